@@ -252,6 +252,25 @@ def heading(q: Array) -> tuple[Array, Array]:
     return jnp.stack([cos, sin, zero], axis=-1), jnp.stack([-sin, cos, zero], axis=-1)
 
 
+def level_axes(yaw: Array) -> tuple[Array, Array]:
+    """Return the horizontal unit vectors along a yaw, rad (..., 1), and to its left. (..., 3) each"""
+    cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)
+    return jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
+
+
+def axes_along(z: Array, ahead: Array, left: Array) -> tuple[Array, Array, Array]:
+    """Return unit axes x, y, z of a frame whose z axis is along a vector and whose x axis is above a heading.
+
+    Args:
+        z: Vector of any length; zero counts as up. (..., 3)
+        ahead: Horizontal unit vector of the heading. (..., 3)
+        left: Horizontal unit vector to its left, the y axis where z is along the heading. (..., 3)
+    """
+    z = safe_normalize(z, jnp.asarray([0.0, 0.0, 1.0], z.dtype))
+    y = safe_normalize(cross(z, ahead), left)
+    return cross(y, z), y, z
+
+
 def from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return roll, pitch, yaw of the frame with these orthonormal axes in the world frame, rad. (..., 3)"""
     cos_pitch = safe_norm(jnp.stack([x[..., 0], x[..., 1]], axis=-1))[..., 0]

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+import functools
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.storage import is_file, read_toml
 
 LARGEST = 1e30
 """Largest size of a number, and inverse of the smallest positive one; float32 represents both, and their inverses."""
+ENTRY = ("value", "unit", "source")
+"""Keys of a number that is written with its unit and source."""
 MAX_BASES = 8
 """Most tables that extend each other."""
 
@@ -94,6 +100,116 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
         raise ConfigError(f"{owner}: expected {path} of shape {' or '.join(map(str, shapes))}, got {value.shape}")
     if not np.all((value >= key.range.low) & (value <= key.range.high)):
         raise ConfigError(f"{owner}: expected {path} to be {key.range.text}, got {shown(value.tolist())}")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Tables and keys of one kind of file."""
+
+    keys: Mapping[str, Key]
+    """Shapes and ranges of all numbers, by dotted path."""
+    top_level: tuple[str, ...]
+    """Keys outside of tables."""
+    guide: str
+    """Page that lists the keys."""
+
+    @functools.cached_property
+    def tables(self) -> tuple[str, ...]:
+        """All tables by dotted path."""
+        parts = [path.split(".") for path in self.keys]
+        return tuple(dict.fromkeys(".".join(x[:k]) for x in parts for k in range(1, len(x))))
+
+    def numbers(
+        self, owner: str, tables: Mapping[str, Any], prefix: str = ""
+    ) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        """Yield the dotted path and the value of every number of tables that a user wrote.
+
+        Args:
+            owner: Kind, name and origin of what they belong to, for messages.
+            tables: The tables, with plain numbers or with units and sources.
+            prefix: Dotted path of these tables, with a dot at the end; empty for all.
+
+        Raises:
+            ConfigError: If a table or key does not exist, with those that are probably meant, or a value is no number.
+        """
+        for key, item in tables.items():
+            path = f"{prefix}{key}"
+            if path in self.top_level:
+                continue
+            if path in self.tables:
+                if not isinstance(item, Mapping):
+                    raise ConfigError(
+                        f"{owner}: expected a table [{path}], got {shown(item)}. {self.guide} lists its keys."
+                    )
+                yield from self.numbers(owner, item, f"{path}.")
+            elif path in self.keys:
+                if isinstance(item, Mapping) and ("value" not in item or set(item) - set(ENTRY)):
+                    raise ConfigError(
+                        f"{owner}: expected {path} as a number, an array or {{ value, unit, source }}, got "
+                        f"{shown(dict(item))}. {self.guide} shows both forms."
+                    )
+                yield path, as_numbers(owner, path, item)
+            elif isinstance(item, Mapping) and "value" not in item:
+                near = self._did_you_mean(f"[{table}]" for table in difflib.get_close_matches(path, self.tables))
+                raise ConfigError(f"{owner}: expected a table that exists, got [{path}]. {near}")
+            else:
+                known = [*self.keys, *self.top_level] if not prefix else list(self.keys)
+                raise ConfigError(f"{owner}: expected a key that exists, got {path!r}. {self.suggestion(path, known)}")
+
+    def suggestion(self, path: str, paths: Iterable[str]) -> str:
+        """Return the paths that are probably meant: first the same key in another table, then those spelt alike."""
+        paths = list(paths)
+        table, _, key = path.rpartition(".")
+        same_table = {p.rpartition(".")[2]: p for p in paths if p.rpartition(".")[0] == table}
+        keys = {p.rpartition(".")[2]: p for p in paths}
+        found = [p for p in paths if p.rpartition(".")[2] == key]
+        found += [same_table[k] for k in difflib.get_close_matches(key, same_table)]
+        found += difflib.get_close_matches(path, paths)
+        found += [keys[k] for k in difflib.get_close_matches(key, keys)]
+        return self._did_you_mean(repr(p) for p in dict.fromkeys(found))
+
+    def _did_you_mean(self, candidates: Iterable[str]) -> str:
+        found = list(candidates)[:3]
+        meant = f"Did you mean {' or '.join(found)}? " if found else ""
+        return f"{meant}{self.guide} lists all keys."
+
+
+def read_source(
+    source: Any, kind: str, loaded: str, folder: Path, names: tuple[str, ...], guide: str
+) -> tuple[str, str, Mapping[str, Any]]:
+    """Return the name of a source, its origin for messages, and its tables.
+
+    Args:
+        source: Name of a built-in file, path of another, or a dict of tables.
+        kind: Name of the kind of thing, for messages.
+        loaded: Name of its class with an article, for messages.
+        folder: Folder of the built-in files.
+        names: Their names.
+        guide: Page that lists the keys.
+
+    Raises:
+        UnknownNameError: If the source is neither the name of a built-in file nor a file.
+        ConfigError: If it is none of these, or not TOML.
+    """
+    if isinstance(source, Mapping):
+        return "custom", "", dict(source)
+    if not isinstance(source, (str, Path)):
+        raise ConfigError(
+            f"expected a {kind} as a name, the path of a TOML file, a dict or {loaded}, got {shown(source)}"
+        )
+    if str(source) in names:
+        return str(source), "", _built_in(folder / f"{source}.toml", guide)
+    if not is_file(source):
+        raise UnknownNameError(
+            f"expected a {kind} as one of {', '.join(names)}, the path of a .toml file, or a dict, got "
+            f"{shown(str(source))}, and no file of that path exists"
+        )
+    return Path(source).stem, f" in {source}", read_toml(source, guide)
+
+
+@functools.cache
+def _built_in(path: Path, guide: str) -> Mapping[str, Any]:
+    return read_toml(path, guide)
 
 
 def extended(bases: tuple[str, ...], source: Any) -> tuple[str, ...]:

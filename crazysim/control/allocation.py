@@ -55,8 +55,7 @@ def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
         ConfigError: If the airframe has no thrust curve.
     """
     thrust = float(airframe.value("rigid_body.mass", ())) * 9.81 / airframe.n_rotors
-    k0, k1, k2 = np.atleast_2d(airframe.value("rotors.thrust_curve")).T
-    return (np.sqrt(k1**2 - 4 * k2 * (k0 - thrust)) - k1) / (2 * k2)
+    return airframe.rotor_vel([thrust])
 
 
 def torque_arms(airframe: Airframe) -> np.ndarray:
@@ -81,6 +80,16 @@ def yaw_arm(airframe: Airframe) -> float:
         _, k1, k2 = np.atleast_2d(airframe.value(f"rotors.{key}")).T
         slopes.append(k1 + 2 * k2 * hover)
     return float(np.mean(slopes[0] / slopes[1]))
+
+
+def hover_arms(airframe: Airframe) -> np.ndarray:
+    """Return torque per thrust about x, y and z around hover, m. (3,)"""
+    return np.array([airframe.arm, airframe.arm, yaw_arm(airframe)])
+
+
+def wrench_matrix(airframe: Airframe) -> np.ndarray:
+    """Return the matrix from the rotors' thrusts to thrust and torque around hover, 1 and m. (4, n_rotors)"""
+    return np.vstack([np.ones(airframe.n_rotors), hover_arms(airframe)[:, None] * airframe.mixing_matrix])
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:

@@ -23,14 +23,14 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import AllocationParams, yaw_arm
+from crazysim.control.allocation import AllocationParams, hover_arms, wrench_matrix
 from crazysim.control.bandwidth import YAW, rotor_rate
 from crazysim.control.fitted import FittedAuto
 from crazysim.control.flatness import HORIZONTAL, NO_THRUST
 from crazysim.control.levels import Control
 from crazysim.control.position import PositionMemory, PositionParams, specific_force, upright
 from crazysim.control.priority import prioritized_thrusts
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData, DroneState
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -96,12 +96,12 @@ class AutoParams(RigidBodyParams):
         rate = 1 / (1 / (lead * lag) + 1.5 / freq)
         rates = rate * np.array([1.0, 1.0, YAW])
         stiffness, damping = STIFFNESS * rates**2, DAMPING * rates
-        body, arms = rigid_body(airframe), np.array([airframe.arm, airframe.arm, yaw_arm(airframe)])
+        body = rigid_body(airframe)
         allocation: AllocationParams = body.pop("allocation")
         return AutoParams(
             **body,
-            allocation=allocation.replace(arms=as_parameter(arms)),
-            mixing_matrix=as_parameter(np.vstack([np.ones(airframe.n_rotors), arms[:, None] * airframe.mixing_matrix])),
+            allocation=allocation.replace(arms=as_parameter(hover_arms(airframe))),
+            mixing_matrix=as_parameter(wrench_matrix(airframe)),
             stiffness=as_parameter(stiffness),
             damping=as_parameter(damping),
             torque_max=as_parameter(TORQUE_MAX * np.diag(airframe.inertia) * stiffness),
@@ -191,7 +191,7 @@ class Auto(Controller):
             return self if control in self.levels else None
         return FittedAuto(Dynamics(fitted), self.outer_freq) if control == Control.state else None
 
-    def outer(self, data: Any, command: Setpoint, memory: Any, params: Any) -> Any:
+    def outer(self, data: DroneData, command: Setpoint, memory: Any, params: Any) -> Any:
         """Return the memory as it is: the position loop runs with the others, at ``freq``."""
         return memory
 
@@ -204,7 +204,7 @@ class Auto(Controller):
         return AutoMemory.at_rest()
 
     def update(
-        self, data: Any, command: Setpoint | Array, memory: AutoMemory, params: AutoParams
+        self, data: DroneData, command: Setpoint | Array, memory: AutoMemory, params: AutoParams
     ) -> tuple[Array, AutoMemory]:
         """Return the rotor speeds, and the memory."""
         s, p = data.states, params
@@ -233,7 +233,7 @@ class Auto(Controller):
         return jnp.where(on, driven, 0.0), memory.replace(momentum=expected, torque=unknown)
 
     def _of_setpoint(
-        self, s: Any, setpoint: Setpoint, ahead: Array, thrust: Array, memory: PositionMemory, params: AutoParams
+        self, s: DroneState, setpoint: Setpoint, ahead: Array, thrust: Array, memory: PositionMemory, params: AutoParams
     ) -> tuple[Array, Array, PositionMemory]:
         """Return collective thrust, N, and angular acceleration, rad/s^2, that lead to a setpoint, and the memory.
 
@@ -268,7 +268,7 @@ class Auto(Controller):
         acc = p.stiffness * error_of_axes(x, y, z) + p.damping * (rate - s.ang_vel)
         return p.mass * specific[..., 2:], acc, memory
 
-    def _of_command(self, s: Any, command: Array, mode: Control, params: AutoParams) -> Array:
+    def _of_command(self, s: DroneState, command: Array, mode: Control, params: AutoParams) -> Array:
         """Return the angular acceleration that follows an attitude or body rates, rad/s^2. (3,)"""
         p = params
         if mode == Control.body_rate:

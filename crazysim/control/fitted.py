@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +11,13 @@ from jax import Array
 from crazysim import rotation
 from crazysim.control.levels import Control
 from crazysim.control.position import PositionMemory, PositionParams, specific_force, upright
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.fitted import Params
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import cross, dot, matvec
+from crazysim.rotation import dot, matvec
 
 
 class FittedParams(PyTree):
@@ -80,7 +80,7 @@ class FittedAuto(Controller):
         return PositionMemory.at_rest()
 
     def update(
-        self, data: Any, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
+        self, data: DroneData, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
     ) -> tuple[Array, PositionMemory]:
         """Return roll, pitch, yaw, rad, and collective thrust, N (4,), and the memory."""
         s, p, model = data.states, params, params.model
@@ -97,8 +97,6 @@ class FittedAuto(Controller):
 
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         later = specific + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
-        z = rotation.safe_normalize(later, up)
-        y = rotation.safe_normalize(cross(z, ahead), left)
-        angles = p.angles * rotation.from_axes(cross(y, z), y, z)
+        angles = p.angles * rotation.from_axes(*rotation.axes_along(later, ahead, left))
         thrust = (model.mass * dot(specific, matrix[..., 2]) - model.acc_coef) / model.cmd_f_coef
         return jnp.concatenate([angles, jnp.maximum(thrust, model.thrust_min)], axis=-1), memory

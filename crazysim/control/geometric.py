@@ -13,7 +13,7 @@ from crazysim.control.bandwidth import Bandwidth, bandwidth
 from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.levels import Control
 from crazysim.control.priority import prioritized_wrench
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -215,7 +215,7 @@ class Geometric(Controller):
         """Return the memory before the first tick; None without an integral."""
         return GeometricMemory(as_parameter(np.zeros(3))) if self.integral else None
 
-    def update(self, data: Any, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
+    def update(self, data: DroneData, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
         """Return the wrench, and the memory."""
         s = data.states
         if self.integral:

@@ -10,14 +10,14 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.control.allocation import force_torque2rotor_vel, yaw_arm
+from crazysim.control.allocation import force_torque2rotor_vel, wrench_matrix
 from crazysim.control.bandwidth import bandwidth, rotor_rate
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
 from crazysim.control.levels import Control
 from crazysim.control.low_pass import butterworth
 from crazysim.control.priority import prioritized_wrench
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
@@ -64,11 +64,9 @@ class INDIParams(PyTree):
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
         gains = gains_of(airframe, bandwidth(airframe, freq, LEAD * rotor_rate(airframe)))
-        arms = np.array([airframe.arm, airframe.arm, yaw_arm(airframe)])
-        mixing = np.vstack([np.ones(airframe.n_rotors), arms[:, None] * airframe.mixing_matrix])
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
-            mixing_matrix=as_parameter(mixing),
+            mixing_matrix=as_parameter(wrench_matrix(airframe)),
             lead=as_parameter(LEAD),
             filter=as_parameter(butterworth(min(cutoff, 0.45 * freq), freq)),
         )
@@ -210,12 +208,12 @@ class INDI(Controller):
         return INDIMemory.at_rest()
 
     def take_over(
-        self, data: Any, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
+        self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
     ) -> INDIMemory:
         """Return the memory before the first tick, since the remembered velocities are not those of the last tick."""
         return memory.replace(started=jnp.zeros_like(memory.started))
 
-    def update(self, data: Any, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
+    def update(self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
         """Return the rotor speeds."""
         s = data.states
         state = (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)

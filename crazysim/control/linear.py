@@ -11,11 +11,6 @@ from jax import Array
 from crazysim import rotation
 from crazysim.rotation import cross, dot, matvec
 
-STATES = 12
-"""States of the drone: position, velocity, roll, pitch, yaw, body rates."""
-LOAD_STATES = 16
-"""States of the drone with a load: those of the drone, two angles of the rod, and their rates."""
-
 Model = Callable[[Array, Array], Array]
 """State and input to the derivative of the state."""
 

@@ -7,15 +7,15 @@ from typing import Any, ClassVar, Literal
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.control.bandwidth import bandwidth
 from crazysim.control.flatness import attitude_of_thrust, direction_of
 from crazysim.control.levels import Control
 from crazysim.control.linear import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import Reference, as_weights, into_heading, solve_on_host, state_error
+from crazysim.control.lqr import Reference, into_heading, solve_on_host, state_error, weights_of
 from crazysim.control.priority import prioritized_wrench
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import gain_discrete
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
@@ -51,9 +51,9 @@ class LoadLQRParams(RigidBodyParams):
         freq: int,
         load_mass: float,
         length: float,
-        Q: Any = None,
-        R: Any = None,
-        attach: Any = (0.0, 0.0, 0.0),
+        Q: ArrayLike | None = None,
+        R: ArrayLike | None = None,
+        attach: ArrayLike = (0.0, 0.0, 0.0),
     ) -> LoadLQRParams:
         """Return the shared parameters of an airframe, with the gain computed in float64.
 
@@ -63,8 +63,8 @@ class LoadLQRParams(RigidBodyParams):
             load_mass: Mass of the load, kg.
             length: Length of the rod, m.
             Q: Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or
-                (16, 16); None for ``default_load_weights``.
-            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_load_weights``.
+                (16, 16); None for those of ``weights_of``.
+            R: Weights of collective thrust and torque (4,) or (4, 4); None for those of ``weights_of``.
             attach: Joint of the rod, from the centre of mass, body frame, m. (3,)
 
         Raises:
@@ -82,9 +82,7 @@ class LoadLQRParams(RigidBodyParams):
                 f"expected attach as three finite numbers, m, got {attach!r}. Use LoadLQR(attach=(0.0, 0.0, -0.02))."
             )
         mass, inertia = airframe.value("rigid_body.mass"), airframe.inertia
-        weights = default_load_weights(airframe, freq, load_mass, length)
-        Q = as_weights("Q", weights[0] if Q is None else Q, 16)
-        R = as_weights("R", weights[1] if R is None else R, 4)
+        Q, R = weights_of(airframe, freq, Q, R, load_mass, length)
         off_centre = [joint] if np.any(joint) else []
         gain = solve_on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
         return LoadLQRParams(
@@ -94,23 +92,6 @@ class LoadLQRParams(RigidBodyParams):
             gain=as_parameter(gain),
             attach=as_parameter(joint) if off_centre else None,
         )
-
-
-def default_load_weights(
-    airframe: Airframe, freq: int, load_mass: float, length: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diagonals of Q (16,) and R (4,) that suit an airframe's bandwidth, by Bryson's rule.
-
-    As ``crazysim.control.lqr.default_weights``, for drone and load together. The angle of the rod counts as a shift of
-    the load: 1 m of position is 1 / length rad, and its rate as the natural frequency times that.
-    """
-    rates, g = bandwidth(airframe, freq), -GRAVITY[2]
-    w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
-    tilt = w**2 / g
-    angle = [1 / length, 1 / length, w / length, w / length]
-    errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
-    inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
-    return errors**-2, inputs**-2
 
 
 def load_gain(
@@ -290,16 +271,16 @@ class LoadLQR(Controller):
     """Mass of the load, kg."""
     length: float = 0.4
     """Length of the rod, m."""
-    attach: Any = (0.0, 0.0, 0.0)
+    attach: ArrayLike = (0.0, 0.0, 0.0)
     """Joint of the rod, from the centre of mass, body frame, m: the ``attach`` of the load's plugin. (3,)"""
     target: Target = "load"
     """Body that setpoints describe."""
     load: str = "load"
     """Name of the plugin of the load, whose record has ``tip_pos`` and ``tip_vel`` of a hook, or else ``pos`` and
     ``vel`` of the load."""
-    Q: Any = None
+    Q: ArrayLike | None = None
     """Weights of the states, as for ``LoadLQRParams.create``."""
-    R: Any = None
+    R: ArrayLike | None = None
     """Weights of the inputs, as for ``LoadLQRParams.create``."""
 
     def params(self, airframe: Airframe) -> LoadLQRParams:
@@ -311,13 +292,13 @@ class LoadLQR(Controller):
         return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
 
     def take_over(
-        self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
+        self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
     ) -> LoadLQRMemory:
         """Return the memory before the first tick, since the remembered derivative is not that of the last tick."""
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(
-        self, data: Any, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
+        self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
     ) -> tuple[Array, LoadLQRMemory]:
         """Return the wrench.
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.control.bandwidth import bandwidth
@@ -15,7 +17,7 @@ from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.levels import Control
 from crazysim.control.linear import drone_derivative, linearize
 from crazysim.control.priority import prioritized_wrench
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import check_gain, gain_continuous
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
@@ -33,45 +35,64 @@ class LQRParams(RigidBodyParams):
     """Gain K from the errors of position, velocity, rotation and body rates to the wrench. (4, 12)"""
 
     @staticmethod
-    def create(airframe: Airframe, freq: int, Q: Any = None, R: Any = None) -> LQRParams:
+    def create(airframe: Airframe, freq: int, Q: ArrayLike | None = None, R: ArrayLike | None = None) -> LQRParams:
         """Return the shared parameters of an airframe, with the gain computed in float64.
 
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz, which enters the default weights.
             Q: Weights of position, velocity, roll, pitch, yaw and body rates, a diagonal (12,) or a matrix (12, 12);
-                None for ``default_weights``.
-            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``default_weights``.
+                None for those of ``weights_of``.
+            R: Weights of collective thrust and torque (4,) or (4, 4); None for those of ``weights_of``.
 
         Raises:
             ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
         """
-        weights = default_weights(airframe, freq)
-        Q = as_weights("Q", weights[0] if Q is None else Q, 12)
-        R = as_weights("R", weights[1] if R is None else R, 4)
+        Q, R = weights_of(airframe, freq, Q, R)
         return LQRParams(
             **rigid_body(airframe),
             gain=as_parameter(solve_on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)),
         )
 
 
-def default_weights(airframe: Airframe, freq: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diagonals of Q (12,) and R (4,) that suit an airframe's bandwidth.
+def weights_of(
+    airframe: Airframe,
+    freq: int,
+    Q: ArrayLike | None,
+    R: ArrayLike | None,
+    load_mass: float = 0.0,
+    length: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights Q (n, n) and R (4, 4): as given, or else those that suit an airframe's bandwidth.
 
     Bryson's rule: each weight is one over the square of an acceptable error. An error of position of 1 m counts as
     much as the velocity, the tilt, the body rates, the thrust and the torque that the rule of
     ``crazysim.control.bandwidth`` would give it: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural frequency
-    w of the position and the attitude stiffness k. Yaw counts as roll and pitch.
+    w of the position and the attitude stiffness k. Yaw counts as roll and pitch. The angle of a rod with a load counts
+    as a shift of the load: 1 m of position is 1 / length rad, and its rate as the natural frequency times that.
+
+    Args:
+        airframe: The airframe.
+        freq: Rate of the controller, Hz.
+        Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for those of the rule.
+        R: Weights of the inputs: a diagonal or a matrix; None for those of the rule.
+        load_mass: Mass of the load, kg.
+        length: Length of its rod, m; None without a load.
+
+    Raises:
+        ConfigError: If a weight has another shape.
     """
     rates, g = bandwidth(airframe, freq), -GRAVITY[2]
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
     tilt = w**2 / g
-    errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w)])
-    inputs = np.array([mass * w**2, *(moments * rates.stiffness * tilt)])
-    return errors**-2, inputs**-2
+    angle = [] if length is None else [1 / length, 1 / length, w / length, w / length]
+    errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
+    inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
+    Q, R = errors**-2 if Q is None else Q, inputs**-2 if R is None else R
+    return as_weights("Q", Q, len(errors)), as_weights("R", R, 4)
 
 
-def as_weights(name: str, weights: Any, n: int) -> np.ndarray:
+def as_weights(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     """Return weights as a matrix (n, n) of float64.
 
     Raises:
@@ -87,7 +108,7 @@ def as_weights(name: str, weights: Any, n: int) -> np.ndarray:
     return array
 
 
-def solve_on_host(gain: Any, *args: Any) -> np.ndarray:
+def solve_on_host(gain: Callable[..., Array], *args: Any) -> np.ndarray:
     """Return a gain computed in float64 on the CPU.
 
     Raises:
@@ -135,7 +156,7 @@ class Reference(NamedTuple):
     """Collective thrust, N, and body torque, N m. (..., 4)"""
 
 
-def reference_of(setpoint: Setpoint, params: Any) -> Reference:
+def reference_of(setpoint: Setpoint, params: RigidBodyParams) -> Reference:
     """Return the reference of a setpoint, from flatness, with the drag of a level drone compensated.
 
     Args:
@@ -218,16 +239,16 @@ class LQR(Controller):
     output: ClassVar[Control] = Control.force_torque
     freq: int = 500
     """Rate, Hz."""
-    Q: Any = None
+    Q: ArrayLike | None = None
     """Weights of the states, as for ``LQRParams.create``."""
-    R: Any = None
+    R: ArrayLike | None = None
     """Weights of the inputs, as for ``LQRParams.create``."""
 
     def params(self, airframe: Airframe) -> LQRParams:
         """Return gain and constants for an airframe."""
         return LQRParams.create(airframe, self.freq, self.Q, self.R)
 
-    def update(self, data: Any, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
+    def update(self, data: DroneData, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
         """Return the wrench."""
         s = data.states
         return lqr_control(s.pos, s.quat, s.vel, s.ang_vel, command, params=params), memory

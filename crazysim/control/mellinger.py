@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,12 +19,12 @@ from crazysim.control.power_distribution import (
     pwm_of_thrust,
     rotor_vel_of_pwm,
 )
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import dot, safe_clip, safe_normalize
+from crazysim.rotation import dot, safe_clip
 
 _GAINS = ("kp", "kd", "ki", "integral_max", "kR", "kw", "ki_m", "kd_omega", "integral_m_max", "torque_max")
 KEYS = (*(f"mellinger.{key}" for key in ("mass", "mass_thrust", *_GAINS)), *power_distribution.KEYS)
@@ -182,7 +182,7 @@ class Mellinger(Controller):
         return MellingerMemory.at_rest()
 
     def update(
-        self, data: Any, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
+        self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
     ) -> tuple[Array, MellingerMemory]:
         """Return the rotor speeds, rpm, and the memory. (n_rotors,)"""
         p = params
@@ -196,7 +196,7 @@ class Mellinger(Controller):
 
     def take_over(
         self,
-        data: Any,
+        data: DroneData,
         command: Setpoint | Array,
         memory: MellingerMemory,
         params: MellingerParams,
@@ -217,7 +217,7 @@ class Mellinger(Controller):
         return rest.replace(integral_m=safe_clip(_over(torque - out, p.ki_m), -p.integral_m_max, p.integral_m_max))
 
     def _command(
-        self, data: Any, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
+        self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
     ) -> tuple[Array, Array, MellingerMemory, Array]:
         """Return thrust and torque, PWM, the memory, and the desired force, N, which is zero without a setpoint."""
         s, p, force = data.states, params, jnp.zeros_like(data.states.pos)
@@ -234,7 +234,7 @@ class Mellinger(Controller):
         return thrust, torque, memory, force
 
 
-def _desired_rates(data: Any, command: Setpoint | Array) -> Array:
+def _desired_rates(data: DroneData, command: Setpoint | Array) -> Array:
     """Return the desired body rates, rad/s: those of a full-state setpoint, otherwise zero. (3,)"""
     if isinstance(command, Setpoint):
         return data.controls.state.cmd[13:16]
@@ -253,12 +253,7 @@ def axes_of_force(force: Array, yaw: Array) -> Array:
         force: Force, world frame, N. (..., 3)
         yaw: Yaw, rad. (..., 1)
     """
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    zero = jnp.zeros_like(yaw)
-    z_axis = safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
-    ahead, left = jnp.concatenate([cos, sin, zero], axis=-1), jnp.concatenate([-sin, cos, zero], axis=-1)
-    y_axis = safe_normalize(rotation.cross(z_axis, ahead), left)
-    return jnp.stack([rotation.cross(y_axis, z_axis), y_axis, z_axis], axis=-1)
+    return jnp.stack(rotation.axes_along(force, *rotation.level_axes(yaw)), axis=-1)
 
 
 def rotation_error(axes: Array, axes_des: Array) -> Array:

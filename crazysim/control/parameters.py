@@ -6,9 +6,9 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-from crazysim.drones import load_airframe
+from crazysim.drones import AirframeSource, load_airframe
 from crazysim.dynamics.models import GRAVITY
-from crazysim.dynamics.parameters import Drone, as_arrays
+from crazysim.dynamics.parameters import as_arrays
 from crazysim.errors import UnknownNameError
 
 CONTROLLER = "mellinger"
@@ -32,7 +32,9 @@ SOURCES: tuple[tuple[str, str, dict[str, str]], ...] = (
 """Tables of Crazyflow, the airframe's tables that they come from, and Crazyflow's name for each key."""
 
 
-def load_params(controller: str, drone: Drone, xp: ModuleType | None = None, device: Any = None) -> dict[str, dict]:
+def load_params(
+    controller: str, drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
+) -> dict[str, dict]:
     """Return the parameters of a drone for a controller: ``core``, and one table for each function.
 
     Parameters that the airframe lacks are left out.
@@ -59,7 +61,9 @@ def load_params(controller: str, drone: Drone, xp: ModuleType | None = None, dev
     return as_arrays(tables, xp, device)
 
 
-def load_fn_params(fn: Callable[..., Any], drone: Drone, xp: ModuleType | None = None, device: Any = None) -> dict:
+def load_fn_params(
+    fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
+) -> dict:
     """Return the parameters of one function of the cascade: those of ``core``, and its own.
 
     Args:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from crazysim.control.pid_cascade import (
 )
 from crazysim.control.pid_loop import LoopMemory, continued, pid_step
 from crazysim.control.power_distribution import command_of_rotor_vel, distribute, pwm_of_thrust, rotor_vel_of_pwm
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 
@@ -66,7 +66,7 @@ class PID(Controller):
         """Return the memory of one drone before the first tick."""
         return PIDMemory.at_rest(self.params(airframe))
 
-    def outer(self, data: Any, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
+    def outer(self, data: DroneData, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
         """Return the memory after position and velocity loop, with the desired roll, pitch and thrust."""
         s, heading = data.states, heading_of(data.states.quat)
         # In world axes, as in the firmware (positionControllerResetAllPID), whose derivative gain here is zero.
@@ -81,7 +81,7 @@ class PID(Controller):
         return memory.replace(position=position, velocity=velocity, rpy_des=rpy_des, thrust=thrust)
 
     def update(
-        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams
+        self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams
     ) -> tuple[Array, PIDMemory]:
         """Return the rotor speeds, rpm, and the memory after the attitude and rate loops. (n_rotors,)"""
         rpy, ang_vel = DEGREES * rotation.to_rpy(data.states.quat), DEGREES * data.states.ang_vel
@@ -96,7 +96,7 @@ class PID(Controller):
         return rotor_vel, _reset_at_zero_thrust(after, rpy, data.states.pos)
 
     def take_over(
-        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
+        self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
     ) -> PIDMemory:
         """Return a memory with integrals that continue the present thrust, roll, pitch and torque.
 
@@ -126,7 +126,7 @@ class PID(Controller):
         return started.replace(rate=continued(started.rate, out, torque, loop=p.rate))
 
     def _desired_rates(
-        self, data: Any, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
+        self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
     ) -> tuple[Array, LoopMemory, Array]:
         """Return the desired angles, degrees, the memory of the attitude loop, and the desired rates, degrees/s."""
         by_rate = data.controls.mode == Control.body_rate

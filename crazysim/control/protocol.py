@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, dataclass_transform
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, dataclass_transform
 
 from jax import Array
 
@@ -14,6 +15,59 @@ from crazysim.pytree import PyTree
 
 OUTPUTS = (Control.attitude, Control.force_torque, Control.rotor_vel)
 """Levels of the commands that controllers return."""
+
+
+class DroneState(Protocol):
+    """The fields of ``crazysim.core.data.SimState`` that controllers read, of one drone."""
+
+    @property
+    def pos(self) -> Array:
+        """Position, world frame, m. (3,)"""
+        ...
+
+    @property
+    def quat(self) -> Array:
+        """Attitude, body to world, xyzw. (4,)"""
+        ...
+
+    @property
+    def vel(self) -> Array:
+        """Velocity, world frame, m/s. (3,)"""
+        ...
+
+    @property
+    def ang_vel(self) -> Array:
+        """Angular velocity, body frame, rad/s. (3,)"""
+        ...
+
+    @property
+    def rotor_vel(self) -> Array:
+        """Rotor speeds, rpm. (n_rotors,)"""
+        ...
+
+
+class DroneData(Protocol):
+    """The parts of ``crazysim.core.data.SimData`` that controllers read, of one drone."""
+
+    @property
+    def states(self) -> DroneState:
+        """State of the drone."""
+        ...
+
+    @property
+    def controls(self) -> Any:
+        """Commands, ``SimControls``."""
+        ...
+
+    @property
+    def core(self) -> Any:
+        """Time and rates, ``SimCore``."""
+        ...
+
+    @property
+    def plugins(self) -> Mapping[str, Any]:
+        """Records of plugins."""
+        ...
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field,))
@@ -60,7 +114,7 @@ class Controller:
         """Return the memory of one drone at rest, in a record of leaves of scope ``drone``, or None."""
         return None
 
-    def outer(self, data: Any, command: Setpoint, memory: Any, params: Any) -> Any:
+    def outer(self, data: DroneData, command: Setpoint, memory: Any, params: Any) -> Any:
         """Return the memory after a tick of the outer loop.
 
         Args:
@@ -71,7 +125,7 @@ class Controller:
         """
         raise NotImplementedError(f"controller {self.name!r} has an outer_freq, and does not define outer")
 
-    def update(self, data: Any, command: Setpoint | Array, memory: Any, params: Any) -> tuple[Array, Any]:
+    def update(self, data: DroneData, command: Setpoint | Array, memory: Any, params: Any) -> tuple[Array, Any]:
         """Return the command of the level ``output``, and the memory after a tick.
 
         Args:
@@ -87,7 +141,7 @@ class Controller:
         """
         raise NotImplementedError(f"controller {self.name!r} does not define update")
 
-    def take_over(self, data: Any, command: Setpoint | Array, memory: Any, params: Any, rotor_vel: Array) -> Any:
+    def take_over(self, data: DroneData, command: Setpoint | Array, memory: Any, params: Any, rotor_vel: Array) -> Any:
         """Return the memory with which the controller starts to command a drone in flight, in place of another one.
 
         By default the memory of when it was last active. Override it to make the first command continue the last.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from jax import Array
 
 from crazysim.control.allocation import AllocationParams
@@ -34,11 +33,10 @@ def rigid_body(airframe: Airframe) -> dict[str, Any]:
     Raises:
         ConfigError: If the airframe lacks a value.
     """
-    drag = airframe.value("drag.coefficients")
     return {
         "mass": as_parameter(airframe.value("rigid_body.mass")),
         "gravity_vec": as_parameter(GRAVITY),
         "J": as_parameter(airframe.inertia),
-        "drag_matrix": as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+        "drag_matrix": as_parameter(airframe.matrix("drag.coefficients")),
         "allocation": AllocationParams.create(airframe),
     }

@@ -8,6 +8,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.control.gains import require_gains
 from crazysim.drones import Airframe
+from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 
 _GAINS = ("kp", "kd", "ki", "int_err_max")
@@ -54,7 +55,7 @@ class StateParams(PyTree):
             kp=as_parameter(airframe.value("controller.state.kp", (3,))),
             kd=as_parameter(airframe.value("controller.state.kd", (3,))),
             ki=as_parameter(airframe.value("controller.state.ki", (3,))),
-            gravity_vec=as_parameter([0.0, 0.0, -9.81]),
+            gravity_vec=as_parameter(GRAVITY),
             thrust_scale=as_parameter(to_pwm * from_pwm),
             int_err_max=as_parameter(airframe.value("controller.state.int_err_max", (3,))),
         )
@@ -94,9 +95,7 @@ def state2attitude(
     force = p.mass * (cmd[..., 6:9] - p.gravity_vec) + p.kp * pos_err + p.kd * vel_err + p.ki * pos_err_i
 
     ahead, left = rotation.heading(cmd[..., 9:13])
-    z_axis = rotation.safe_normalize(force, jnp.asarray([0.0, 0.0, 1.0], force.dtype))
-    y_axis = rotation.safe_normalize(rotation.cross(z_axis, ahead), left)
-    rpy = rotation.from_axes(rotation.cross(y_axis, z_axis), y_axis, z_axis)
+    rpy = rotation.from_axes(*rotation.axes_along(force, ahead, left))
 
     thrust = p.thrust_scale * rotation.dot(force, rotation.z_axis(quat))
     return jnp.concatenate([rpy, thrust], axis=-1), pos_err_i

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
 from crazysim.control.levels import Control
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError
@@ -84,7 +84,7 @@ class Switch(Controller):
         return SwitchMemory(memory, np.full(1, -1, np.int32), rest)  # type: ignore[arg-type]
 
     def update(
-        self, data: Any, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
+        self, data: DroneData, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
     ) -> tuple[Array, SwitchMemory]:
         """Return the rotor speeds of the chosen controller, rpm, and the memory. (n_rotors,)"""
         index = self._index(data, command, params)
@@ -108,7 +108,7 @@ class Switch(Controller):
         active = jnp.full_like(memory.active, index)
         return rotor_vel, SwitchMemory(tuple(after), active, rotor_vel)
 
-    def _index(self, data: Any, command: Setpoint | Array, params: SwitchParams) -> Array:
+    def _index(self, data: DroneData, command: Setpoint | Array, params: SwitchParams) -> Array:
         """Return the number of the controller to use. ()"""
         if params.index is not None:
             index = params.index[0]
@@ -148,7 +148,7 @@ def _indices(switch: Any, n: int) -> np.ndarray:
     return indices[..., None].astype(np.int32)
 
 
-def _due(data: Any, freq: Any) -> Array | bool:
+def _due(data: DroneData, freq: Any) -> Array | bool:
     """Return True where a rate fires at this step. ()"""
     return data.core.steps % (data.core.freq // freq) == 0
 

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.control.levels import Control
 from crazysim.control.lqr import (
     Reference,
-    as_weights,
-    default_weights,
     reference_of,
     solve_on_host,
     state_error,
+    weights_of,
 )
 from crazysim.control.priority import prioritized_wrench
-from crazysim.control.protocol import Controller
+from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import gain_continuous, solve_lyapunov
 from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
@@ -45,15 +45,6 @@ class TrackingLQRParams(RigidBodyParams):
     """Time from one knot to the next, s. (1,)"""
     start: Array = leaf("parameter", 1)
     """Time of the first knot, s since the reset. (1,)"""
-
-
-class _Model(NamedTuple):
-    """Parameters of a reference."""
-
-    mass: Array
-    gravity_vec: Array
-    J: Array
-    drag_matrix: Array
 
 
 def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
@@ -106,7 +97,8 @@ def tracking_gains(
         (n, 4, 12)
     """
     mass = jnp.reshape(mass, (1,))
-    params = _Model(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix)
+    # A reference needs no allocation.
+    params = RigidBodyParams(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix, None)  # type: ignore[arg-type]
 
     def matrices(setpoint: Setpoint) -> tuple[Array, Array]:
         reference = reference_of(setpoint, params)
@@ -185,7 +177,7 @@ class TrackingLQR(Controller):
     name: ClassVar[str] = "tracking_lqr"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
     output: ClassVar[Control] = Control.force_torque
-    setpoints: Any = None
+    setpoints: Setpoint | None = None
     """Setpoints of the trajectory, ``dt`` apart: a ``Setpoint`` with one leading axis, 2 to ``MAX_KNOTS`` long."""
     dt: float = 0.1
     """Time from one setpoint to the next, s."""
@@ -193,9 +185,9 @@ class TrackingLQR(Controller):
     """Time of the first setpoint, s since the reset."""
     freq: int = 500
     """Rate, Hz."""
-    Q: Any = None
+    Q: ArrayLike | None = None
     """Weights of the states, as for ``LQRParams.create``."""
-    R: Any = None
+    R: ArrayLike | None = None
     """Weights of the inputs, as for ``LQRParams.create``."""
 
     def params(self, airframe: Airframe) -> TrackingLQRParams:
@@ -217,11 +209,8 @@ class TrackingLQR(Controller):
                 f"expected finite setpoints, got NaN or infinity in {', '.join(bad)}. Evaluate the trajectory at "
                 f"times that it covers, and check its limits."
             )
-        weights = default_weights(airframe, self.freq)
-        Q = as_weights("Q", weights[0] if self.Q is None else self.Q, 12)
-        R = as_weights("R", weights[1] if self.R is None else self.R, 4)
-        mass, drag = airframe.value("rigid_body.mass"), airframe.value("drag.coefficients")
-        drag = np.diag(drag) if drag.ndim == 1 else drag
+        Q, R = weights_of(airframe, self.freq, self.Q, self.R)
+        mass, drag = airframe.value("rigid_body.mass"), airframe.matrix("drag.coefficients")
         gains_of = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
         gains = solve_on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
         return TrackingLQRParams(
@@ -231,7 +220,7 @@ class TrackingLQR(Controller):
             start=as_parameter(self.start),
         )
 
-    def update(self, data: Any, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
+    def update(self, data: DroneData, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
         """Return the wrench."""
         s, core = data.states, data.core
         time = core.steps.astype(s.pos.dtype) / core.freq

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
-from crazysim.drones import Airframe, load_airframe
+from crazysim.drones import Airframe, AirframeSource, load_airframe
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 
@@ -25,8 +26,6 @@ PER_ROTOR = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
 """Fields that missing rotors have like the last one; all others are zero for missing rotors."""
 
 
-AirframeSource = str | Path | Mapping[str, Any] | Airframe
-"""Name of a built-in airframe, path of a TOML file, dict, or airframe."""
 Airframes = Airframe | Sequence[Airframe]
 """Airframe of all drones, or of each."""
 
@@ -52,7 +51,7 @@ def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: i
     return tuple([loaded[key] for key in keys])
 
 
-def is_list(drone: Any) -> TypeGuard[Sequence[AirframeSource]]:
+def is_list(drone: object) -> TypeGuard[Sequence[AirframeSource]]:
     """Check for a list of airframes, one for each drone."""
     return isinstance(drone, Sequence) and not isinstance(drone, str)
 
@@ -132,7 +131,7 @@ def for_drones(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: 
             )
     numbers = [kinds.index(airframe) for airframe in airframes]
 
-    def joined(path: Any, *values: Any) -> Any:
+    def joined(path: tuple[object, ...], *values: ArrayLike) -> np.ndarray:
         name = jax.tree_util.keystr(path[-1:]).strip("[].'\"")
         arrays = _of_one_shape([np.asarray(x) for x in values], name)
         if all(np.array_equal(x, arrays[0]) for x in arrays):

@@ -7,7 +7,7 @@ from typing import Any
 from jax import Array
 
 from crazysim.control import Control, Controller, Setpoint
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, controls_of
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.stage import Stage, tick
 
@@ -58,7 +58,7 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
 
 def with_staged_command(data: SimData) -> SimData:
     """Return the data of one drone with the staged command in force."""
-    controls: Any = data.controls
+    controls = controls_of(data)
     ctrl = getattr(controls, controls.mode.value)
     ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
     if controls.mode == Control.state:
@@ -68,7 +68,7 @@ def with_staged_command(data: SimData) -> SimData:
 
 def command_in_force(data: SimData) -> Setpoint | Array:
     """Return the command in force of one drone: a setpoint at the level ``state``, otherwise four numbers."""
-    controls: Any = data.controls
+    controls = controls_of(data)
     if controls.mode == Control.state:
         return Setpoint.of_command(controls.state.cmd, controls.state.feedforward)
     return getattr(controls, controls.mode.value).cmd

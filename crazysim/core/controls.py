@@ -130,7 +130,7 @@ class ControllerData(PyTree):
                     f"leading axes (n_worlds, n_drones) = {counts}, got shape {np.shape(x)}. Use np.broadcast_to."
                 )
 
-        def of_all(x: Any, like: Any) -> Any:
+        def of_all(x: np.ndarray, like: np.ndarray) -> np.ndarray:
             dtype = floating() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
             core = np.shape(x)[np.ndim(x) - np.ndim(like) :]  # it may have rows of drones, and more rotors
             return host_array(x, n_worlds, n_drones, *core, dtype=dtype)

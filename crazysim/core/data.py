@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.control import Control, Controller, command_size
 from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
@@ -77,7 +79,7 @@ class SimStateDeriv(PyTree):
     """Derivatives of plugins' own states, per second: by plugin, then by field of its record."""
 
     @staticmethod
-    def create(n_worlds: int, n_drones: int, device: Any = None, n_rotors: int = 4) -> SimStateDeriv:
+    def create(n_worlds: int, n_drones: int, device: jax.Device | None = None, n_rotors: int = 4) -> SimStateDeriv:
         """Return zeros.
 
         Args:
@@ -119,7 +121,7 @@ class SimCore(PyTree):
     """True where the scene matches this data. ()"""
 
     @staticmethod
-    def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: Any, rng_key: int | Array) -> SimCore:
+    def create(freq: int, n_worlds: int, n_drones: int, drone_mocap_ids: ArrayLike, rng_key: int | Array) -> SimCore:
         """Return the core of a simulation before its first step."""
         return SimCore(
             freq=freq,
@@ -153,6 +155,18 @@ class Objects(PyTree):
     recorded: bool = static(default=False)
     """True where the poses are those of a recording, also of objects that plugins place, such as loads."""
 
+    def with_poses(self, rows: Mapping[str, tuple[Array, Array]]) -> Objects:
+        """Return the objects of one world with some at other poses.
+
+        Args:
+            rows: Positions (n, 3) and attitudes, xyzw (n, 4), of all objects of a kind, by the kind's name.
+        """
+        pos, quat = self.pos, self.quat
+        for kind, (at, turned) in rows.items():
+            where = np.array([self.names.index(f"{kind}:{k}") for k in range(at.shape[0])])
+            pos, quat = pos.at[where].set(at.astype(pos.dtype)), quat.at[where].set(turned.astype(quat.dtype))
+        return self.replace(pos=pos, quat=quat)
+
 
 class SimData(PyTree):
     """Complete data of a simulation, which a step takes and returns."""
@@ -180,7 +194,7 @@ class SimData(PyTree):
         airframe: Airframes,
         freq: int,
         freqs: dict[Control, int],
-        drone_mocap_ids: Any,
+        drone_mocap_ids: ArrayLike,
         rng_key: int | Array,
         controller: Controller | None = None,
     ) -> SimData:
@@ -224,6 +238,11 @@ def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:
     return n_rotors_of(airframes) if dynamics == Dynamics.first_principles else 4
 
 
+def controls_of(data: SimData) -> Any:
+    """Return the controls untyped: the command level and the model determine which of their fields are None."""
+    return data.controls
+
+
 def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
     """Return the shape of a command to all drones, (n_worlds, n_drones, k)."""
     n_worlds, n_drones, n_rotors = data.states.rotor_vel.shape
@@ -247,7 +266,7 @@ def as_key(seed: int | Array) -> Array:
         raise ConfigError(f"the seed {seed} needs more than 64 bits; use a smaller integer") from error
 
 
-def grid_2d(n: int, spacing: float = 1.0, center: Any = (0.0, 0.0)) -> np.ndarray:
+def grid_2d(n: int, spacing: float = 1.0, center: ArrayLike = (0.0, 0.0)) -> np.ndarray:
     """Return the ``n`` points of a square grid nearest to its centre, nearest first, m. (n, 2)"""
     side = math.isqrt(n - 1) + 1
     line = spacing * (np.arange(side) - (side - 1) / 2)

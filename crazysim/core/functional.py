@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
@@ -61,18 +62,23 @@ def state_control(
 
 
 def check_setpoint(
-    data: SimData, controls: ArrayLike | None, check_finite: bool, *, feedforward: ArrayLike | None, **parts: Any
+    data: SimData,
+    controls: ArrayLike | None,
+    check_finite: bool,
+    *,
+    feedforward: ArrayLike | None,
+    **parts: ArrayLike | None,
 ) -> tuple[Array | NDArray, Array | NDArray | None]:
     """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
 
     Arguments and errors as in ``state_control``; of the data, shapes and types are enough.
     """
-    parts = {name: x for name, x in parts.items() if x is not None}
+    given = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
-        controls = _joined(data, parts)
-    elif parts:
+        controls = _joined(data, given)
+    elif given:
         raise ConfigError(
-            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(parts)}. Write them "
+            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(given)}. Write them "
             f"into the vector, or leave it out."
         )
     command = check_command(data, Control.state, controls, check_finite)
@@ -84,7 +90,7 @@ def check_setpoint(
     return command, _as_command(data, "feedforward", shape, FEEDFORWARD, feedforward, check_finite)
 
 
-def _joined(data: SimData, parts: dict[str, Any]) -> Array | np.ndarray:
+def _joined(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:
     """Return the setpoint of some parts, on the host if all of them are. (n_worlds, n_drones, 16)
 
     Raises:
@@ -99,7 +105,7 @@ def _joined(data: SimData, parts: dict[str, Any]) -> Array | np.ndarray:
     return _setpoint(np, counts, float, given)
 
 
-def _part(name: str, value: Any, shape: tuple[int, ...]) -> Array | np.ndarray:
+def _part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:
     """Return a part of a setpoint as an array that broadcasts to a shape."""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)
@@ -114,7 +120,7 @@ def _part(name: str, value: Any, shape: tuple[int, ...]) -> Array | np.ndarray:
     return array
 
 
-def _setpoint(xp: Any, counts: tuple[int, ...], dtype: Any, parts: dict[str, Any]) -> Any:
+def _setpoint(xp: Any, counts: tuple[int, ...], dtype: DTypeLike, parts: Mapping[str, ArrayLike]) -> Any:
     """Return the setpoint of some parts, with zeros for the others and for the body rates. (n_worlds, n_drones, 16)"""
     zeros = xp.zeros((*counts, 3), dtype)
     vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]

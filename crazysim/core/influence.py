@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.plugin import Plugin
 from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
+
+T = TypeVar("T")
 
 
 def influenced(plugin: Plugin, data: SimData) -> SimData:
@@ -96,7 +98,7 @@ def constrained(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float |
     return _called(where, lambda seen: plugin.constrain(seen, deriv, dt), data, plugin.coupling)
 
 
-def _called(where: str, method: Callable[[SimData], Any], data: SimData, scope: str = "drone") -> Any:
+def _called(where: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
     """Return the result of a plugin's method; its errors carry a note with plugin and method."""
     try:
         return method(data)

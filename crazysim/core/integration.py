@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TypeVar
 
 import jax
 from jax import Array
@@ -14,6 +15,9 @@ from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.influence import constrained, influenced, own_rates
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import Stage, over_drones
+from crazysim.pytree import PyTree
+
+R = TypeVar("R", bound=PyTree)
 
 DerivFn = Callable[[SimData], SimStateDeriv]
 
@@ -94,11 +98,13 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool
     )
     if not deriv.plugins:
         return data.replace(states=states)
-    moved = {}
-    for name, rates in deriv.plugins.items():
-        record = data.plugins[name]
-        moved[name] = record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
+    moved = {name: along(data.plugins[name], rates, dt) for name, rates in deriv.plugins.items()}
     return data.replace(states=states, plugins=data.plugins | moved)
+
+
+def along(record: R, rates: Mapping[str, Array], dt: float) -> R:
+    """Return a record ``dt`` seconds along a derivative, by field."""
+    return record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
 
 
 def limit_ang_vel(ang_vel: Array, freq: float) -> Array:

@@ -7,7 +7,7 @@ array has an axis of pairs there: ``plain`` forms one, kernels loop over the dro
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -87,14 +87,14 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     return structure.unflatten(found)
 
 
-def _outside(*args: Any, **params: Any) -> Any:
+def _outside(*args: object, **params: object) -> NoReturn:
     raise ConfigError(
         "expected reduce_over_others in a function of one drone that a stage applies to all drones of a world, got a "
         "call outside of one. Use it in stage('drone') or in the influence of a plugin."
     )
 
 
-def _results(*args: Any, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list[Any]:
+def _results(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list[Any]:
     return [x.update(weak_type=False) for x in jaxpr.out_avals]
 
 

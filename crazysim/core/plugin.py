@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Protocol, dataclass_transform
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar, dataclass_transform
 
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike, DTypeLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
@@ -19,6 +21,9 @@ from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree, on_device
 from crazysim.tables import LARGEST
+
+P = TypeVar("P", bound="Plugin")
+R = TypeVar("R", bound=PyTree)
 
 
 class Simulation(Protocol):
@@ -31,7 +36,7 @@ class Simulation(Protocol):
     integrator: Any
     n_worlds: int
     n_drones: int
-    lock: Any
+    lock: AbstractContextManager[object]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -48,11 +53,11 @@ class Simulation(Protocol):
         """Airframe of all drones; an error where they have several."""
         ...
 
-    def add(self, plugin: Any, name: str | None = None) -> Any:
+    def add(self, plugin: P, name: str | None = None) -> P:
         """Add a plugin and return it."""
         ...
 
-    def build_step_fn(self) -> Any:
+    def build_step_fn(self) -> object:
         """Compile the step pipeline as it is now."""
         ...
 
@@ -71,16 +76,35 @@ class Placement:
     """Name of the stage; None for the plugin's."""
 
 
-def parameter(*, default: Any = dataclasses.MISSING) -> Any:
+class _Limits(NamedTuple):
+    """Values that a setting may have; the arguments of ``check_parameter`` that a plugin declares."""
+
+    low: float
+    high: float
+    positive: bool
+    per_axis: bool
+    dtype: DTypeLike | None
+
+
+def parameter(
+    *,
+    default: Any = dataclasses.MISSING,
+    low: float = -np.inf,
+    high: float = np.inf,
+    positive: bool = False,
+    per_axis: bool = False,
+    dtype: DTypeLike | None = None,
+) -> Any:
     """Declare a field of a plugin whose value only fills numbers of its record.
 
     ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
-    ``derivative`` must read the number from the record, never from the field.
+    ``derivative`` must read the number from the record, never from the field. ``Plugin.filled`` checks it against the
+    limits given here, which are those of ``check_parameter``.
     """
-    return dataclasses.field(default=default, metadata={"parameter": True})
+    return dataclasses.field(default=default, metadata={"parameter": _Limits(low, high, positive, per_axis, dtype)})
 
 
-def of_airframes(sim: Simulation, number: Callable[[Airframe], Any]) -> Any:
+def of_airframes(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
     """Return a number of the airframe, as ``check_parameter`` takes it: one for all drones, or one for each.
 
     Args:
@@ -102,12 +126,13 @@ def of_airframes(sim: Simulation, number: Callable[[Airframe], Any]) -> Any:
 def check_parameter(
     sim: Simulation,
     name: str,
-    value: Any,
+    value: ArrayLike,
     core: tuple[int, ...] = (1,),
     low: float = -np.inf,
     high: float = np.inf,
-    dtype: Any = None,
+    dtype: DTypeLike | None = None,
     positive: bool = False,
+    per_axis: bool = False,
 ) -> Array:
     """Return a setting as an array that all drones share, or with one entry per drone.
 
@@ -121,6 +146,7 @@ def check_parameter(
         high: Largest value allowed.
         dtype: Type; None for that of the states.
         positive: Refuse zero and negative values.
+        per_axis: Accept one number for a vector, for each axis.
 
     Returns:
         (*core) or (n_worlds, n_drones, *core)
@@ -133,7 +159,7 @@ def check_parameter(
     if core == (1,) and array.shape == batch:
         array = array[..., None]
     is_number = array.dtype.kind in ("iu" if dtype is not None and np.issubdtype(dtype, np.integer) else "iuf")
-    is_shared = array.shape == core or (array.ndim == 0 and core != (3,))
+    is_shared = array.shape == core or (array.ndim == 0 and (per_axis or core != (3,)))
     if not is_number or not (is_shared or array.shape == (*batch, *core)):
         raise ConfigError(
             f"expected {name} as {'whole' if dtype is not None else 'real'} numbers of shape {core} for all drones, or "
@@ -150,6 +176,12 @@ def check_parameter(
         raise ConfigError(f"expected {name} to be finite and {bounds}, got {value!r}")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
     return on_device(np.broadcast_to(array, core) if is_shared else array, dtype)
+
+
+def per_drone(sim: Simulation, value: ArrayLike, *core: int) -> Array:
+    """Return a number for every drone, of the states' type. (n_worlds, n_drones, *core)"""
+    shape = (*sim.data.states.pos.shape[:2], *core)
+    return on_device(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, dataclasses.field))
@@ -207,6 +239,34 @@ class Plugin:
     def default_record(self, sim: Simulation) -> PyTree | None:
         """Return the record that resets restore; by default the same as ``record``."""
         return self.record(sim)
+
+    def filled(self, sim: Simulation, kind: type[R], **given: Any) -> R:
+        """Return a record for all worlds, whose other fields follow from their declarations.
+
+        A parameter has the value of the plugin's setting of that name, checked; without a fixed core shape it has one
+        number for each rotor. A state of drones with a fixed core shape is zero. A setting of None is None.
+
+        Args:
+            sim: The simulation.
+            kind: Class of the record.
+            given: Fields as they are to be.
+
+        Raises:
+            ConfigError: If a setting is invalid.
+        """
+        limits = {f.name: f.metadata.get("parameter") for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        values = dict(given)
+        for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+            name, scope, core = field.name, field.metadata.get("scope"), field.metadata.get("core")
+            if name in given:
+                continue
+            if scope == "drone" and core is not None:
+                values[name] = per_drone(sim, 0.0, *core)
+            elif scope == "parameter" and limits.get(name):
+                value, core = getattr(self, name), core or sim.data.states.rotor_vel.shape[-1:]
+                checked = None if value is None else check_parameter(sim, name, value, core, **limits[name]._asdict())
+                values[name] = checked
+        return kind(**values)
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of the plugin with their places, in the order in which they are inserted."""

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.influence import own_rates
-from crazysim.core.integration import Integrator
+from crazysim.core.integration import Integrator, along
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import RESERVED, Stage, tick
@@ -177,7 +178,7 @@ class Population(Plugin):
         """
         return record.replace(**{k: x for k, x in (("pos", pos), ("quat", quat)) if k in _fields(record)})
 
-    def commanded(self, data: SimData, command: Any) -> SimData:
+    def commanded(self, data: SimData, command: ArrayLike) -> SimData:
         """Return the data of all worlds with a command for every member. (n_worlds, n_members, k)
 
         Raises:
@@ -206,11 +207,6 @@ class Population(Plugin):
 
 Rates = Callable[[R], dict[str, Array]]
 """From the record of one member to its derivatives by field."""
-
-
-def along(record: R, rates: Mapping[str, Array], dt: float) -> R:
-    """Return a record ``dt`` seconds along a derivative."""
-    return record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
 
 
 def euler(record: R, rates: Rates, dt: float) -> R:
@@ -252,7 +248,7 @@ def _fields(record: Members) -> set[str]:
     return {f.name for f in dataclasses.fields(record)}  # type: ignore[arg-type]
 
 
-def check_command(name: str, shape: tuple[int, ...], command: Any, dtype: Any) -> Array | np.ndarray:
+def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: Any) -> Array | np.ndarray:
     """Return a command of some shape as an array of a type.
 
     Raises:

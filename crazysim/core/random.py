@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from typing import Any
 
 import jax
 from jax import Array
@@ -16,7 +15,7 @@ from jax import Array
 from crazysim.core.data import SimData, as_key
 
 
-def seed_sim(data: SimData, seed: int | Array, device: Any = None) -> SimData:
+def seed_sim(data: SimData, seed: int | Array, device: jax.Device | None = None) -> SimData:
     """Return the data with another seed or key for all random numbers drawn from now on.
 
     Args:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control, Controller
 from crazysim.control.switch import Switch
@@ -32,7 +32,7 @@ SLOW_FREQ = 200
 stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
 
 
-def positive(name: str, value: Any, at_most: int | None = None) -> int:
+def positive(name: str, value: object, at_most: int | None = None) -> int:
     """Return a positive integer.
 
     Args:
@@ -50,7 +50,7 @@ def positive(name: str, value: Any, at_most: int | None = None) -> int:
     return int(value)
 
 
-def flag(name: str, value: Any) -> bool:
+def flag(name: str, value: object) -> bool:
     """Return a setting that is on or off.
 
     Args:
@@ -76,7 +76,9 @@ def check_flags(settings: Any) -> None:
             flag(f"{field.name} of {type(settings).__name__}", getattr(settings, field.name))
 
 
-def check_contacts(freq: int, friction: Any, restitution: Any, softness: Any, iterations: Any) -> None:
+def check_contacts(
+    freq: int, friction: ArrayLike, restitution: ArrayLike, softness: ArrayLike, iterations: object
+) -> None:
     """Check the settings of contacts.
 
     Args:
@@ -98,7 +100,7 @@ def check_contacts(freq: int, friction: Any, restitution: Any, softness: Any, it
     positive("iterations", iterations, MAX_ITERATIONS)
 
 
-def physics_freq(freq: Any) -> int:
+def physics_freq(freq: object) -> int:
     """Return the rate of physics steps, Hz.
 
     Raises:
@@ -113,7 +115,7 @@ def physics_freq(freq: Any) -> int:
     return freq
 
 
-def member(enum: type[E], name: str, value: Any) -> E:
+def member(enum: type[E], name: str, value: object) -> E:
     """Return the member of an enum.
 
     Raises:
@@ -151,7 +153,7 @@ def find_device(device: str | jax.Device) -> jax.Device:
         ) from None
 
 
-def as_rgba(rgba: Any, n: int | None = None, name: str = "rgba") -> NDArray[np.float64]:
+def as_rgba(rgba: object, n: int | None = None, name: str = "rgba") -> NDArray[np.float64]:
     """Return a colour. (4,)
 
     Args:
@@ -175,7 +177,7 @@ def as_rgba(rgba: Any, n: int | None = None, name: str = "rgba") -> NDArray[np.f
     return array.astype(np.float64)
 
 
-def as_mask(mask: Any, *shapes: tuple[int, ...], each: str = "world") -> Array | None:
+def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Array | None:
     """Return a mask as an array; None, for all, stays None.
 
     Of a traced mask shape and type are checked, which are known while it is traced.
@@ -278,7 +280,7 @@ def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[
     return {name: _largest_divisor(freq, default) for name, default in defaults.items()}
 
 
-def dividing_rate(name: str, rate: Any, freq: int) -> int:
+def dividing_rate(name: str, rate: object, freq: int) -> int:
     """Return a rate that was set, Hz.
 
     Raises:

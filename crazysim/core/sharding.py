@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import numpy as np
@@ -14,6 +14,8 @@ from crazysim.core.data import SimData
 from crazysim.core.stage import with_leaves
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_batch_axes, scopes
+
+T = TypeVar("T")
 
 WORLD_AXIS = "worlds"
 """Name of the mesh axis over which worlds are distributed."""
@@ -47,11 +49,11 @@ def locate(x: jax.Array) -> Location:
     return Location(platform, devices, cast(Mesh, x.sharding.mesh), spec[0] if len(spec) else None)
 
 
-def put(tree: Any, device: jax.Device) -> Any:
+def put(tree: T, device: jax.Device) -> T:
     """Return the tree committed to a device, itself if it is; leaves that are remain the same arrays."""
     here = SingleDeviceSharding(device)
 
-    def is_here(x: Any) -> bool:
+    def is_here(x: object) -> bool:
         return isinstance(x, jax.Array) and x.committed and x.sharding == here
 
     leaves, treedef = jax.tree.flatten(tree)
@@ -62,7 +64,7 @@ def put(tree: Any, device: jax.Device) -> Any:
     return treedef.unflatten(with_leaves(leaves, away, placed))
 
 
-def commit(x: Any, device: jax.Device) -> jax.Array:
+def commit(x: jax.Array, device: jax.Device) -> jax.Array:
     """Return an array committed to a device. Under a trace, the function that is compiled then runs on it.
 
     JAX compiles a function of uncommitted arrays for its default device. If that is the device, or under a mesh, which
@@ -77,7 +79,7 @@ def commit(x: Any, device: jax.Device) -> jax.Array:
     return jax.lax.with_sharding_constraint(x, SingleDeviceSharding(device))
 
 
-def beside(x: Any) -> AbstractContextManager[Any]:
+def beside(x: object) -> AbstractContextManager[object]:
     """Return a context in which new arrays are made on the device of an array, not on JAX's default one.
 
     It changes nothing under a trace, whose program runs where its arguments are, and for arrays of several devices.
@@ -119,6 +121,6 @@ def shard(data: SimData, mesh: Mesh) -> SimData:
     return jax.device_put(data, shardings_of(data, mesh))
 
 
-def shard_scene(mjx_data: Any, mesh: Mesh) -> Any:
+def shard_scene(mjx_data: T, mesh: Mesh) -> T:
     """Return the MJX data of all worlds distributed over a mesh."""
     return jax.device_put(mjx_data, NamedSharding(mesh, PartitionSpec(WORLD_AXIS)))

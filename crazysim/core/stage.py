@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.data import SimData
 from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, numbered, scopes
+
+T = TypeVar("T")
 
 StageScope = str
 """``"drone"``, ``"world"``, ``"batch"`` for all worlds, or the name of a population."""
@@ -45,20 +48,20 @@ class Stage:
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
         self.__doc__ = fn.__doc__
 
-    def __call__(self, data: Any) -> Any:
+    def __call__(self, data: SimData) -> SimData:
         """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
             return self.one(data)
         return _over_worlds(self, data)
 
-    def one(self, data: Any) -> Any:
+    def one(self, data: SimData) -> SimData:
         """Return the data of one drone or world after the stage."""
         after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
             return after
 
-        def select(new: Any, old: Any) -> Any:
+        def select(new: Array, old: Array) -> Array:
             return new if new is old else jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - mask.ndim)), new, old)
 
         return jax.tree.map(select, after, data)
@@ -98,7 +101,7 @@ def stage(scope: StageScope, when: Callable[..., Array | None] | None = None) ->
     return lambda fn: Stage(fn, scope, when)
 
 
-def tick(data: Any, freq: int) -> Array | None:
+def tick(data: SimData, freq: int) -> Array | None:
     """Return where a controller of a rate acts at this step, or None if it does always. (n_worlds, 1), or () for one"""
     period = data.core.freq // freq
     return None if period == 1 else data.core.steps % period == 0
@@ -117,7 +120,7 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
 class Axes:
     """Names and batch axes of all leaves of a simulation's data."""
 
-    def __init__(self, data: Any):
+    def __init__(self, data: SimData):
         """Take the data of all worlds."""
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
@@ -125,7 +128,7 @@ class Axes:
         """Number of every leaf, by its path."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
-    def written(self, before: list[Any], after: Any, stage: Stage) -> list[int]:
+    def written(self, before: list[Array], after: SimData, stage: Stage) -> list[int]:
         """Return the numbers of the leaves that a stage wrote, and check that it may.
 
         Raises:
@@ -175,11 +178,11 @@ class Axes:
             )
         return [stage.scope]
 
-    def shapes_of_one(self, leaves: list[Any], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
+    def shapes_of_one(self, leaves: list[Array], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
         """Return what a stage is given, for each leaf of all worlds: its shape and type for one drone or world."""
         return [self.shape_of_one(i, x, scope) for i, x in enumerate(leaves)]
 
-    def shape_of_one(self, i: int, x: Any, scope: StageScope) -> jax.ShapeDtypeStruct:
+    def shape_of_one(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the same for the leaf with number ``i``."""
         own, taken = self.scopes[i], 0
         if scope != "batch" and own != "batched":
@@ -187,7 +190,7 @@ class Axes:
         return jax.ShapeDtypeStruct(jnp.shape(x)[taken:], x.dtype)
 
 
-def with_leaves(leaves: Sequence[Any], numbers: Sequence[int], values: Sequence[Any]) -> list[Any]:
+def with_leaves(leaves: Sequence[T], numbers: Sequence[int], values: Sequence[T]) -> list[T]:
     """Return a list of leaves in which those of some numbers are replaced."""
     out = list(leaves)
     for i, value in zip(numbers, values, strict=True):
@@ -253,12 +256,12 @@ def over_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
     return of_all
 
 
-def over_drones(fn: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def over_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
     """Return a function of the data of one drone as a function of the data of one world; see ``over_members``."""
     return over_members(fn, "drone")
 
 
-def over_members(fn: Callable[[Any], Any], population: str) -> Callable[[Any], Any]:
+def over_members(fn: Callable[[SimData], Any], population: str) -> Callable[[SimData], Any]:
     """Return a function of the data of one member of a population as a function of the data of one world.
 
     Args:
@@ -266,7 +269,7 @@ def over_members(fn: Callable[[Any], Any], population: str) -> Callable[[Any], A
         population: Name of the population, or ``"drone"``.
     """
 
-    def of_world(data: Any) -> Any:
+    def of_world(data: SimData) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == population else None for scope in jax.tree.leaves(scopes(data))]
         return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=AXIS)(leaves)
@@ -274,28 +277,28 @@ def over_members(fn: Callable[[Any], Any], population: str) -> Callable[[Any], A
     return of_world
 
 
-def _kinds(tree: Any) -> list[str]:
+def _kinds(tree: object) -> list[str]:
     """Return the scope of every leaf: as its record declares it, and ``batched`` outside of records."""
 
-    def is_record(x: Any) -> bool:
+    def is_record(x: object) -> bool:
         return isinstance(x, PyTree)
 
     return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batched", tree, is_leaf=is_record))
 
 
-def _over_worlds(stage: Stage, data: Any) -> Any:
+def _over_worlds(stage: Stage, data: SimData) -> SimData:
     """Return the data after ``stage.one`` in every world, and for every drone or member that it is declared for."""
     return over_worlds(of_world(stage, Axes(data)), 2)(data)
 
 
-def of_world(stage: Stage, axes: Axes) -> Callable[[Any], Any]:
+def of_world(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
     """Return a stage as a function of the data of one world, with a condition that selects its results."""
 
-    def of_one_world(world: Any) -> Any:
+    def of_one_world(world: SimData) -> SimData:
         leaves = jax.tree.leaves(world)
         written: list[int] = []
 
-        def one(values: list[Any]) -> list[Any]:
+        def one(values: list[Array]) -> list[Array]:
             after = stage.one(axes.treedef.unflatten(values))
             written[:] = axes.written(values, after, stage)
             new = jax.tree.leaves(after)

@@ -19,7 +19,7 @@ from crazysim.control import (
     state2attitude,
 )
 from crazysim.core.controllers import controller_stages
-from crazysim.core.data import SimData, SimStateDeriv
+from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
@@ -80,15 +80,10 @@ def cascade_stages(control: Control, fitted_model: bool) -> Pipeline:
     return stages
 
 
-def _controls(data: SimData) -> Any:
-    """Return the controls untyped: which of their fields are None follows from the pipeline a stage stands in."""
-    return data.controls
-
-
 @_built_in("drone", when=_ticks("state"))
 def state_controller(data: SimData) -> SimData:
     """Take over the staged setpoint, and stage the attitude, thrust and body rates that lead to it."""
-    states, controls = data.states, _controls(data)
+    states, controls = data.states, controls_of(data)
     ctrl, attitude = controls.state, controls.attitude
     cmd = ctrl.staged_cmd
     attitude_cmd, pos_err_i = state2attitude(
@@ -112,7 +107,7 @@ def commit_attitude(data: SimData) -> SimData:
 @_built_in("drone", when=_ticks("attitude"))
 def attitude_controller(data: SimData) -> SimData:
     """Take over the staged attitude command, and stage the wrench that turns the drone there."""
-    states, controls = data.states, _controls(data)
+    states, controls = data.states, controls_of(data)
     ctrl = controls.attitude
     wrench, r_int_error = attitude2force_torque(
         states.quat,
@@ -138,7 +133,7 @@ def attitude_controller(data: SimData) -> SimData:
 @_built_in("drone", when=_ticks("body_rate"))
 def body_rate_controller(data: SimData) -> SimData:
     """Take over the staged body rates, and stage the wrench that follows them."""
-    states, controls = data.states, _controls(data)
+    states, controls = data.states, controls_of(data)
     ctrl = controls.body_rate
     cmd = ctrl.staged_cmd
     wrench, r_int_error = body_rate2force_torque(
@@ -159,7 +154,7 @@ def body_rate_controller(data: SimData) -> SimData:
 @_built_in("drone", when=_ticks("force_torque"))
 def force_torque_controller(data: SimData) -> SimData:
     """Take over the staged wrench, and command the rotor speeds that give it."""
-    controls = _controls(data)
+    controls = controls_of(data)
     ctrl = controls.force_torque
     rotor_vel = force_torque2rotor_vel(ctrl.staged_cmd, params=ctrl.params)
     force_torque = ctrl.replace(cmd=ctrl.staged_cmd)
@@ -169,7 +164,7 @@ def force_torque_controller(data: SimData) -> SimData:
 @_built_in("drone")
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
     """Keep commanded rotor speeds within what the motors can do; zero or less is off."""
-    rotor_vel = first_principles.saturate(_controls(data).rotor_vel, data.params)
+    rotor_vel = first_principles.saturate(controls_of(data).rotor_vel, data.params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 
@@ -183,13 +178,13 @@ def clip_thrust_cmd(data: SimData) -> SimData:
 
 def first_principles_derivative(data: SimData) -> SimStateDeriv:
     """Return the derivative of every drone from first principles."""
-    return _derivative(data, first_principles.dynamics, _controls(data).rotor_vel)
+    return _derivative(data, first_principles.dynamics, controls_of(data).rotor_vel)
 
 
 def first_principles_euler_derivative(data: SimData) -> SimStateDeriv:
     """Return the derivative of every drone from first principles for an Euler step, stable at any body rate."""
     dynamics = functools.partial(first_principles.dynamics, dt=1 / data.core.freq)
-    return _derivative(data, dynamics, _controls(data).rotor_vel)
+    return _derivative(data, dynamics, controls_of(data).rotor_vel)
 
 
 def fitted_derivative(data: SimData) -> SimStateDeriv:
@@ -221,18 +216,21 @@ def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
     return held
 
 
-@_built_in("drone")
-def clip_floor_pos(data: SimData) -> SimData:
-    """Stop drones at the floor: one that is below it, or on it and not rising, is set on it, at rest."""
-    s = data.states
+def stopped_at(s: SimState, lowest: Array | float) -> SimState:
+    """Return states in which a drone below a height, m (..., 1), or on it and not rising, is on it, at rest."""
     height, climb = s.pos[..., 2:], s.vel[..., 2:]
-    stopped = (height < FLOOR) | ((height == FLOOR) & (climb <= 0))
-    states = s.replace(
-        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, FLOOR)], axis=-1),
+    stopped = (height < lowest) | ((height == lowest) & (climb <= 0))
+    return s.replace(
+        pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, lowest)], axis=-1),
         vel=jnp.where(stopped, 0.0, s.vel),
         ang_vel=jnp.where(stopped, 0.0, s.ang_vel),
     )
-    return data.replace(states=states)
+
+
+@_built_in("drone")
+def clip_floor_pos(data: SimData) -> SimData:
+    """Stop drones at the floor."""
+    return data.replace(states=stopped_at(data.states, FLOOR))
 
 
 @_built_in("world")
@@ -282,7 +280,7 @@ def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> Si
     mask = as_mask(mask, data.core.steps.shape[:1])
     plugins = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
 
-    def restore(scope: str, x: Any, default: Any) -> Any:
+    def restore(scope: str, x: Array, default: Array) -> Array:
         if n_batch_axes(scope):
             return select_worlds(mask, default, x)
         return default if mask is None else x

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
 
-from crazysim.drones.keys import GUIDE, KEYS
+from crazysim.drones.airframe import Airframe
+from crazysim.drones.keys import GUIDE, LAYOUT
 from crazysim.errors import ConfigError, shown
 from crazysim.tables import INERTIA, check_numbers
-
-if TYPE_CHECKING:
-    from crazysim.drones.airframe import Airframe
 
 GRAVITY = 9.81
 """Gravitational acceleration, m/s^2."""
@@ -39,7 +34,7 @@ def check_airframe(airframe: Airframe) -> None:
         raise ConfigError(f"{owner}: expected rotors.position of shape (n, 3), got {position.shape}")
     n = len(position)
     for path, value in airframe.values.items():
-        check_numbers(owner, path, value, KEYS[path], n)
+        check_numbers(owner, path, value, LAYOUT.keys[path], n)
     for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):
         airframe.value(path)
     for problem in (_inertia, _rotors, _curves, _forces, _controller, _camera):
@@ -130,7 +125,10 @@ def _forces(airframe: Airframe) -> str | None:
     numbers, n = airframe.values, airframe.n_rotors
     weight, most = numbers["rigid_body.mass"] * GRAVITY, n * numbers["rotors.thrust_max"]
     for path in ("drag.coefficients", "fitted.so_rpy_rotor_drag.drag_coefficients"):
-        if path in numbers and np.max(np.linalg.eigvalsh(_symmetric(numbers[path]))) > 1e-12:
+        if (
+            path in numbers
+            and np.max(np.linalg.eigvalsh((airframe.matrix(path) + airframe.matrix(path).T) / 2)) > 1e-12
+        ):
             return f"expected {path} that brakes, so negative or zero, got {shown(numbers[path].tolist())}"
     for model in airframe.tables.get("fitted", {}):
         known = [numbers.get(f"fitted.{model}.{key}") for key in ("acc_coef", "cmd_f_coef")]
@@ -160,9 +158,3 @@ def _camera(airframe: Airframe) -> str | None:
     if camera is not None and not abs(camera[0]) > 0:
         return f"expected track_camera behind or ahead of the drone, with x other than 0, got {camera.tolist()}"
     return None
-
-
-def _symmetric(drag: NDArray) -> NDArray:
-    """Return the symmetric part of drag coefficients, on which the power depends. (3, 3)"""
-    matrix = np.diag(drag) if drag.ndim == 1 else drag
-    return (matrix + matrix.T) / 2

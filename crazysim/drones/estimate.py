@@ -43,6 +43,8 @@ CELL_RESISTANCE = 0.015
 """Resistance of a cell times its capacity, ohm A h."""
 DISC_LOADING = 1e4
 """Thrust over disc area that only wrong units exceed, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
+MotorTable = str | Path | Mapping[str, ArrayLike]
+"""Path of a CSV file, or its columns."""
 COLUMNS = {
     "throttle": ("throttle", 1.0),
     "thrust_n": ("thrust", 1.0),
@@ -93,7 +95,7 @@ def estimate_airframe(
     positions: ArrayLike | None = None,
     spins: Sequence[int] | None = None,
     thrust_to_weight: float | None = None,
-    motor_table: str | Path | Mapping[str, ArrayLike] | None = None,
+    motor_table: MotorTable | None = None,
     pitch: float | None = None,
     inertia: ArrayLike | None = None,
     time_constant: float | None = None,
@@ -183,7 +185,7 @@ class _File:
         self.tables: dict[str, list[str]] = {}
         self.sources: dict[str, str] = {}
 
-    def add(self, table: str, key: str, value: Any, unit: str, source: str, **numbers: Any) -> None:
+    def add(self, table: str, key: str, value: ArrayLike, unit: str, source: str, **numbers: Any) -> None:
         """Add a number with its unit and a source of ``SOURCES``, which ``numbers`` are filled into."""
         if source not in self.sources:
             self.describe(source, SOURCES[source].format(**numbers) if numbers else SOURCES[source])
@@ -226,7 +228,13 @@ def _toml(value: Any) -> str:
 
 
 def _rotors(
-    file: _File, arm: Any, n_rotors: int, layout: str, positions: Any, spins: Any, propeller: float
+    file: _File,
+    arm: Any,
+    n_rotors: int,
+    layout: str,
+    positions: ArrayLike | None,
+    spins: Sequence[int] | None,
+    propeller: float,
 ) -> tuple[NDArray, NDArray]:
     """Return positions and signs of the yaw torques of the rotors."""
     if (arm is None) == (positions is None):
@@ -276,7 +284,15 @@ def _inertia(mass: float, places: NDArray) -> NDArray:
     return np.diag(matrix) if np.max(np.abs(off)) < 1e-6 * np.max(matrix) else matrix
 
 
-def _thrusts(file: _File, mass: float, n: int, diameter: float, ratio: Any, table: Any, pitch: float | None) -> float:
+def _thrusts(
+    file: _File,
+    mass: float,
+    n: int,
+    diameter: float,
+    ratio: Any,
+    table: MotorTable | None,
+    pitch: float | None,
+) -> float:
     """Add the thrust and its curves; return the largest thrust of one rotor, N."""
     if (ratio is None) == (table is None):
         raise ConfigError(
@@ -341,7 +357,7 @@ def _quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
     return k, float(np.max(np.abs(values - k * squares)))
 
 
-def _motor_table(table: Any) -> dict[str, NDArray]:
+def _motor_table(table: MotorTable) -> dict[str, NDArray]:
     """Return the columns of a motor table by quantity, in SI units and rpm."""
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
     known = ", ".join(COLUMNS)

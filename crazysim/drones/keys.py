@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
-from typing import Any
-
-from crazysim.errors import ConfigError, shown
 from crazysim.tables import (
     LENGTH,
     MASS,
@@ -15,6 +10,7 @@ from crazysim.tables import (
     PLACE,
     POSITIVE,
     Key,
+    Layout,
     Range,
     Shapes,
 )
@@ -105,72 +101,9 @@ TABLES: dict[str, dict[str, Key]] = {
 }
 """All tables by dotted path, with the keys of each."""
 
-KEYS: dict[str, Key] = {f"{table}.{key}": entry for table, keys in TABLES.items() for key, entry in keys.items()}
-"""Shapes and ranges of all numbers, by dotted path."""
-
-TOP_LEVEL = ("name", "base", "sources")
-"""Keys outside of tables."""
-
-ENTRY = ("value", "unit", "source")
-"""Keys of a number that is written with its unit and source."""
-
-
-def check_keys(airframe: str, tables: Mapping[str, Any], prefix: str = "") -> None:
-    """Check that tables and keys, as a user wrote them, are documented ones.
-
-    Args:
-        airframe: Name and origin of the airframe, for messages.
-        tables: The tables, with plain numbers or with units and sources.
-        prefix: Dotted path of these tables, with a dot at the end; empty for all.
-
-    Raises:
-        ConfigError: If a table or key does not exist, with those that are probably meant.
-    """
-    for key, item in tables.items():
-        path = f"{prefix}{key}"
-        if path in TOP_LEVEL:
-            continue
-        if path in TABLES:
-            if not isinstance(item, Mapping):
-                raise ConfigError(f"{airframe}: expected a table [{path}], got {shown(item)}. {GUIDE} lists its keys.")
-            check_keys(airframe, item, f"{path}.")
-        elif path in KEYS:
-            _check_entry(airframe, path, item)
-        elif isinstance(item, Mapping) and "value" not in item:
-            raise ConfigError(f"{airframe}: expected a table that exists, got [{path}]. {_nearest_table(path)}")
-        else:
-            known = [*KEYS, *TOP_LEVEL] if not prefix else list(KEYS)
-            raise ConfigError(f"{airframe}: expected a key that exists, got {path!r}. {suggestion(path, known)}")
-
-
-def suggestion(path: str, paths: Iterable[str]) -> str:
-    """Return the paths that are probably meant: first the same key in another table, then those spelt alike."""
-    paths = list(paths)
-    table, _, key = path.rpartition(".")
-    same_table = {p.rpartition(".")[2]: p for p in paths if p.rpartition(".")[0] == table}
-    keys = {p.rpartition(".")[2]: p for p in paths}
-    found = [p for p in paths if p.rpartition(".")[2] == key]
-    found += [same_table[k] for k in difflib.get_close_matches(key, same_table)]
-    found += difflib.get_close_matches(path, paths)
-    found += [keys[k] for k in difflib.get_close_matches(key, keys)]
-    return _did_you_mean(repr(p) for p in dict.fromkeys(found))
-
-
-def _check_entry(airframe: str, path: str, item: Any) -> None:
-    if not isinstance(item, Mapping):
-        return
-    unknown = [key for key in item if key not in ENTRY]
-    if unknown or "value" not in item:
-        raise ConfigError(
-            f"{airframe}: expected {path} as a number, an array or {{ value, unit, source }}, got {shown(dict(item))}. "
-            f"{GUIDE} shows both forms."
-        )
-
-
-def _nearest_table(path: str) -> str:
-    return _did_you_mean(f"[{table}]" for table in difflib.get_close_matches(path, TABLES))
-
-
-def _did_you_mean(candidates: Iterable[str]) -> str:
-    found = list(candidates)[:3]
-    return f"Did you mean {' or '.join(found)}? {GUIDE} lists all keys." if found else f"{GUIDE} lists all keys."
+LAYOUT = Layout(
+    {f"{table}.{key}": entry for table, keys in TABLES.items() for key, entry in keys.items()},
+    ("name", "base", "sources"),
+    GUIDE,
+)
+"""Keys of airframes."""

@@ -65,7 +65,6 @@ class Params(PyTree):
         thrust_curve = airframe.value("rotors.thrust_curve")
         # In float64, whatever the precision of the simulation: the limits are constants, not results.
         low, high = airframe.rotor_vel_limits
-        drag = airframe.value("drag.coefficients")
         return Params(
             mass=as_parameter(airframe.value("rigid_body.mass")),
             L=as_parameter(airframe.arm),
@@ -76,7 +75,7 @@ class Params(PyTree):
             rpm2thrust=as_parameter(np.atleast_2d(thrust_curve)),
             rpm2torque=as_parameter(np.atleast_2d(airframe.value("rotors.torque_curve"))),
             mixing_matrix=as_parameter(airframe.mixing_matrix),
-            drag_matrix=as_parameter(np.diag(drag) if drag.ndim == 1 else drag),
+            drag_matrix=as_parameter(airframe.matrix("drag.coefficients")),
             rotor_dyn_coef=as_parameter(np.atleast_2d(airframe.value("rotors.lag"))),
             rotor_vel_min=as_parameter(low),
             rotor_vel_max=as_parameter(high),

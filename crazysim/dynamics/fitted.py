@@ -79,8 +79,7 @@ class Params(PyTree):
         has_lag = dynamics in (Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
         drag_matrix = None
         if dynamics == Dynamics.so_rpy_rotor_drag:
-            drag = airframe.value("fitted.so_rpy_rotor_drag.drag_coefficients")
-            drag_matrix = as_parameter(np.diag(drag) if drag.ndim == 1 else drag)
+            drag_matrix = as_parameter(airframe.matrix("fitted.so_rpy_rotor_drag.drag_coefficients"))
         return Params(
             mass=as_parameter(airframe.value("rigid_body.mass")),
             gravity_vec=as_parameter(GRAVITY),

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from enum import StrEnum
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from crazysim.drones import Airframe, Drone, load_airframe
+from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
 
 RINGING = 1.5
@@ -33,7 +30,7 @@ class Dynamics(StrEnum):
     default = first_principles
 
 
-def supported_dynamics(drone: str | Path | Mapping[str, Any] | Airframe) -> tuple[Dynamics, ...]:
+def supported_dynamics(drone: AirframeSource) -> tuple[Dynamics, ...]:
     """Return the models for which an airframe, or a source of one as in ``load_airframe``, has parameters."""
     airframe = load_airframe(drone)
     fitted = airframe.tables.get("fitted", {})
@@ -73,7 +70,7 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
         ConfigError: If steps diverge; the message has the least rate.
     """
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
-    found: dict[str, Any] = {}
+    found: dict[str, np.ndarray] = {}
     if dynamics == Dynamics.first_principles:
         drag = "drag.coefficients"
         if "rotors.lag" in numbers:

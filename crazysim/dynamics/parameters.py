@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from crazysim.drones import Airframe, load_airframe
+from crazysim.drones import AirframeSource, load_airframe
 from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.errors import ConfigError, UnknownNameError
 
-Drone = str | Path | Mapping[str, Any] | Airframe
-"""Name of a built-in airframe, path of a TOML file, dict, or airframe."""
 
-
-def load_params(dynamics: Dynamics | str, drone: Drone, xp: ModuleType | None = None, device: Any = None) -> dict:
+def load_params(
+    dynamics: Dynamics | str, drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
+) -> dict:
     """Return the parameters of a drone for a dynamics model, in SI units; thrusts are per rotor.
 
     Args:
@@ -51,17 +49,20 @@ def load_params(dynamics: Dynamics | str, drone: Drone, xp: ModuleType | None = 
             "rpm2torque": airframe.value("rotors.torque_curve"),
             "rotor_dyn_coef": airframe.value("rotors.lag"),
             "mixing_matrix": airframe.mixing_matrix,
-            "drag_matrix": _as_matrix(airframe.value("drag.coefficients")),
+            "drag_matrix": airframe.matrix("drag.coefficients"),
         }
     else:
         fit = {key: airframe.value(f"fitted.{model.value}.{key}") for key in airframe.table(f"fitted.{model.value}")}
         if "drag_coefficients" in fit:
-            fit["drag_matrix"] = _as_matrix(fit.pop("drag_coefficients"))
+            del fit["drag_coefficients"]
+            fit["drag_matrix"] = airframe.matrix(f"fitted.{model.value}.drag_coefficients")
         params |= fit
     return as_arrays(params, xp, device)
 
 
-def load_fn_params(fn: Callable[..., Any], drone: Drone, xp: ModuleType | None = None, device: Any = None) -> dict:
+def load_fn_params(
+    fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
+) -> dict:
     """Return the parameters that ``first_principles.dynamics`` uses, as ``load_params`` has them.
 
     Args:
@@ -80,7 +81,7 @@ def load_fn_params(fn: Callable[..., Any], drone: Drone, xp: ModuleType | None =
     return {name: value for name, value in params.items() if name not in ("thrust_min", "thrust_max")}
 
 
-def rotor_vel_limits(dynamics: Dynamics | str, drone: Drone) -> tuple[float, float]:
+def rotor_vel_limits(dynamics: Dynamics | str, drone: AirframeSource) -> tuple[float, float]:
     """Return the limits of ``states.rotor_vel``: rpm, or collective thrust in N in a fitted model."""
     params = load_params(dynamics, drone)
     thrusts = np.array([params["thrust_min"], params["thrust_max"]])
@@ -96,7 +97,3 @@ def as_arrays(params: dict[str, Any], xp: ModuleType | None, device: Any) -> dic
     make = (np if xp is None else xp).asarray
     options = {} if device is None else {"device": device}
     return {k: as_arrays(v, xp, device) if isinstance(v, dict) else make(v, **options) for k, v in params.items()}
-
-
-def _as_matrix(drag: np.ndarray) -> np.ndarray:
-    return np.diag(drag) if drag.ndim == 1 else drag

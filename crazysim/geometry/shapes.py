@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -78,7 +77,7 @@ class Shape:
             raise TypeError(f"expected a shape with {name}, got a {self.kind}, which has none")
         return found
 
-    def _content(self) -> tuple[Any, ...]:
+    def _content(self) -> tuple[object, ...]:
         arrays = (self.vertices, self.faces, self.normals, self.offsets, self.heights)
         return (self.kind, self.size, *(None if a is None else (a.shape, a.tobytes()) for a in arrays))
 
@@ -91,7 +90,7 @@ class Shape:
         return hash(self._content())
 
 
-def hull(vertices: Any, faces: Any = None) -> Shape:
+def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     """Return a convex mesh.
 
     Args:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimData
@@ -68,13 +68,13 @@ class Follow(Plugin):
 
     trajectories: Trajectory | Sequence[Trajectory]
     """Trajectories in the first slots: one, a sequence, or one record with a leading axis."""
-    index: Any = parameter(default=None)
+    index: ArrayLike | None = parameter(default=None)
     """Slot that a drone follows; None for drone i the trajectory i modulo their number. (), (n_drones,) or (n_worlds,
     n_drones)"""
-    start: Any = parameter(default=0.0)
+    start: ArrayLike = parameter(default=0.0)
     """Time since the reset of the world at which a drone starts, s. A drone with a negative start is in the middle of
     its trajectory at the reset: with -2 and a rate of 1, at 2 s. (), (n_drones,) or (n_worlds, n_drones)"""
-    rate: Any = parameter(default=1.0)
+    rate: ArrayLike = parameter(default=1.0)
     """Speed at which a drone goes through its trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
     n_slots: int | None = None
     """Number of slots; None for one of each trajectory. The others hold the first trajectory until ``upload``."""
@@ -176,7 +176,13 @@ class Follow(Plugin):
         with sim.lock:
             sim.data = self.uploaded(sim.data, slot, trajectory)
 
-    def assign(self, sim: Simulation, index: Any = None, start: Any = None, rate: Any = None) -> None:
+    def assign(
+        self,
+        sim: Simulation,
+        index: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        rate: ArrayLike | None = None,
+    ) -> None:
         """Give drones other slots, starts or rates; whatever is None stays as it is.
 
         Nothing is compiled again, except where a number of all drones becomes one per drone.
@@ -219,15 +225,13 @@ class Follow(Plugin):
     def _given(self) -> list[Trajectory]:
         """Return the given trajectories, one by one."""
         given = self.trajectories
-        if isinstance(given, Trajectory):
-            some = given if np.ndim(given.ends) > 1 else jax.tree.map(lambda x: x[None], given)
-            given = [jax.tree.map(lambda x, k=k: x[k], some) for k in range(len(some.ends))]
+        given = given.unstacked() if isinstance(given, Trajectory) else given
         if not given or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in given):
             raise ConfigError(f"expected one or more trajectories of one vehicle each, got {self.trajectories!r}")
         return list(given)
 
 
-def _checked(sim: Simulation, name: str, value: Any, n_slots: int) -> Array:
+def _checked(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:
     """Return an index, start or rate as ``check_parameter`` does; one axis is that of the drones, in all worlds."""
     if np.shape(value) == (sim.n_drones,):
         value = np.broadcast_to(np.asarray(value), (sim.n_worlds, sim.n_drones))
@@ -238,7 +242,7 @@ def _checked(sim: Simulation, name: str, value: Any, n_slots: int) -> Array:
     return check_parameter(sim, name, value, positive=name == "rate")
 
 
-def _count(name: str, value: Any, least: int) -> int:
+def _count(name: str, value: object, least: int) -> int:
     """Return a setting, checked to be an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise ConfigError(

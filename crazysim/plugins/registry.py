@@ -227,7 +227,7 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
     return data.replace(plugins=others if record is None else others | {name: record})
 
 
-def _with(pipeline: Pipeline, plugin: Plugin, placements: Any) -> tuple[Pipeline, _Installed]:
+def _with(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _Installed]:
     """Return the pipeline with the stages of a plugin, and the plugin with what it changed.
 
     Raises:
@@ -332,7 +332,7 @@ def _continued(record: PyTree | None, before: PyTree | None) -> PyTree | None:
     return record.replace(**kept)
 
 
-def _signature(tree: Any) -> Any:
+def _signature(tree: object) -> tuple[object, list[tuple[object, ...]]]:
     return jax.tree.structure(tree), [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from crazysim.core.data import as_key
 from crazysim.core.settings import positive
-from crazysim.drones.airframe import is_airframe_file
+from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.references import absolute, is_reference, reference_of, split
 from crazysim.envs.registry import TASKS, entry_of, make

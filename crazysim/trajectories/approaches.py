@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from crazysim.trajectories.bezier import to_bernstein
 from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
 CELL = 0.4
@@ -76,7 +76,7 @@ class _Motion:
     def __init__(self, pieces: PieceTable) -> None:
         self.pieces = pieces
         snap = pieces.coefficients_of(4)[:, :3]
-        control_points = snap @ _to_bernstein(snap.shape[-1] - 1)  # a polynomial lies in their convex hull
+        control_points = snap @ to_bernstein(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
         self.snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
         jumps = np.zeros((4, len(pieces.drone)))
         piece = np.flatnonzero(pieces.drone[1:] == pieces.drone[:-1])
@@ -134,12 +134,6 @@ def _lower_bounds(
     closer = distance < best[pair[k]]
     best[pair[k[closer]]], when[pair[k[closer]]] = distance[closer], t[closer]
     return to_chord - deviation
-
-
-def _to_bernstein(degree: int) -> Floats:
-    """Return the matrix from coefficients to Bezier control points, both in rows. (degree + 1, degree + 1)"""
-    n = range(degree + 1)
-    return np.array([[math.comb(j, k) / math.comb(degree, k) for j in n] for k in n])
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

@@ -20,7 +20,7 @@ def _to_power(degree: int) -> NDArray:
 
 
 @lru_cache
-def _to_bernstein(degree: int) -> NDArray:
+def to_bernstein(degree: int) -> NDArray:
     """Return the matrix from coefficients to control points. (degree + 1, degree + 1)"""
     matrix = np.zeros((degree + 1, degree + 1))
     for i in range(degree + 1):
@@ -54,7 +54,7 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
     n = coefficients.shape[1]
     raised = n - 1 if degree is None else degree
     padded = np.pad(coefficients, ((0, 0), (0, raised + 1 - n)))
-    return _to_bernstein(raised) @ padded.T
+    return to_bernstein(raised) @ padded.T
 
 
 def restricted(coefficients: NDArray, start: float, end: float) -> NDArray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import grid_2d
+from crazysim.core.settings import positive
 from crazysim.errors import ConfigError
+from crazysim.trajectories.shapes import as_positive, as_vector
 
 CENTER = (0.0, 0.0, 1.0)
 """Default centre of a formation, m."""
@@ -27,7 +28,7 @@ def line(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    x = _size("spacing", spacing) * (np.arange(_count(n)) - (n - 1) / 2)
+    x = as_positive("spacing", spacing) * (np.arange(positive("n", n)) - (n - 1) / 2)
     return _placed(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
 
 
@@ -43,7 +44,7 @@ def grid(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    return _placed(grid_2d(_count(n), _size("spacing", spacing)), center, yaw)
+    return _placed(grid_2d(positive("n", n), as_positive("spacing", spacing)), center, yaw)
 
 
 def circle(
@@ -67,12 +68,12 @@ def circle(
     """
     if spacing is not None and radius is not None:
         raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")
-    angle = 2 * math.pi * np.arange(_count(n)) / n
+    angle = 2 * math.pi * np.arange(positive("n", n)) / n
     if radius is None:
-        side = _size("spacing", 1.0 if spacing is None else spacing)
+        side = as_positive("spacing", 1.0 if spacing is None else spacing)
         radius = side / (2 * math.sin(math.pi / n)) if n > 1 else 0.0
     else:
-        radius = _size("radius", radius)
+        radius = as_positive("radius", radius)
     return _placed(radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1), center, yaw)
 
 
@@ -99,24 +100,8 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
     return b[linear_sum_assignment(squares)[1]]
 
 
-def _placed(level: np.ndarray, center: Any, yaw: Any) -> np.ndarray:
+def _placed(level: np.ndarray, center: ArrayLike, yaw: ArrayLike) -> np.ndarray:
     """Return level places, (n, 2), turned around the origin and moved to a centre. (n, 3)"""
-    for name, value, shape in (("center", center, (3,)), ("yaw", yaw, ())):
-        array = np.asarray(value)
-        if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.isfinite(array)):
-            raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {value!r}")
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return np.pad(level @ np.array([[cos, sin], [-sin, cos]]), ((0, 0), (0, 1))) + np.asarray(center, float)
-
-
-def _count(n: Any) -> int:
-    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-        raise ConfigError(f"expected a number of places of at least 1, got {n!r}")
-    return int(n)
-
-
-def _size(name: str, value: Any) -> float:
-    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not is_number or not 0 < value < np.inf:
-        raise ConfigError(f"expected {name} as a positive, finite number of metres, got {value!r}")
-    return float(value)
+    angle, middle = float(as_vector("yaw", yaw, ())), as_vector("center", center)
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.pad(level @ np.array([[cos, sin], [-sin, cos]]), ((0, 0), (0, 1))) + middle

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
-from crazysim.drones import Airframe, load_airframe
+from crazysim.drones import AirframeSource, load_airframe
 from crazysim.errors import ConfigError
 from crazysim.trajectories.approaches import Approach, closest_approaches
 from crazysim.trajectories.peaks import GRAVITY, QUANTITIES, Peak, peaks
@@ -73,7 +71,7 @@ class Limits:
         fields = dataclasses.fields(self)
         return {field.name: getattr(self, field.name) for field in fields if getattr(self, field.name) is not None}
 
-    def of_airframe(self, airframe: str | Path | Mapping[str, Any] | Airframe) -> Limits:
+    def of_airframe(self, airframe: AirframeSource) -> Limits:
         """Return these limits with the thrusts of an airframe where there are none.
 
         Args:
@@ -157,9 +155,9 @@ class Report:
 def check(
     trajectories: Trajectory | Sequence[Trajectory],
     limits: Limits,
-    airframe: str | Path | Mapping[str, Any] | Airframe | None = None,
+    airframe: AirframeSource | None = None,
     *,
-    starts: Any = 0.0,
+    starts: ArrayLike = 0.0,
     duration: float | None = None,
     names: Sequence[str] | None = None,
     tolerance: float = 1e-3,
@@ -183,9 +181,9 @@ def check(
         ConfigError: If there is no trajectory, or the number of names or starts differs from that of the trajectories,
             or the tolerance is not positive.
     """
-    several = _unstacked(trajectories) if isinstance(trajectories, Trajectory) else list(trajectories)
+    several = trajectories.unstacked() if isinstance(trajectories, Trajectory) else list(trajectories)
     if len(several) == 1 and np.ndim(starts) == 1:
-        several *= len(starts)
+        several *= np.size(starts)
     table = PieceTable.of(several, starts, duration)
     labels = tuple(names) if names is not None else tuple(f"drone {k}" for k in range(len(several)))
     if len(labels) != len(several):
@@ -211,10 +209,3 @@ def check(
             who = tuple(labels[k] for k in pair.drones)
             violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
     return Report(tuple(violations), closest, found, labels, table.duration)
-
-
-def _unstacked(trajectories: Trajectory) -> list[Trajectory]:
-    """Return the single trajectories of a record with at most one leading axis."""
-    if trajectories.ends.ndim == 1:
-        return [trajectories]
-    return [jax.tree.map(lambda x, k=k: x[k], trajectories) for k in range(len(trajectories.ends))]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.trajectories.bezier import restricted
 from crazysim.trajectories.trajectory import N_DERIVATIVES, Trajectory
 
 Floats = NDArray[np.float64]
@@ -35,7 +34,7 @@ class PieceTable:
     """Coefficients of x, y, z, m, and yaw, rad, of a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
 
     @staticmethod
-    def of(trajectories: Sequence[Trajectory], starts: Any = 0.0, duration: float | None = None) -> PieceTable:
+    def of(trajectories: Sequence[Trajectory], starts: ArrayLike = 0.0, duration: float | None = None) -> PieceTable:
         """Return the pieces of trajectories, with those at rest before the start and after the end.
 
         Args:
@@ -94,7 +93,7 @@ class PieceTable:
         """Return the coefficients of a derivative, up to snap. (n_pieces, 4, degree + 1 - order)"""
         return self._derivatives[order]
 
-    def piece(self, drone: Any, t: Any) -> Ints:
+    def piece(self, drone: Ints, t: NDArray) -> Ints:
         """Return the piece that each drone is in at a time; where two meet, the later one. (...)"""
         t = np.clip(t, 0.0, self.duration)
         found = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
@@ -117,13 +116,13 @@ class PieceTable:
             value = value * u[..., None] + c[..., k]
         return value
 
-    def at(self, drone: Any, t: Any, order: int = 0) -> Floats:
+    def at(self, drone: Ints, t: NDArray, order: int = 0) -> Floats:
         """Return a derivative of x, y, z and yaw of drones at times. (...) -> (..., 4)"""
         piece = self.piece(drone, t)
         return self.within(piece, (t - self.start[piece]) / self.length[piece], order)
 
 
-def _pieces(t: Any, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
+def _pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Floats, Floats, Floats]:
     """Return starts, lengths and coefficients of the pieces of one trajectory up to a duration."""
     ends = np.asarray(t.ends, float)
     starts = np.concatenate([[0.0], ends[:-1]])
@@ -154,11 +153,7 @@ def _since_zero(starts: Floats, lengths: Floats, c: Floats) -> tuple[Floats, Flo
     later = starts + lengths > 0
     starts, lengths, c = starts[later], lengths[later], c[later]
     if len(starts) and starts[0] < 0:
-        u0, size = -starts[0] / lengths[0], c.shape[-1]
-        # p(u0 + (1 - u0) v) by the binomial theorem
-        rest = [[math.comb(j, k) * u0 ** (j - k) * (1 - u0) ** k if k <= j else 0.0 for k in range(size)]
-                for j in range(size)]  # fmt: skip
-        c[0] = c[0] @ np.array(rest)
+        c[0] = restricted(c[0], -starts[0] / lengths[0], 1.0)
         lengths[0], starts[0] = lengths[0] + starts[0], 0.0
     return starts, lengths, c
 

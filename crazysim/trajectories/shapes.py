@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories.trajectory import Trajectory
@@ -57,7 +56,7 @@ def lissajous(
     phases: ArrayLike = (0.0, 0.0, 0.0),
     period: float | None = None,
     speed: float | None = None,
-    center: Any = (0.0, 0.0, 1.0),
+    center: ArrayLike = (0.0, 0.0, 1.0),
 ) -> Trajectory:
     """Return a Lissajous curve, ``center + amplitudes sin(frequencies wt + phases)``, that repeats.
 
@@ -72,7 +71,7 @@ def lissajous(
     Raises:
         ConfigError: If a setting is invalid.
     """
-    a, k, phi, c = (_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
+    a, k, phi, c = (as_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
                                                   (amplitudes, frequencies, phases, center), strict=True))  # fmt: skip
     if np.any(k != np.round(k)):
         raise ConfigError(f"expected frequencies as whole numbers, got {frequencies!r}")
@@ -127,8 +126,9 @@ def helix(
     Raises:
         ConfigError: If a setting is invalid.
     """
-    _positive("turns", turns)
-    radius, climb, height = (_vector(n, x, ()) for n, x in (("radius", radius), ("climb", climb), ("height", height)))
+    as_positive("turns", turns)
+    given = {"radius": radius, "climb": climb, "height": height}
+    radius, climb, height = (float(as_vector(name, x, ())) for name, x in given.items())
     w = 2 * np.pi / _period(period, speed, math.hypot(2 * np.pi * radius, climb))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:
@@ -142,7 +142,7 @@ def helix(
 
 
 def line(
-    start: Any, end: Any, duration: float | None = None, speed: float | None = None, yaw: float = 0.0
+    start: ArrayLike, end: ArrayLike, duration: float | None = None, speed: float | None = None, yaw: float = 0.0
 ) -> Trajectory:
     """Return a straight line from rest to rest, with acceleration and jerk zero at both ends.
 
@@ -156,13 +156,13 @@ def line(
     Raises:
         ConfigError: If a setting is invalid.
     """
-    a, b = _vector("start", start), _vector("end", end)
+    a, b = as_vector("start", start), as_vector("end", end)
     # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1 with three derivatives of zero at both; its slope is at most
     # 140 (1/2)^6 = 35/16.
     time = _period(duration, speed, 35 / 16 * float(np.linalg.norm(b - a)), "duration")
     c = np.zeros((1, 4, 8))
     c[0, :3] = np.outer(b - a, [0, 0, 0, 0, 35, -84, 70, -20]) / time ** np.arange(8)
-    c[0, :, 0] = [*a, _vector("yaw", yaw, ())]
+    c[0, :, 0] = [*a, as_vector("yaw", yaw, ())]
     return Trajectory.of_pieces([time], c)
 
 
@@ -178,7 +178,7 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
         ConfigError: If a setting is invalid.
     """
     _period(duration, None, 0.0, "duration")
-    return Trajectory.of_pieces([duration], np.append(_vector("pos", pos), _vector("yaw", yaw, ()))[None, :, None])
+    return Trajectory.of_pieces([duration], np.append(as_vector("pos", pos), as_vector("yaw", yaw, ()))[None, :, None])
 
 
 def fitted(curve: Curve, duration: float, eighth: float, repeats: bool = False) -> Trajectory:
@@ -212,9 +212,9 @@ def _period(period: float | None, speed: float | None, length: float, name: str 
     if period is not None and speed is not None:
         raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
     if speed is None:
-        time = _positive(name, PERIOD if period is None else period)
+        time = as_positive(name, PERIOD if period is None else period)
     else:
-        _positive("speed", speed)
+        as_positive("speed", speed)
         if length == 0:
             raise ConfigError(f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
         time = length / speed
@@ -223,14 +223,24 @@ def _period(period: float | None, speed: float | None, length: float, name: str 
     return time
 
 
-def _positive(name: str, value: Any) -> float:
+def as_positive(name: str, value: float) -> float:
+    """Return a setting as a positive number.
+
+    Raises:
+        ConfigError: If it is anything else.
+    """
     is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not is_number or not np.isfinite(value) or value <= 0:
         raise ConfigError(f"expected {name} as a positive number, got {value!r}")
     return float(value)
 
 
-def _vector(name: str, value: Any, shape: tuple[int, ...] = (3,)) -> Any:
+def as_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
+    """Return a setting as numbers of some shape.
+
+    Raises:
+        ConfigError: If it is anything else, or a number is larger than ``MAX_SIZE``.
+    """
     array = np.asarray(value)
     if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.abs(array.astype(float)) <= MAX_SIZE):
         kind = "3 finite numbers" if shape else "a finite number"

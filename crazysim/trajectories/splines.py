@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -62,7 +61,7 @@ def spline(
     return of_unit_pieces(durations, interpolation.unit_coefficients(filled, durations))
 
 
-def of_bezier(ends: ArrayLike, control_points: Sequence[Any], repeats: bool = False) -> Trajectory:
+def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: bool = False) -> Trajectory:
     """Return the trajectory of a sequence of Bezier curves.
 
     The Bernstein polynomials are expanded in float64: ``c_k = C(n, k) sum_i (-1)^(k - i) C(k, i) P_i``.

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import compiled
@@ -40,7 +41,7 @@ class Trajectory(PyTree):
     """True where the trajectory starts again after its end. ()"""
 
     @staticmethod
-    def of_pieces(durations: Any, coefficients: Any, repeats: bool = False) -> Trajectory:
+    def of_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
         """Return the trajectory of polynomials of the time in seconds, worked out in float64 on the host.
 
         Args:
@@ -93,7 +94,7 @@ class Trajectory(PyTree):
         return self.ends[..., -1]
 
     @compiled()
-    def evaluate(self, t: Any) -> Setpoint:
+    def evaluate(self, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one trajectory at one time, with derivatives up to snap.
 
         Where two pieces meet, the later one counts. Use ``jax.vmap`` for several trajectories or times.
@@ -103,7 +104,7 @@ class Trajectory(PyTree):
         """
         return _setpoint(self.derivatives(t, N_DERIVATIVES))
 
-    def evaluate_one(self, index: Any, t: Any) -> Setpoint:
+    def evaluate_one(self, index: Array | int, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
 
         It reads the numbers that it needs and no others, so that many trajectories cost no more than one.
@@ -115,7 +116,9 @@ class Trajectory(PyTree):
         """
         return self.evaluate_at_rate(index, t, 1.0)
 
-    def evaluate_at_rate(self, index: Any, t: Any, rate: Any, degrees: Sequence[int] | None = None) -> Setpoint:
+    def evaluate_at_rate(
+        self, index: Array | int, t: ArrayLike, rate: Array | float, degrees: Sequence[int] | None = None
+    ) -> Setpoint:
         """Return the setpoint of one of several trajectories that is flown faster or slower.
 
         Args:
@@ -141,7 +144,7 @@ class Trajectory(PyTree):
         values = [jnp.stack([rows[axis][k] for axis in range(4)]) for k in range(N_DERIVATIVES + 1)]
         return _setpoint(_per_second(values, jnp.where(inside, inverse * rate, 0.0)))
 
-    def derivatives(self, t: Any, order: int) -> list[Array]:
+    def derivatives(self, t: ArrayLike, order: int) -> list[Array]:
         """Return x, y, z, m, and yaw, rad, of one trajectory at one time, and their derivatives up to an order.
 
         Args:
@@ -189,6 +192,12 @@ class Trajectory(PyTree):
         padded = [t.padded(n_pieces, degree) for t in trajectories]
         xp = _module(padded)
         return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded)
+
+    def unstacked(self) -> list[Trajectory]:
+        """Return the trajectories of all vehicles, one by one."""
+        if np.ndim(self.ends) == 1:
+            return [self]
+        return [jax.tree.map(lambda x, k=k: x[k], self) for k in range(len(self.ends))]
 
     def padded(self, n_pieces: int, degree: int) -> Trajectory:
         """Return the same trajectory with at least this number of pieces and this degree, for one vehicle.
@@ -278,7 +287,7 @@ class Trajectory(PyTree):
         polynomials = [c(x) for x in np.asarray(self.coefficients[k], float)]
         return np.array([[p.deriv(m)(u) / lengths[k] ** m for p in polynomials] for m in range(4)])
 
-    def moved(self, offset: Any = (0.0, 0.0, 0.0), yaw: Any = 0.0) -> Trajectory:
+    def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0) -> Trajectory:
         """Return the trajectory turned around the z axis of the world, then moved, with any leading axes.
 
         Args:
@@ -303,17 +312,17 @@ class Trajectory(PyTree):
         return self.replace(coefficients=xp.concatenate([constant, turned[..., 1:]], axis=-1))
 
 
-def _module(tree: Any) -> Any:
+def _module(tree: object) -> Any:
     """Return ``jax.numpy`` if there is an array of JAX, else NumPy, which compiles nothing."""
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 
-def _at(x: Array, *index: Any) -> Array:
+def _at(x: Array, *index: Array | int) -> Array:
     """Return an entry of an array; an index that is too large or too small means the last or first one."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
-def _local_time(t: Array, end: Any, repeats: Any) -> tuple[Array, Array]:
+def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
     """Return the time between start and end at which a trajectory is at a time, s, and whether it moves. () each"""
     local = jnp.where(t < 0, 0.0, t)
     # A remainder by floor, which is a vector instruction where that of lax.rem is a call for each number.
@@ -322,7 +331,7 @@ def _local_time(t: Array, end: Any, repeats: Any) -> tuple[Array, Array]:
     return local, (t >= 0) & (repeats | (t <= end))
 
 
-def _inverse(xp: Any, length: Any) -> Any:
+def _inverse(xp: Any, length: Array) -> Array:
     """Return the inverse of the length of a piece, 1/s; padding has no length. (...)"""
     return 1 / xp.where(length > 0, length, xp.ones_like(length))
 
@@ -347,7 +356,7 @@ def _setpoint(derivatives: list[Array]) -> Setpoint:
     )  # fmt: skip
 
 
-def _piece(ends: Array, index: Any, t: Array) -> Array:
+def _piece(ends: Array, index: Array | int, t: Array) -> Array:
     """Return the number of ends of a trajectory up to a time, at most that of its last piece. ()"""
     n = ends.shape[1]
     if len(ends) == 1 and n <= COUNTED:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation, timing
@@ -19,15 +20,15 @@ YAW_ORDER = 2
 
 
 def minimum_snap(
-    waypoints: Any,
-    durations: Any = None,
+    waypoints: ArrayLike,
+    durations: ArrayLike | None = None,
     *,
     limits: Limits | None = None,
-    yaw: Any = 0.0,
-    corridors: Any = None,
-    velocities: Any = None,
-    accelerations: Any = None,
-    jerks: Any = None,
+    yaw: ArrayLike = 0.0,
+    corridors: ArrayLike | None = None,
+    velocities: ArrayLike | None = None,
+    accelerations: ArrayLike | None = None,
+    jerks: ArrayLike | None = None,
 ) -> Trajectory:
     """Return the trajectory through waypoints with the smallest integral of the squared snap.
 
@@ -58,14 +59,14 @@ def minimum_snap(
 
 
 def minimum_jerk(
-    waypoints: Any,
-    durations: Any = None,
+    waypoints: ArrayLike,
+    durations: ArrayLike | None = None,
     *,
     limits: Limits | None = None,
-    yaw: Any = 0.0,
-    corridors: Any = None,
-    velocities: Any = None,
-    accelerations: Any = None,
+    yaw: ArrayLike = 0.0,
+    corridors: ArrayLike | None = None,
+    velocities: ArrayLike | None = None,
+    accelerations: ArrayLike | None = None,
 ) -> Trajectory:
     """Return the trajectory through waypoints with the smallest integral of the squared jerk.
 
@@ -87,7 +88,14 @@ def minimum_jerk(
     return _plan(waypoints, durations, (velocities, accelerations), limits, yaw, corridors)
 
 
-def _plan(waypoints: Any, durations: Any, fixed: tuple[Any, ...], limits: Limits | None, yaw: Any, corridors: Any):
+def _plan(
+    waypoints: ArrayLike,
+    durations: ArrayLike | None,
+    fixed: Sequence[ArrayLike | None],
+    limits: Limits | None,
+    yaw: ArrayLike,
+    corridors: ArrayLike | None,
+) -> Trajectory:
     nodes = _nodes(waypoints, fixed)
     n_pieces = len(nodes) - 1
     angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
@@ -136,7 +144,7 @@ def _plan(waypoints: Any, durations: Any, fixed: tuple[Any, ...], limits: Limits
     return of_unit_pieces(lengths, solve(lengths))
 
 
-def _nodes(waypoints: Any, fixed: tuple[Any, ...]) -> Floats:
+def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
     """Return the derivatives at each waypoint, NaN where free. (n, k, 3)"""
     at = np.asarray(waypoints, float)
     if at.ndim != 2 or at.shape[1] != 3 or len(at) < 2:
@@ -159,7 +167,7 @@ def _nodes(waypoints: Any, fixed: tuple[Any, ...]) -> Floats:
     return nodes
 
 
-def _radii(corridors: Any, n_pieces: int) -> Floats:
+def _radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
     """Return the radius of the corridor of each piece, m. (n_pieces,)"""
     radii = np.asarray(np.inf if corridors is None else corridors, float)
     if radii.shape not in ((), (n_pieces,)) or not np.all(radii > 0):
@@ -167,7 +175,7 @@ def _radii(corridors: Any, n_pieces: int) -> Floats:
     return np.broadcast_to(radii, (n_pieces,))
 
 
-def _given(durations: Any, n_pieces: int) -> Floats:
+def _given(durations: ArrayLike, n_pieces: int) -> Floats:
     """Return the durations of the pieces, s. (n_pieces,)"""
     lengths = np.asarray(durations, float)
     if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):

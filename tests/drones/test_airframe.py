@@ -11,9 +11,9 @@ import pytest
 from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
-from crazysim.drones.airframe import FOLDER
 from crazysim.drones.body import body_geoms, outline
-from crazysim.drones.keys import KEYS, TABLES, TOP_LEVEL
+from crazysim.drones.keys import LAYOUT, TABLES
+from crazysim.drones.loading import FOLDER
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
 
 pytestmark = pytest.mark.fast
@@ -497,7 +497,7 @@ def test_the_page_lists_all_tables_and_keys_and_no_others():
             table = row[0].strip("`")
         keys = re.findall(r"`(\w+)`", row[0] if is_shape else row[1])
         found |= {f"shape.{key}" if is_shape else f"{table}.{key}".removeprefix(".") for key in keys}
-    assert found == {*KEYS, *TOP_LEVEL}
+    assert found == {*LAYOUT.keys, *LAYOUT.top_level}
 
 
 def test_models_of_the_keys_are_those_of_the_dynamics():

@@ -59,11 +59,11 @@ def test_matching_refuses_different_numbers():
 @pytest.mark.parametrize("make", SHAPES.values())
 def test_law_09_wrong_settings_are_refused(make):
     for wrong, message in (
-        ({"n": 0}, "number of places"),
-        ({"n": 2.5}, "number of places"),
+        ({"n": 0}, "positive whole number"),
+        ({"n": 2.5}, "positive whole number"),
         ({"n": 2, "spacing": 0.0}, "spacing as a positive"),
-        ({"n": 2, "center": (0.0, 0.0)}, "center as finite numbers"),
-        ({"n": 2, "yaw": np.nan}, "yaw as finite"),
+        ({"n": 2, "center": (0.0, 0.0)}, "center as 3 finite numbers"),
+        ({"n": 2, "yaw": np.nan}, "yaw as a finite"),
     ):
         with pytest.raises(ConfigError, match=message):
             make(**wrong)

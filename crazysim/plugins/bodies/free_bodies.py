@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
@@ -22,7 +23,6 @@ from crazysim.geometry import Shape
 from crazysim.plugins.contacts.rigid_bodies import Touching, require_few_contacts
 from crazysim.plugins.effects.ground import TerrainData
 from crazysim.plugins.payloads.body import shape_of
-from crazysim.plugins.payloads.load import with_poses
 from crazysim.pytree import Members, host_array, leaf
 from crazysim.scene.contact_report import ObjectSelection
 from crazysim.tables import MASS, as_numbers
@@ -78,18 +78,18 @@ class FreeBodies(Population):
     """Number of bodies in each world, or their names."""
     size: Any = (0.2, 0.2, 0.2)
     """Full lengths of a box, m (3,), or radius of a ball, m, for all; or a list of one for each body."""
-    mass: Any = parameter(default=0.1)
+    mass: ArrayLike = parameter(default=0.1)
     """Mass, kg. (), (n_members,) or (n_worlds, n_members)"""
-    pos: Any = parameter(default=None)
+    pos: ArrayLike | None = parameter(default=None)
     """Positions at the start, world frame, m; None for a row along x on the floor. (3,), (n_members, 3) or (n_worlds,
     n_members, 3)"""
-    quat: Any = parameter(default=(0.0, 0.0, 0.0, 1.0))
+    quat: ArrayLike = parameter(default=(0.0, 0.0, 0.0, 1.0))
     """Attitudes at the start, xyzw, normalised here. (4,), (n_members, 4) or (n_worlds, n_members, 4)"""
-    vel: Any = parameter(default=(0.0, 0.0, 0.0))
+    vel: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Velocities at the start, world frame, m/s. (3,), (n_members, 3) or (n_worlds, n_members, 3)"""
-    friction: Any = parameter(default=0.6)
+    friction: ArrayLike = parameter(default=0.6)
     """Coulomb's coefficient; of two bodies the larger counts. (), (n_members,) or (n_worlds, n_members)"""
-    restitution: Any = parameter(default=0.0)
+    restitution: ArrayLike = parameter(default=0.0)
     """Ratio of the speeds after and before a bounce, 0 to 1; of two bodies the larger counts. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectSelection = None
@@ -100,7 +100,7 @@ class FreeBodies(Population):
     """Time constant with which an overlap is pushed out, s; at least two steps."""
     iterations: int = 30
     """Iterations of the solver."""
-    rgba: Any = None
+    rgba: ArrayLike | None = None
     """Colour, one or one for each body; None for the default. (4,) or (n_members, 4)"""
     name: str = "bodies"
     prefix: ClassVar[str] = "Box"
@@ -215,7 +215,7 @@ class FreeBodies(Population):
     def place(self, data: SimData) -> Objects:
         """Return the scene's objects with the bodies at their poses; of one world."""
         record = self.read(data)
-        return with_poses(data.objects, {self.name: (record.pos, record.quat)})  # type: ignore[arg-type]
+        return data.objects.with_poses({self.name: (record.pos, record.quat)})  # type: ignore[union-attr]
 
     def _add_to_scene(self, sim: Simulation, shapes: Sequence[Shape]) -> None:
         """Add the bodies to the scene, if they are not there yet."""
@@ -241,7 +241,7 @@ def inertia_per_mass(shape: Shape) -> np.ndarray:
     return np.array([y + z, z + x, x + y]) / 3
 
 
-def bodies_geom(shape: Shape, rgba: Any) -> str:
+def bodies_geom(shape: Shape, rgba: Iterable[float]) -> str:
     """Return MJCF of the geom of a body, which drones touch."""
     size, color = (" ".join(f"{float(x):.9g}" for x in values) for values in (shape.size, rgba))
     geom = f'<geom type="{shape.kind}" size="{size}" contype="0" conaffinity="2" rgba="{color}"/>'

@@ -32,34 +32,63 @@ THIN = 0.05
 """Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
 
 
+class Carrier(NamedTuple):
+    """The static scene, an object or a member of a population, with its geoms."""
+
+    population: str | None
+    """Name of the population; None for the static scene and objects."""
+    row: int | None
+    """Number among the members or objects; None for the static scene."""
+    geoms: tuple[CollisionGeom, ...]
+    """Its geoms, in its frame."""
+
+
 class Surface(NamedTuple):
-    """Surface of a geom."""
+    """A geom that drones and loads touch."""
 
     geom: CollisionGeom
-    """The geom, in the frame of its object or of the world."""
+    """The geom, in the frame of its carrier."""
     row: int | None
-    """Row of the movable object that carries it in ``data.objects``, or number of the member; None for a fixed one."""
+    """Number of the carrier among the members or objects; None for the static scene."""
     population: str | None = None
-    """Name of the population of which a member carries it; None for an object."""
+    """Name of the carrier's population; None for the static scene and objects."""
 
 
-def surfaces_of(sim: Simulation, objects: ObjectSelection, loads: Collection[str] = ()) -> list[Surface]:
-    """Return the surfaces of the floor, of some objects, and of members of populations, such as cars.
+def carriers_of(sim: Simulation, objects: ObjectSelection, without: Collection[str] = ()) -> list[Carrier]:
+    """Return the static scene, and chosen objects and members of populations that turn.
 
-    Loads are left out, and bodies that exchange impulses with drones in a stage of their own.
+    Objects that other plugins place, such as loads, are left out.
+
+    Args:
+        sim: Simulation.
+        objects: Handles, or names of objects; None for all.
+        without: Names of populations that are left out.
     """
     model = sim.scene.collision_model
-    found = [Surface(geom, None) for geom in model.floor]
-    placing = {kind: plugin for plugin in sim.scene.plugins() for kind in plugin.placed_kinds or ()}
+    found = [Carrier(None, None, tuple(model.floor))] if model.floor else []
+    placed = {kind for plugin in sim.scene.plugins() for kind in plugin.placed_kinds or ()}
     members = populations(sim.data)
     for body in choose(model, objects):
         kind, _, number = body.name.rpartition(":")
+        if kind in without:
+            continue
         if kind in members and hasattr(members[kind], "ang_vel"):
-            if not getattr(placing.get(kind), "pushes_drones", False):
-                found += [Surface(geom, int(number), kind) for geom in body.geoms]
-        elif body.name not in loads and kind not in placing:
-            found += [Surface(geom, body.row) for geom in body.geoms]
+            found.append(Carrier(kind, int(number), body.geoms))
+        elif kind not in placed:
+            found.append(Carrier(None, body.row, body.geoms))
     return found
+
+
+def surfaces_of(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
+    """Return the surfaces that drones and loads touch, without those of bodies that push drones themselves.
+
+    Args:
+        sim: Simulation.
+        objects: Handles, or names of objects; None for all.
+    """
+    pushing = [plugin.name for plugin in sim.scene.plugins() if getattr(plugin, "pushes_drones", False)]
+    carriers = carriers_of(sim, objects, pushing)
+    return [Surface(geom, x.row, x.population) for x in carriers for geom in x.geoms]
 
 
 def is_ground(surface: Surface) -> bool:

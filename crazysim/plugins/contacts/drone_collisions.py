@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.settings import check_contacts
 from crazysim.core.stage import Stage, over_worlds
 from crazysim.errors import ConfigError
@@ -25,7 +25,6 @@ from crazysim.plugins.contacts.rigid_bodies import (
     require_few_contacts,
 )
 from crazysim.plugins.contacts.solver import Impulses, solve_contacts
-from crazysim.plugins.effects.moving_air import zeros
 from crazysim.pytree import PyTree, leaf, on_device
 
 
@@ -71,7 +70,7 @@ class DroneCollisions(Plugin):
         return DroneCollisionsData(
             friction=on_device([self.friction]),
             restitution=on_device([self.restitution]),
-            impulse=zeros(sim, 3),
+            impulse=per_drone(sim, 0.0, 3),
             press=on_device(np.zeros((sim.n_worlds, 1, n_contacts))),
             drag=on_device(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ def after_contact(
     fast = active & (-slip(before)[0] > BOUNCE_SPEED)
     wanted = jnp.where(fast, 0.0, jnp.minimum(-points.gap / material.softness, FASTEST_PUSH))
 
-    def turn(k: Any, u: Array) -> Array:
+    def turn(k: Array, u: Array) -> Array:
         out, aside = slip(u)
         pressed = active & (out < wanted)
         push = jnp.where(pressed, stiff * (wanted - out), 0.0)
@@ -112,7 +112,7 @@ def _with_torque(force: Array, p: Array | None) -> Array:
     return force if p is None else jnp.concatenate([force, rotation.cross(p, force)], axis=-1)
 
 
-def _tangential(weight: Array, p: Array | None, dtype: Any) -> Array:
+def _tangential(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array:
     """Return the sum of ``weight * B^T B``; ``B`` maps a body's velocity to that of its point ``p``. (..., k, k)"""
     total = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=dtype)
     if p is None:

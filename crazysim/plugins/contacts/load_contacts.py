@@ -31,13 +31,13 @@ OWN_GAP = 1e3
 """Distance that stands for that of a body to itself, m."""
 
 
-def loads_of(sim: Simulation) -> list[Any]:
+def loads_of(sim: Simulation) -> list[Colliding]:
     """Return the plugins whose loads are objects of the scene, and collide."""
     names = () if sim.data.objects is None else sim.data.objects.names
     return [p for p in sim.scene.plugins() if isinstance(p, Colliding) and f"{p.name}:0" in names]
 
 
-def names_of(sim: Simulation, plugins: Sequence[Any]) -> set[str]:
+def names_of(sim: Simulation, plugins: Sequence[Colliding]) -> set[str]:
     """Return the names of the loads and hooks of some plugins in the scene."""
     kinds = {kind for p in plugins for kind in p.solid_kinds}
     return {name for name in (sim.data.objects.names if plugins else ()) if name.rpartition(":")[0] in kinds}
@@ -60,7 +60,7 @@ def stop_loads(
     return collider.with_vel(data, vel)
 
 
-def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Boxes) -> tuple[SimData, Any]:
+def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Boxes) -> tuple[SimData, Array]:
     """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
 
     The impulse acts at the load's centre, on both: momentum and angular momentum are kept. First the normal impulse,
@@ -92,7 +92,7 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Box
     touches = (gap < 0) & ~collider.joined(data)
     touches = touches if body.exists is None else touches & body.exists[:, None]
 
-    def response(change: Any) -> Any:
+    def response(change: Array) -> Array:
         """Return the change of the relative velocity at the lever where the load's velocity changes, m/s."""
         turned = rotation.matvec(p.J_inv, rotation.cross(lever, change))
         return change + mass * (change / p.mass + rotation.cross(turned, lever))
@@ -169,7 +169,7 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
         + sum(pairs.touches.sum(axis=0) for (_, b), pairs in found.items() if b == k)
         for k in range(len(colliders))
     ]
-    changes: list[Any] = [0.0] * len(colliders)
+    changes: list[Array | float] = [0.0] * len(colliders)
     for (a, b), pairs in found.items():
         n = jnp.maximum(n_touches[a][:, None], n_touches[b][None])
         share = jnp.where(pairs.touches, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)

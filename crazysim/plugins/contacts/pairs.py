@@ -81,23 +81,18 @@ def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, p
         carrier: Number of the body that carries it.
         pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
     """
-    at, turn = pose
-    is_ball, dtype = bool(solids.is_ball[number]), solids.pos.dtype
-    pos, rot = solids.pos[number], solids.rot[number]
-    shape = geom.shape
-    if is_ball:
-        radius = float(solids.size[number, 0])
-        gap, normal = _height(shape, apply(turn.T, pos - at))
-        normal, gap = apply(turn, normal), gap - radius
-        found = Manifold(gap[None], normal[None], (pos - normal * (radius + 0.5 * gap))[None])
-    else:
-        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], dtype))
-        gap, normal = _height(shape, apply(turn.T, corners - at))
-        found = Manifold(gap, apply(turn, normal), corners)
-        if shape.kind != "plane":
-            nearest = _nearest(Shape("box", tuple(map(float, solids.size[number]))), pos, rot, shape, at, turn)
-            found = Manifold(*(jnp.concatenate(x) for x in zip(found, nearest, strict=True)))
-    return Found(solids.body[number : number + 1], np.array([carrier]), found)
+    (at, turn), shape = pose, geom.shape
+
+    def gap_at(points: Array) -> tuple[Array, Array]:
+        gap, normal = _height(shape, apply(turn.T, points - at))
+        return gap, apply(turn, normal)
+
+    found = on_ground(solids, number, carrier, gap_at)
+    if solids.is_ball[number] or shape.kind == "plane":
+        return found
+    box = Shape("box", tuple(map(float, solids.size[number])))
+    nearest = _nearest(box, solids.pos[number], solids.rot[number], shape, at, turn)
+    return found._replace(points=Manifold(*(jnp.concatenate(x) for x in zip(found.points, nearest, strict=True))))
 
 
 def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found:

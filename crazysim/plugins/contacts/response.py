@@ -9,7 +9,6 @@ impulses those of ``impulse``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +23,7 @@ from crazysim.plugins.contacts.contact_points import Surface, contact_points, is
 from crazysim.plugins.contacts.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.plugins.contacts.impulse import Material, after_contact, inertia_matrix
 from crazysim.plugins.contacts.load_contacts import hit_drones, hit_each_other, loads_of, names_of, stop_loads
+from crazysim.plugins.payloads.body import Colliding
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.contact_report import ObjectSelection, choose
 
@@ -83,7 +83,7 @@ class ContactResponse(Plugin):
         boxes = boxes_of(sim)
         plugins = loads_of(sim)
         names = names_of(sim, plugins)
-        surfaces = surfaces_of(sim, self.objects, names)
+        surfaces = surfaces_of(sim, self.objects)
 
         def respond(data: SimData) -> SimData:
             found = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
@@ -97,7 +97,7 @@ class ContactResponse(Plugin):
             found += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
         return found
 
-    def _load_stages(self, plugin: Any, obstacles: list[Surface], boxes: Boxes, n_drones: int) -> list[Placement]:
+    def _load_stages(self, plugin: Colliding, obstacles: list[Surface], boxes: Boxes, n_drones: int) -> list[Placement]:
         """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
 
         Args:

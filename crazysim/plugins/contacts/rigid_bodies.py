@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import combinations, product
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,32 +13,20 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
-from crazysim.core.population import populations
 from crazysim.core.stage import over_worlds
 from crazysim.errors import ConfigError
 from crazysim.geometry.linear import apply, matmul
 from crazysim.geometry.manifold import N_OF_BOXES
+from crazysim.plugins.contacts.contact_points import Carrier, carriers_of
 from crazysim.plugins.contacts.pairs import CORNERS, Found, Solids, between, joined, on_ground, on_surface
 from crazysim.plugins.contacts.solver import Bodies, Impulses, Solved, solve_contacts
 from crazysim.plugins.effects.ground import TerrainData
 from crazysim.scene.collision import CollisionGeom
-from crazysim.scene.contact_report import choose
 
 MAX_CONTACTS = 250_000
 """Most contact points in a world: those of 250 drones or boxes."""
 EXACT = ("sphere", "box")
 """Kinds of geoms whose contact with balls and boxes is that of bodies; others touch corners and the nearest point."""
-
-
-class Carrier(NamedTuple):
-    """A body that moves and is not pushed, with its geoms."""
-
-    population: str | None
-    """Name of the population that it belongs to; None for an object of the scene."""
-    row: int | None
-    """Number of the member or of the movable object; None for a fixed object."""
-    geoms: tuple[CollisionGeom, ...]
-    """Its geoms, in its frame; in the world frame if it is fixed."""
 
 
 class Touching:
@@ -49,18 +37,7 @@ class Touching:
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
         self.boxes = boxes_of_drones(sim)
-        model = sim.scene.collision_model
-        self.carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
-        kinds = {kind: p for p in sim.scene.plugins() for kind in p.placed_kinds or ()}
-        members = populations(sim.data)
-        for body in choose(model, plugin.objects):
-            kind, _, number = body.name.rpartition(":")
-            if kind == plugin.name:
-                continue
-            if kind in members and hasattr(members[kind], "ang_vel"):
-                self.carriers.append(Carrier(kind, int(number), body.geoms))
-            elif kind not in kinds:
-                self.carriers.append(Carrier(None, body.row, body.geoms))
+        self.carriers = carriers_of(sim, plugin.objects, (plugin.name,))
 
     def n_contacts(self, terrains: Collection[str]) -> int:
         """Return the number of contact points, of which most are out of contact.
@@ -233,7 +210,7 @@ def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array
     return objects.pos[carrier.row], objects.quat[carrier.row], objects.vel[carrier.row], zero
 
 
-def _pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: Any) -> tuple[Array, Array]:
+def _pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.dtype) -> tuple[Array, Array]:
     """Return position and rotation matrix of a geom, world frame."""
     pos, quat, _, _ = _motion(data, carrier)
     rot = rotation.matrix(quat)

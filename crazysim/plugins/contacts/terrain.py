@@ -7,20 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.settings import as_rgba
 from crazysim.core.stage import Stage
-from crazysim.core.stages import FLOOR
+from crazysim.core.stages import FLOOR, stopped_at
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
 from crazysim.plugins.effects.grid import LARGEST_FUSED
 from crazysim.plugins.effects.ground import TerrainData, ground_height
-from crazysim.plugins.effects.moving_air import zeros
 from crazysim.pytree import on_device
 from crazysim.storage import read_bytes
 
@@ -46,14 +45,14 @@ class Terrain(Plugin):
     heights: Any = parameter()
     """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image, whose brightness is
     the height, from its darkest to its brightest pixel, and whose upper edge lies at the largest y."""
-    size: Any
+    size: ArrayLike
     """Full lengths along x and y, m (2,); with an image also the height of the brightest over the darkest (3,)."""
-    pos: Any = (0.0, 0.0, 0.0)
+    pos: ArrayLike = (0.0, 0.0, 0.0)
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
     """True to keep the flat floor around it; False to remove it, which depressions below z = 0 need. The heights of the
     border then extend outwards without end."""
-    rgba: Any = None
+    rgba: ArrayLike | None = None
     """Colour; None for that of the floor. (4,)"""
     name: str = "terrain"
 
@@ -65,7 +64,7 @@ class Terrain(Plugin):
             heights=on_device(heights, dtype),
             middle=on_device(pos, dtype),
             half=on_device(size / 2, dtype),
-            below=zeros(sim, 1),
+            below=per_drone(sim, 0.0, 1),
             floor=self.floor,
         )
         _put(sim.scene, self, heights, size, pos)
@@ -79,15 +78,8 @@ class Terrain(Plugin):
 
     def stop(self, data: SimData) -> SimData:
         """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
-        s = data.states
-        ground = ground_height(data, s.pos)
-        lowest, height = ground + FLOOR, s.pos[..., 2:]
-        stopped = (height < lowest) | ((height == lowest) & (s.vel[..., 2:] <= 0))
-        states = s.replace(
-            pos=jnp.concatenate([s.pos[..., :2], jnp.maximum(height, lowest)], axis=-1),
-            vel=jnp.where(stopped, 0.0, s.vel),
-            ang_vel=jnp.where(stopped, 0.0, s.ang_vel),
-        )
+        ground = ground_height(data, data.states.pos)
+        states = stopped_at(data.states, ground + FLOOR)
         return self.write(data.replace(states=states), self.read(data).replace(below=ground))
 
     def _checked(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

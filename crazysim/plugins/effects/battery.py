@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.data import SimData, controls_of
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter, per_drone
 from crazysim.core.stage import stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.eager import compiled
-from crazysim.plugins.effects.moving_air import controls_of, per_drone, require_rotors, zeros
+from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, leaf
 
 NOMINAL_VOLTAGE = 3.7
@@ -28,11 +27,11 @@ class BatteryData(PyTree):
 
     charge: Array = leaf("drone", 1)
     """State of charge, 0 to 1. (n_worlds, n_drones, 1)"""
-    rounding: Array = leaf("drone", 1)
+    rounding: Array = leaf("drone", 1, (1,))
     """Rounding error of the charge, subtracted at the next step, 1. (n_worlds, n_drones, 1)"""
     voltage: Array = leaf("drone", 1)
     """Voltage under load, V. (n_worlds, n_drones, 1)"""
-    current: Array = leaf("drone", 1)
+    current: Array = leaf("drone", 1, (1,))
     """Current, A. (n_worlds, n_drones, 1)"""
     capacity: Array = leaf("parameter", 1, (1,))
     """Charge of the full battery, A h. (1,)"""
@@ -56,17 +55,17 @@ class Battery(Plugin):
     (n_worlds, n_drones).
     """
 
-    capacity: Any = parameter(default=None)
+    capacity: ArrayLike | None = parameter(default=None)
     """Charge of the full battery, A h; None for that of the airframe's table ``[battery]``."""
-    resistance: Any = parameter(default=None)
+    resistance: ArrayLike | None = parameter(default=None)
     """Internal resistance of the whole battery, ohm; None for that of the airframe's table ``[battery]``."""
-    n_cells: Any = parameter(default=None)
+    n_cells: ArrayLike | None = parameter(default=None)
     """Number of lithium-polymer cells in series; None for that of the airframe's table ``[battery]``, or else 1."""
-    efficiency: Any = parameter(default=1.0)
+    efficiency: ArrayLike = parameter(default=1.0, high=1.0, positive=True)
     """Mechanical power of the propellers per electric power of the motors, above 0, up to 1."""
-    base_power: Any = parameter(default=0.0)
+    base_power: ArrayLike = parameter(default=0.0, low=0.0)
     """Electric power of everything but the motors, W."""
-    full_speed_voltage: Any = parameter(default=None)
+    full_speed_voltage: ArrayLike | None = parameter(default=None)
     """Least voltage at which the rotors reach the airframe's largest speed, V; None for that of the airframe's table
     ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
     charge: ArrayLike = parameter(default=1.0)
@@ -85,21 +84,19 @@ class Battery(Plugin):
         if full_speed_voltage is None:
             known = of_airframes(sim, lambda a: a.full_thrust_voltage or 0.0)
             full_speed_voltage = np.where(known[..., None] > 0, known[..., None], NOMINAL_VOLTAGE * np.asarray(cells))
-        charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0))
-        return BatteryData(
+        charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0), 1)
+        return self.filled(
+            sim,
+            BatteryData,
             charge=charge,
-            rounding=zeros(sim, 1),
             voltage=open_circuit_voltage(charge, cells),
-            current=zeros(sim, 1),
             capacity=check_parameter(sim, "capacity", self._own(sim, "capacity"), positive=True),
             resistance=check_parameter(sim, "resistance", self._own(sim, "resistance"), positive=True),
-            efficiency=check_parameter(sim, "efficiency", self.efficiency, high=1.0, positive=True),
-            base_power=check_parameter(sim, "base_power", self.base_power, low=0.0),
             full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, positive=True),
             n_cells=cells,
         )
 
-    def _own(self, sim: Simulation, key: str) -> Any:
+    def _own(self, sim: Simulation, key: str) -> ArrayLike:
         """Return a setting, or else the airframes' number."""
         given = getattr(self, key)
         return of_airframes(sim, lambda a: a.value(f"battery.{key}", ())) if given is None else given

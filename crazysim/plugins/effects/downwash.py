@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, of_airframes, parameter
 from crazysim.core.stage import stage
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
-from crazysim.plugins.effects.moving_air import Exposed, checked_propeller_radius, require_drag, with_moving_air, zeros
+from crazysim.plugins.effects.moving_air import Exposed, checked_propeller_radius, require_drag, with_moving_air
 from crazysim.pytree import PyTree, leaf, on_device
 
 DECAY, SPREAD = 5.8, 0.094
@@ -35,16 +35,16 @@ class DownwashData(PyTree):
     """Diameter of the fully contracted jet of a drone, m. (1,)"""
     air_density: Array = leaf("parameter", 1, (1,))
     """Density of air, kg/m^3. (1,)"""
-    air_vel: Array = leaf("drone", 1)
+    air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air from other drones, world frame, m/s. (n_worlds, n_drones, 3)"""
 
 
 class Downwash(Plugin):
     """Downwash of the other drones of a world, as drag of the velocity relative to the air; needs a model with drag."""
 
-    propeller_radius: ArrayLike = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
-    air_density: ArrayLike = parameter(default=AIR_DENSITY)
+    air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
     name: str = "downwash"
 
@@ -52,9 +52,8 @@ class Downwash(Plugin):
         """Return still air."""
         require_drag(sim, "downwash")
         radius = checked_propeller_radius(sim, self.propeller_radius)
-        density = check_parameter(sim, "air_density", self.air_density, positive=True)
         # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
-        return DownwashData(stream_diameter(sim, radius), density, zeros(sim, 3))
+        return self.filled(sim, DownwashData, diameter=stream_diameter(sim, radius))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that computes the air velocity."""

@@ -28,11 +28,11 @@ UNEVEN = 1e-3
 class Grid(NamedTuple):
     """Values at the nodes of a regular grid, along x, y and z."""
 
-    values: Any
+    values: ArrayLike
     """Values. (n_x, n_y, n_z) or (n_x, n_y, n_z, k)"""
     origin: ArrayLike = (0.0, 0.0, 0.0)
     """Position of the node of the smallest x, y and z, m. (3,)"""
-    spacing: Any = 1.0
+    spacing: ArrayLike = 1.0
     """Distance between neighbouring nodes, m: () or (3,)."""
 
     def checked(self, name: str, k: int | None = None) -> Grid:
@@ -92,7 +92,7 @@ def interpolate(values: Array, position: Array) -> Array:
     total: Any = 0.0
     for corner in product((0, 1), repeat=n_axes):
         node = values.at[tuple(nodes[k][c] for k, c in enumerate(corner))]
-        weight: Any = 1.0
+        weight: Array | float = 1.0
         for k, c in enumerate(corner):
             weight = weight * shares[k][c]
         found = node.get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -28,7 +28,7 @@ class GroundEffectData(PyTree):
 class GroundEffect(Plugin):
     """Thrust of every rotor that grows near the ground, flat floor or terrain; needs rotors."""
 
-    propeller_radius: ArrayLike = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
     name: str = "ground_effect"
 

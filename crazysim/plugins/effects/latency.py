@@ -11,11 +11,10 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.control import Control
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, controls_of
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.errors import ConfigError, shown
-from crazysim.plugins.effects.moving_air import controls_of
 from crazysim.pytree import PyTree, leaf, on_device
 
 MAX_DELAY = 100_000

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
-from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.data import SimData, controls_of
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
 from crazysim.core.random import drone_key
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.moving_air import controls_of, per_drone, require_rotors
+from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, leaf, select_worlds
 
 
@@ -37,13 +38,13 @@ class MotorFailure(Plugin):
     no command and runs down. Controllers keep the airframe's parameters.
     """
 
-    effectiveness: Any = parameter(default=1.0)
+    effectiveness: ArrayLike = parameter(default=1.0)
     """Fraction of thrust and drag torque at the beginning of an episode, 0 to 1.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
-    fail_step: Any = parameter(default=None)
+    fail_step: ArrayLike | None = parameter(default=None, dtype=np.int32)
     """Step of the episode in which a rotor fails, a whole number, negative for never; None if no rotor does.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
-    rate: Any = parameter(default=None)
+    rate: ArrayLike | None = parameter(default=None, low=0.0)
     """Random failures per second of a working rotor, 1/s; None for no random failures.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     name: str = "motors"
@@ -51,12 +52,9 @@ class MotorFailure(Plugin):
     def record(self, sim: Simulation) -> MotorFailureData:
         """Return the rotors at their initial effectiveness."""
         require_rotors(sim, "motor failure")
-        core, step, rate = (sim.data.states.rotor_vel.shape[-1],), self.fail_step, self.rate
-        return MotorFailureData(
-            effectiveness=per_drone(sim, check_parameter(sim, "effectiveness", self.effectiveness, core, 0.0, 1.0)),
-            fail_step=None if step is None else check_parameter(sim, "fail_step", step, core, dtype=jnp.int32),
-            rate=None if rate is None else check_parameter(sim, "rate", rate, core, 0.0),
-        )
+        n = sim.data.states.rotor_vel.shape[-1]
+        effectiveness = check_parameter(sim, "effectiveness", self.effectiveness, (n,), 0.0, 1.0)
+        return self.filled(sim, MotorFailureData, effectiveness=per_drone(sim, effectiveness, n))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that makes rotors fail, if any can."""
@@ -83,7 +81,7 @@ class MotorFailure(Plugin):
             effectiveness = jnp.where(uniform < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
         return self.write(data, motors.replace(effectiveness=effectiveness))
 
-    def fail(self, data: SimData, mask: Any) -> SimData:
+    def fail(self, data: SimData, mask: ArrayLike | None) -> SimData:
         """Return the data with failed rotors; a reset of their world restores them.
 
         Args:

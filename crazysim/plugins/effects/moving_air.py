@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, check_parameter, of_airframes
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, leaf
 
 
 class Exposed(PyTree):
     """Record of bodies that wind and downwash act on: one for each drone, such as its load."""
 
-    pos: Array = leaf("drone", 1)
+    pos: Array = leaf("drone", 1, (3,))
     """Position of the body, world frame, m. (n_worlds, n_drones, 3)"""
-    air_vel: Array | None = leaf("drone", 1)
+    air_vel: Array | None = leaf("drone", 1, (3,))
     """Velocity of the air at the body from the jets of all drones, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
-    wind_vel: Array | None = leaf("drone", 1)
+    wind_vel: Array | None = leaf("drone", 1, (3,))
     """Velocity of the air at the body from all wind fields, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
 
@@ -67,23 +66,8 @@ def require_rotors(sim: Simulation, effect: str) -> None:
         raise ConfigError(f"{effect} acts on single rotors, which only dynamics='first_principles' has")
 
 
-def checked_propeller_radius(sim: Simulation, radius: Any) -> Array:
+def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:
     """Return the radius of propellers as ``check_parameter`` does, m; of None that of the airframes."""
     if radius is None:
         radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
     return check_parameter(sim, "propeller_radius", radius, positive=True)
-
-
-def controls_of(data: SimData) -> Any:
-    """Return the controls untyped: the command level and the model determine which of their fields are None."""
-    return data.controls
-
-
-def per_drone(sim: Simulation, value: Array) -> Array:
-    """Return a parameter with one entry per drone. (n_worlds, n_drones, *core)"""
-    return on_device(np.broadcast_to(value, (*sim.data.states.pos.shape[:2], value.shape[-1])), value.dtype)
-
-
-def zeros(sim: Simulation, n: int) -> Array:
-    """Return zeros for every drone, of the states' type. (n_worlds, n_drones, n)"""
-    return on_device(np.zeros((*sim.data.states.pos.shape[:2], n)), sim.data.states.pos.dtype)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +11,12 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.effects.moving_air import require_drag, with_moving_air, zeros
+from crazysim.plugins.effects.moving_air import require_drag, with_moving_air
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
 
@@ -45,9 +44,9 @@ class WindData(PyTree):
     """Height of the mean wind, m; None for a wind that is the same at all heights. (1,)"""
     speed_20ft: Array | None = leaf("parameter", 1, (1,))
     """Mean wind speed 20 ft above ground, which sets the strength of gusts, m/s; None without gusts. (1,)"""
-    filters: Array | None = leaf("drone", 1)
+    filters: Array | None = leaf("drone", 1, (5,))
     """States of the shaping filters at unit variance, 1; None without gusts. (n_worlds, n_drones, 5)"""
-    gust: Array | None = leaf("drone", 1)
+    gust: Array | None = leaf("drone", 1, (3,))
     """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
 
     def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
@@ -76,16 +75,16 @@ class Wind(Plugin):
 
     velocity: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Mean wind, at the reference height with a profile, world frame, m/s. (3,) or (n_worlds, n_drones, 3)"""
-    speed_20ft: ArrayLike = parameter(default=None)
+    speed_20ft: ArrayLike | None = parameter(default=None, low=0.0)
     """Mean wind speed 20 ft above ground, m/s, which sets the strength of gusts: 15 knots (7.7 m/s) is light, 30
     moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. () or (n_worlds, n_drones)"""
-    roughness: ArrayLike = parameter(default=None)
+    roughness: ArrayLike | None = parameter(default=None, positive=True)
     """Roughness length of the ground, m, for a mean that grows with the logarithm of the height: 0.15 ft (0.046 m) in
     MIL-F-8785C near airfields, 2 ft (0.61 m) elsewhere. None for none. () or (n_worlds, n_drones)"""
-    exponent: Any = parameter(default=None)
+    exponent: ArrayLike | None = parameter(default=None, low=0.0)
     """Exponent of a mean that grows with a power of the height, 1, such as 0.2 over land (IEC 61400-1) and 0.14 over
     the sea (IEC 61400-3). None for none. () or (n_worlds, n_drones)"""
-    reference_height: Any = parameter(default=20 * FOOT)
+    reference_height: ArrayLike = parameter(default=20 * FOOT, positive=True)
     """Height at which a mean that grows is ``velocity``, m. () or (n_worlds, n_drones)"""
     name: str = "wind"
 
@@ -98,21 +97,10 @@ class Wind(Plugin):
                 "logarithmic profile, exponent for the power law."
             )
 
-        def optional(name: str, is_used: bool = True, **limits: Any) -> Array | None:
-            value = getattr(self, name)
-            return check_parameter(sim, name, value, **limits) if is_used and value is not None else None
-
-        grows = self.roughness is not None or self.exponent is not None
-        speed = optional("speed_20ft", low=0.0)
-        record = WindData(
-            velocity=check_parameter(sim, "velocity", self.velocity, (3,)),
-            roughness=optional("roughness", positive=True),
-            exponent=optional("exponent", low=0.0),
-            reference_height=optional("reference_height", grows, positive=True),
-            speed_20ft=speed,
-            filters=None if speed is None else zeros(sim, 5),
-            gust=None if speed is None else zeros(sim, 3),
-        )
+        absent = [] if self.speed_20ft is not None else ["filters", "gust"]
+        if self.roughness is None and self.exponent is None:
+            absent.append("reference_height")
+        record = self.filled(sim, WindData, **dict.fromkeys(absent))
         if record.roughness is not None and np.any(np.asarray(record.roughness) >= np.asarray(record.reference_height)):
             raise ConfigError(
                 f"expected a roughness below the reference height, got {self.roughness} m and "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -11,12 +10,12 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.random import world_key
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import LARGEST_FUSED, Grid, interpolate
-from crazysim.plugins.effects.moving_air import Exposed, require_drag, with_moving_air, zeros
+from crazysim.plugins.effects.moving_air import Exposed, require_drag, with_moving_air
 from crazysim.pytree import PyTree, leaf, on_device
 
 
@@ -38,7 +37,7 @@ class WindFieldData(PyTree):
     shift: Array | None = leaf("drone", 1)
     """Random displacement in this episode, the same for all drones of a world, m; None for none.
     (n_worlds, n_drones, 3)"""
-    air_vel: Array = leaf("drone", 1)
+    air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
 
     def velocity_at(self, pos: Array) -> Array:
@@ -55,13 +54,13 @@ class WindField(Plugin):
     loads with drag. Winds add up.
     """
 
-    field: Any = parameter()
+    field: Grid = parameter()
     """Velocities of the air, world frame, m/s: values (n_x, n_y, n_z, 3) of a grid."""
-    offset: Any = parameter(default=(0.0, 0.0, 0.0))
+    offset: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Displacement of the grid, world frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    scale: Any = parameter(default=1.0)
+    scale: ArrayLike = parameter(default=1.0)
     """Factor of all velocities, 1. () or (n_worlds, n_drones)"""
-    spread: ArrayLike = parameter(default=None)
+    spread: ArrayLike | None = parameter(default=None, low=0.0)
     """Largest random displacement along each axis, m, uniform, drawn for each world and episode; None for none. (3,)
     or (n_worlds, n_drones, 3)"""
     name: str = "wind_field"
@@ -76,16 +75,13 @@ class WindField(Plugin):
             )
         grid = self.field.checked("field", 3)
         dtype = sim.data.states.pos.dtype
-        spread = None if self.spread is None else check_parameter(sim, "spread", self.spread, (3,), 0.0)
-        return WindFieldData(
+        return self.filled(
+            sim,
+            WindFieldData,
             field=on_device(grid.values, dtype),
             origin=on_device(grid.origin, dtype),
             spacing=on_device(grid.spacing, dtype),
-            offset=check_parameter(sim, "offset", self.offset, (3,)),
-            scale=check_parameter(sim, "scale", self.scale),
-            spread=spread,
-            shift=None if spread is None else zeros(sim, 3),
-            air_vel=zeros(sim, 3),
+            shift=None if self.spread is None else per_drone(sim, 0.0, 3),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, shown
@@ -87,7 +88,7 @@ class Colliding:
         raise NotImplementedError
 
 
-def shape_of(size: Any) -> Shape:
+def shape_of(size: ArrayLike) -> Shape:
     """Return a ball of a radius, or a box of three full lengths, m.
 
     Raises:
@@ -103,7 +104,7 @@ def shape_of(size: Any) -> Shape:
     return Shape(kind, tuple((lengths / 2).tolist()) if kind == "box" else (float(lengths),))
 
 
-def rest_height(size: Any) -> float:
+def rest_height(size: ArrayLike) -> float:
     """Return the height of the middle of a ball or box above the floor on which it stands, m.
 
     Raises:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
@@ -27,7 +28,6 @@ from crazysim.plugins.payloads.load import (
     hanging,
     on_floor,
     turned_z,
-    with_poses,
 )
 from crazysim.plugins.payloads.slung import load_record, place_loads, upward
 from crazysim.pytree import leaf, on_device, select_worlds
@@ -37,9 +37,9 @@ from crazysim.rotation import dot
 class HookData(LoadData):
     """State and parameters of the hook of each drone, and of its load."""
 
-    tip_pos: Array = leaf("drone", 1)
+    tip_pos: Array = leaf("drone", 1, (3,))
     """Position of the hook, world frame, m. (n_worlds, n_drones, 3)"""
-    tip_vel: Array = leaf("drone", 1)
+    tip_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the hook, world frame, m/s. (n_worlds, n_drones, 3)"""
     grip: Array = leaf("drone", 0)
     """Command: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones)"""
@@ -59,41 +59,41 @@ class Hook(Colliding, Plugin):
     the impulse of two bodies that stay together; a load that is let go falls freely.
     """
 
-    mass: Any = parameter()
+    mass: ArrayLike = parameter(low=0.0)
     """Mass of the load, kg; zero for none. () or (n_worlds, n_drones)"""
     dof: int = 2
     """Degrees of freedom of the rod, 1 or 2."""
-    length: Any = parameter(default=0.4)
+    length: ArrayLike = parameter(default=0.4, positive=True)
     """Length of the rod, m. () or (n_worlds, n_drones)"""
-    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Joint, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    hook_mass: Any = parameter(default=0.0203)
+    hook_mass: ArrayLike = parameter(default=0.0203, low=0.0)
     """Mass of the hook, kg. () or (n_worlds, n_drones)"""
-    damping: Any = parameter(default=0.001)
+    damping: ArrayLike = parameter(default=0.001, low=0.0)
     """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
-    reach: Any = parameter(default=0.05)
+    reach: ArrayLike = parameter(default=0.05, low=0.0)
     """Distance of the hook from the ring below which it picks up, m. () or (n_worlds, n_drones)"""
-    max_speed: Any = parameter(default=0.5)
+    max_speed: ArrayLike = parameter(default=0.5, low=0.0)
     """Speed of the hook relative to the ring below which it picks up, m/s. () or (n_worlds, n_drones)"""
-    drag: Any = parameter(default=0.0)
+    drag: ArrayLike = parameter(default=0.0, low=0.0)
     """Linear drag coefficient of the load, N s/m. () or (n_worlds, n_drones)"""
-    friction: Any = parameter(default=0.6)
+    friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
-    size: Any = (0.14, 0.14, 0.08)
+    size: ArrayLike = (0.14, 0.14, 0.08)
     """Radius of a ball, or full lengths of a box, m: () or (3,)."""
     ring: float = 0.1275
     """Height of the ring above the middle of the load, m."""
-    load_at: Any = None
+    load_at: ArrayLike | None = None
     """Initial position of the loads' rings, world frame, m; None for loads on the hooks. (3,) or (n_worlds, n_drones,
     3)"""
-    rgba: Any = None
+    rgba: ArrayLike | None = None
     """Colour of the loads; None for the default. (4,)"""
     in_scene: bool = True
     """True to put loads and rods into the scene."""
     name: str = "load"
 
     @staticmethod
-    def bumblebee(mass: Any = 0.2, dof: int = 2, **settings: Any) -> Hook:
+    def bumblebee(mass: ArrayLike = 0.2, dof: int = 2, **settings: Any) -> Hook:
         """Return the hook of AIMotionLab's Bumblebee with a load; the rod turns about the drone's centre of mass.
 
         Rod of 0.4 m, hook of 0.0203 kg, joint damping 0.001 N m s, ring 0.1275 m above the load's middle (facts of
@@ -111,29 +111,18 @@ class Hook(Colliding, Plugin):
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
         if self.dof not in (1, 2):
             raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}. Use Hook(mass, dof=2).")
-        load = load_record(self, sim, False, rest_height(self.size) + self.ring, self.ring)
-
-        def check(name: str) -> Array:
-            return check_parameter(sim, name, getattr(self, name), low=0.0)
-
-        values = {field: getattr(load, field) for field in load.__dataclass_fields__}
-        tip_pos, tip_vel = load.pos, load.vel
-        if self.load_at is not None:
-            at = check_parameter(sim, "load_at", self.load_at, (3,))
-            pos = np.array(np.broadcast_to(at, load.pos.shape))
-            pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
-            vel, attached = np.zeros_like(pos), np.zeros(load.attached.shape, bool)
-            values |= {"pos": on_device(pos), "vel": on_device(vel), "attached": on_device(attached, bool)}
-            no_clearance = on_device(np.zeros(load.clearance.shape))
-            tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
-        return HookData(
-            **values,
-            tip_pos=on_device(tip_pos),
-            tip_vel=on_device(tip_vel),
-            grip=on_device(values["attached"], bool),
-            hook_mass=check("hook_mass"),
-            reach=check("reach"),
-            max_speed=check("max_speed"),
+        grip = on_device(np.ones(sim.data.states.pos.shape[:2]), bool)
+        load = load_record(self, sim, HookData, False, rest_height(self.size) + self.ring, self.ring, grip=grip)
+        if self.load_at is None:
+            return load.replace(tip_pos=on_device(load.pos), tip_vel=on_device(load.vel))
+        at = check_parameter(sim, "load_at", self.load_at, (3,))
+        pos = np.array(np.broadcast_to(at, load.pos.shape))
+        pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
+        no_clearance = on_device(np.zeros(load.clearance.shape))
+        tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
+        free = {name: on_device(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
+        return load.replace(
+            pos=on_device(pos), vel=on_device(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **free
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
@@ -196,7 +185,7 @@ class Hook(Colliding, Plugin):
         pos, vel = jnp.where(load.attached, tip_pos, pos), jnp.where(load.attached, tip_vel, vel)
         return self.write(data, load.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
 
-    def command(self, data: SimData, grip: Any) -> SimData:
+    def command(self, data: SimData, grip: ArrayLike) -> SimData:
         """Return the data with another command to the hooks.
 
         Args:
@@ -218,7 +207,7 @@ class Hook(Colliding, Plugin):
             )
         return self.write(data, load.replace(grip=jnp.broadcast_to(flags, load.grip.shape)))
 
-    def hang(self, data: SimData, mask: Any = None) -> SimData:
+    def hang(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
         """Return the data with hooks, and the loads on them, at rest below their drones; of all worlds.
 
         Use it after moving drones.
@@ -251,7 +240,7 @@ class Hook(Colliding, Plugin):
         holds = np.ones(load.tip_pos.shape[0], bool)
         objects = place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring, bare=True)  # type: ignore[arg-type]
         heads = {f"{self.name}_hook": (load.tip_pos, turned_z(-self._along(data, load)))}
-        return with_poses(objects, heads)
+        return objects.with_poses(heads)
 
     @property
     def solid_kinds(self) -> tuple[str, ...]:

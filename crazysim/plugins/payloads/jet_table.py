@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 
@@ -19,15 +20,15 @@ LAB_SIDE = 81
 class JetTable(NamedTuple):
     """Air around a hovering drone on a regular grid that moves and turns with it, by rotor speed."""
 
-    speeds: Any
+    speeds: ArrayLike
     """Mean rotor speeds of the tables, rad/s, ascending. (k,)"""
     pressure: Any = None
     """Pressures, Pa; None for none. (k, n_x, n_y, n_z)"""
     velocity: Any = None
     """Velocities of the air, body frame, m/s; None for none. (k, n_x, n_y, n_z, 3)"""
-    origin: Any = (0.0, 0.0, 0.0)
+    origin: ArrayLike = (0.0, 0.0, 0.0)
     """Node of the smallest x, y and z, from the drone's centre of mass, body frame, m. (3,)"""
-    spacing: Any = CENTIMETRE
+    spacing: ArrayLike = CENTIMETRE
     """Distance between neighbouring nodes, m: () or (3,)."""
 
     @property
@@ -48,7 +49,7 @@ class JetTable(NamedTuple):
             raise ConfigError(
                 "expected a table of pressure or velocity, got neither. Use pressure=, velocity= or both."
             )
-        found: dict[str, Any] = {}
+        found: dict[str, np.ndarray] = {}
         for name, core in (("pressure", ()), ("velocity", (3,))):
             value = getattr(self, name)
             if value is None:
@@ -75,7 +76,10 @@ class JetTable(NamedTuple):
 
 
 def load_jet_table(
-    folder: str | Path, shape: tuple[int, int, int] | None = None, spacing: float = CENTIMETRE, origin: Any = None
+    folder: str | Path,
+    shape: tuple[int, int, int] | None = None,
+    spacing: float = CENTIMETRE,
+    origin: ArrayLike | None = None,
 ) -> JetTable:
     """Return the table in a folder of text files as AIMotionLab writes them.
 
@@ -118,7 +122,7 @@ def load_jet_table(
     if len(n_rows) > 1:
         raise ConfigError(f"expected the same number of rows in all files of {str(folder)!r}, got {sorted(n_rows)}")
     dims = _dims(n_rows.pop(), shape)
-    at = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else origin
+    at = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else np.asarray(origin)
     return JetTable(
         speeds=np.array(speeds, np.float64),
         pressure=np.stack([pressure[s].reshape(dims) for s in speeds]) if pressure else None,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.core.data import Objects, SimData, SimState
+from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_mask, as_rgba
 from crazysim.eager import compiled
@@ -42,7 +44,7 @@ SOLID = 'contype="0" conaffinity="2"'
 class LoadData(Exposed):
     """State and parameters of the load of each drone."""
 
-    vel: Array = leaf("drone", 1)
+    vel: Array = leaf("drone", 1, (3,))
     """Velocity, world frame, m/s. (n_worlds, n_drones, 3)"""
     attached: Array = leaf("drone", 0)
     """True where the load hangs from its drone. (n_worlds, n_drones)"""
@@ -79,7 +81,7 @@ class PointLoad(Colliding):
         pos, vel = on_floor(load.pos, load.vel, clearance, load.friction)
         return self.write(data, load.replace(pos=pos, vel=vel))
 
-    def release(self, data: SimData, mask: Any = None) -> SimData:
+    def release(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
         """Return the data with links of loads cut.
 
         Args:
@@ -98,7 +100,7 @@ class PointLoad(Colliding):
         )
 
 
-def integrator_of(sim: Simulation) -> Any:
+def integrator_of(sim: Simulation) -> Callable[..., SimData] | None:
     """Return the function of the integrator, such as ``core.integration.rk4``, or None if the stage is not built in."""
     return getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
 
@@ -199,8 +201,8 @@ def load_vel(data: SimData, name: str = "load") -> Array:
 def add_to_scene(
     sim: Simulation,
     name: str,
-    size: Any,
-    rgba: Any,
+    size: ArrayLike,
+    rgba: ArrayLike | None,
     length: float,
     n_loads: int,
     n_pieces: int,
@@ -222,7 +224,7 @@ def add_to_scene(
     if objects is not None and f"{name}:0" in objects.names:
         return
     rgba = as_rgba((0.85, 0.55, 0.2, 1.0) if rgba is None else rgba)
-    half = np.full(3, float(size)) if np.ndim(size) == 0 else np.asarray(size, float) / 2
+    half = np.full(3, size, float) if np.ndim(size) == 0 else np.asarray(size, float) / 2
     kind = "sphere" if np.ndim(size) == 0 else "box"
     body = f'<geom type="{kind}" size="{_numbers(half)}" {SOLID} rgba="{_numbers(rgba)}"/>'
     shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
@@ -240,28 +242,14 @@ def add_to_scene(
         sim.scene.add(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count=count)
 
 
-def _rod(start: Any, end: Any, radius: float, rgba: Any) -> str:
+def _rod(start: Iterable[float], end: Iterable[float], radius: float, rgba: Iterable[float]) -> str:
     """Return MJCF of a rod that touches nothing."""
     ends = f"{_numbers(start)} {_numbers(end)}"
     return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{_numbers(rgba)}"/>'
 
 
-def _numbers(values: Any) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{float(value):.9g}" for value in values)
-
-
-def with_poses(objects: Objects, rows: dict[str, tuple[Array, Array]]) -> Objects:
-    """Return the objects of a world with some at other poses.
-
-    Args:
-        objects: Objects of one world.
-        rows: Positions (n, 3) and attitudes, xyzw (n, 4), of all objects of a kind, by the kind's name.
-    """
-    pos, quat = objects.pos, objects.quat
-    for kind, (at, turned) in rows.items():
-        where = np.array([objects.names.index(f"{kind}:{k}") for k in range(at.shape[0])])
-        pos, quat = pos.at[where].set(at.astype(pos.dtype)), quat.at[where].set(turned.astype(quat.dtype))
-    return objects.replace(pos=pos, quat=quat)
 
 
 def pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array, Array]:

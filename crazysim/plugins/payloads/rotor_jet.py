@@ -8,16 +8,17 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.downwash import AIR_DENSITY, collective_thrust, jet, mean_rotor_vel, stream_diameter
 from crazysim.plugins.effects.grid import LARGEST_FUSED, interpolate, is_inside
-from crazysim.plugins.effects.moving_air import require_rotors, zeros
+from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
 from crazysim.plugins.payloads.body import Colliding
 from crazysim.plugins.payloads.jet_table import JetTable
 from crazysim.plugins.payloads.panels import panels_of
@@ -30,9 +31,9 @@ PANELS_PER_LENGTH = 2
 class RotorJetData(PyTree):
     """Wrench of the jets on the loads, and the table of the jet."""
 
-    force: Array = leaf("drone", 1)
+    force: Array = leaf("drone", 1, (3,))
     """Force on the load, world frame, N. (n_worlds, n_drones, 3)"""
-    torque: Array = leaf("drone", 1)
+    torque: Array = leaf("drone", 1, (3,))
     """Torque about the centre of the load's shape, world frame, N m. (n_worlds, n_drones, 3)"""
     diameter: Array = leaf("parameter", 1, (1,))
     """Diameter of the fully contracted jet of a drone, m. (1,)"""
@@ -69,9 +70,9 @@ class RotorJet(Plugin):
     """Largest edge of a panel, m; None for half the longest edge of the load."""
     all_drones: bool = False
     """True for the jets of all drones of a world on each load; False for that of the load's own drone."""
-    air_density: Any = parameter(default=AIR_DENSITY)
+    air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
-    propeller_radius: Any = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None)
     """Radius of a propeller, m, for the analytic jet; None for the airframe's. () or (n_worlds, n_drones)"""
     name: str = "rotor_jet"
 
@@ -86,28 +87,11 @@ class RotorJet(Plugin):
                 f"expected table as a JetTable or None, got {type(self.table).__name__}. Use load_jet_table(folder)."
             )
         table = None if self.table is None else self.table.checked()
-        radius = self.propeller_radius
-        if radius is None:
-            radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
-        radius = check_parameter(sim, "propeller_radius", radius, positive=True)
-        dtype = radius.dtype
-
-        def shared(name: str) -> Array | None:
-            value = getattr(table, name, None)
-            return None if value is None else on_device(value, dtype)
-
-        return RotorJetData(
-            force=zeros(sim, 3),
-            torque=zeros(sim, 3),
-            diameter=stream_diameter(sim, radius),
-            air_density=check_parameter(sim, "air_density", self.air_density, positive=True),
-            speeds=shared("speeds"),
-            pressure=shared("pressure"),
-            velocity=shared("velocity"),
-            origin=shared("origin"),
-            spacing=shared("spacing"),
-            load=self.load,
-        )
+        radius = checked_propeller_radius(sim, self.propeller_radius)
+        names = ("speeds", "pressure", "velocity", "origin", "spacing")
+        values = {name: getattr(table, name, None) for name in names}
+        shared = {name: None if x is None else on_device(x, radius.dtype) for name, x in values.items()}
+        return self.filled(sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared)
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that adds up the forces on the panels."""

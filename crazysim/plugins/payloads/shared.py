@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +27,6 @@ from crazysim.plugins.payloads.load import (
     integrator_of,
     pieces,
     turned_z,
-    with_poses,
 )
 from crazysim.pytree import PyTree, leaf, on_device
 
@@ -93,7 +92,7 @@ class SharedLoad(PointLoad, Plugin):
     """Length of rods or cables, m. () or (n_worlds, n_drones)"""
     cable: bool = True
     """True for cables, False for rigid rods."""
-    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     friction: float = parameter(default=0.6)
     """Coulomb's coefficient between load and floor."""
@@ -195,7 +194,7 @@ class SharedLoad(PointLoad, Plugin):
         links = pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
         up = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
         rows = {self.name: (load.pos[None], turned_z(up)), f"{self.name}_link": links}
-        return with_poses(data.objects, rows)  # type: ignore[arg-type]
+        return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
     def body(self, data: SimData) -> LoadBody:
         """Return the load; of one world."""

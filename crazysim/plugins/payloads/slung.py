@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.integration import rk4
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import Stage
-from crazysim.plugins.effects.moving_air import zeros
 from crazysim.plugins.payloads.body import LoadBody, rest_height
 from crazysim.plugins.payloads.link import Link, couple, end_relative_motion, relative
 from crazysim.plugins.payloads.load import (
@@ -27,9 +27,10 @@ from crazysim.plugins.payloads.load import (
     integrator_of,
     pieces,
     turned_z,
-    with_poses,
 )
 from crazysim.pytree import on_device, select_worlds
+
+L = TypeVar("L", bound=LoadData)
 
 OUT_OF_SIGHT = 1000.0
 """Depth at which loads are that do not exist, m."""
@@ -42,26 +43,26 @@ class SlungLoad(PointLoad, Plugin):
     as it is taut. The load starts at rest below the drone, where the drone is when the plugin is added.
     """
 
-    mass: Any = parameter()
+    mass: ArrayLike = parameter(low=0.0)
     """Mass of the load, kg; at zero the drone flies as without it. () or (n_worlds, n_drones)"""
-    length: Any = parameter(default=0.4)
+    length: ArrayLike = parameter(default=0.4, positive=True)
     """Length of rod or cable, m. () or (n_worlds, n_drones)"""
     cable: bool = False
     """True for a cable, False for a rigid rod."""
-    attach: Any = parameter(default=(0.0, 0.0, 0.0))
+    attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    damping: Any = parameter(default=0.0)
+    damping: ArrayLike = parameter(default=0.0, low=0.0)
     """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
-    restitution: Any = parameter(default=0.0)
+    restitution: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Ratio of the radial speeds after and before a cable becomes taut, 0 to 1. () or (n_worlds, n_drones)"""
-    drag: Any = parameter(default=0.0)
+    drag: ArrayLike = parameter(default=0.0, low=0.0)
     """Linear drag coefficient of the load, N s/m, through which wind and downwash act on it.
     () or (n_worlds, n_drones)"""
-    friction: Any = parameter(default=0.6)
+    friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
-    size: Any = 0.03
+    size: ArrayLike = 0.03
     """Radius of a ball, or full lengths of a box, m: () or (3,). For contacts, the floor and images."""
-    rgba: Any = None
+    rgba: ArrayLike | None = None
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
     """True to put loads and links into the scene, where they are drawn and reported as contacts of drones."""
@@ -69,7 +70,7 @@ class SlungLoad(PointLoad, Plugin):
 
     def record(self, sim: Simulation) -> LoadData:
         """Return loads at rest below their drones."""
-        return load_record(self, sim, self.cable, rest_height(self.size))
+        return load_record(self, sim, LoadData, self.cable, rest_height(self.size))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage of the floor, and for cables in schemes of higher order that of becoming taut."""
@@ -95,7 +96,7 @@ class SlungLoad(PointLoad, Plugin):
         states, vel = end_relative_motion(data.states, p.mass, p.J_inv, self._link(load), load.pos, load.vel)
         return self.write(data.replace(states=states), load.replace(vel=vel))
 
-    def hang(self, data: SimData, mask: Any = None) -> SimData:
+    def hang(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
         """Return the data with every load attached, and at rest below its drone; of all worlds.
 
         Use it after moving drones.
@@ -142,49 +143,42 @@ class SlungLoad(PointLoad, Plugin):
         return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
 
 
-def load_record(plugin: Any, sim: Simulation, is_cable: bool, clearance: float, ring: float | None = None) -> LoadData:
+def load_record(
+    plugin: Plugin,
+    sim: Simulation,
+    kind: type[L],
+    is_cable: bool,
+    clearance: float,
+    ring: float | None = None,
+    **given: Any,
+) -> L:
     """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
 
     Args:
         plugin: The plugin.
         sim: Simulation.
+        kind: Class of the record.
         is_cable: True for cables.
         clearance: Height of a load's position above the floor where it rests, m.
         ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
+        given: Further fields of the record.
     """
-
-    def check(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array:
-        return check_parameter(sim, name, getattr(plugin, name), core, **limits)
-
-    def optional(name: str, core: tuple[int, ...] = (1,), **limits: Any) -> Array | None:
-        """Return a setting, or None where it is zero everywhere: what is not there is not computed."""
-        value = check(name, core, **limits)
-        return value if np.any(np.asarray(value)) else None
-
-    length, attach = check("length", positive=True), optional("attach", (3,))
-    rest, drag = check_parameter(sim, "size", clearance, low=0.0), optional("drag", low=0.0)
+    rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
+    attached = on_device(np.ones(states.pos.shape[:2]), bool)
+    given |= {} if is_cable else {"restitution": None}
+    load = plugin.filled(sim, kind, clearance=rest, attached=attached, **given)
+    # A setting that is zero everywhere is None: what is not there is not computed.
+    optional = [name for name in ("attach", "damping", "restitution", "drag") if getattr(load, name) is not None]
+    load = load.replace(**{name: None for name in optional if not np.any(np.asarray(getattr(load, name)))})
+    if load.drag is None:
+        load = load.replace(air_vel=None, wind_vel=None)
     if plugin.in_scene:
         add_to_scene(
-            sim, plugin.name, plugin.size, plugin.rgba, float(np.max(length)), sim.n_drones,
+            sim, plugin.name, plugin.size, plugin.rgba, float(np.max(load.length)), sim.n_drones,
             CABLE_SEGMENTS if is_cable else 1, ring,
         )  # fmt: skip
-    states = sim.data.states
-    pos, vel = hanging(states, attach, length, rest, is_cable)
-    return LoadData(
-        pos=pos,
-        vel=on_device(np.broadcast_to(vel, states.vel.shape)),
-        air_vel=None if drag is None else zeros(sim, 3),
-        wind_vel=None if drag is None else zeros(sim, 3),
-        attached=on_device(np.ones(states.pos.shape[:2]), bool),
-        mass=check("mass", low=0.0),
-        length=length,
-        attach=attach,
-        damping=optional("damping", low=0.0),
-        restitution=optional("restitution", low=0.0, high=1.0) if is_cable else None,
-        drag=drag,
-        friction=check("friction", low=0.0),
-        clearance=rest,
-    )
+    pos, vel = hanging(states, load.attach, load.length, rest, is_cable)
+    return load.replace(pos=pos, vel=vel)
 
 
 def place_loads(
@@ -218,7 +212,7 @@ def place_loads(
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
     links = pieces(top if bare else top - away, offset, load.length, n_pieces)
     rows = {name: (load.pos - away - ring * up, turned_z(up)), f"{name}_link": links}
-    return with_poses(data.objects, rows)  # type: ignore[arg-type]
+    return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
 
 def upward(data: SimData, load: LoadData, tip: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
-from crazysim.plugins.effects.moving_air import zeros
-from crazysim.plugins.sensors.sensor import Samples, Sensor, check_resolution, correlated, quantise
+from crazysim.core.plugin import parameter
+from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, quantise
 from crazysim.pytree import PyTree, leaf
 
 SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE = 101325.0, 288.15, 0.0065
@@ -28,13 +27,13 @@ class BarometerData(PyTree):
 
     samples: Samples
     """Measurements."""
-    drift: Array = leaf("drone", 1)
+    wander: Array = leaf("drone", 1, (1,))
     """Error that wanders, Pa. (n_worlds, n_drones, 1)"""
-    offset: Array = leaf("drone", 1)
+    offset: Array = leaf("drone", 1, (1,))
     """Error in this episode, Pa. (n_worlds, n_drones, 1)"""
     noise: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of a measurement, Pa. (1,)"""
-    drift_deviation: Array = leaf("parameter", 1, (1,), sparse=True)
+    drift: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of the error that wanders, Pa. (1,)"""
     drift_time: Array = leaf("parameter", 1, (1,))
     """Its correlation time, s. (1,)"""
@@ -49,17 +48,18 @@ class BarometerData(PyTree):
 class Barometer(Sensor):
     """Pressure, Pa, and the height above the world's origin that it corresponds to in the standard atmosphere, m."""
 
-    noise: ArrayLike = parameter(default=0.0)
+    kind: ClassVar[type[PyTree]] = BarometerData
+    noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of a measurement, Pa; 12 Pa are a metre. () or (n_worlds, n_drones)"""
-    drift: ArrayLike = parameter(default=0.0)
+    drift: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of an error that wanders, such as weather and temperature, Pa. () or (n_worlds, n_drones)"""
-    drift_time: ArrayLike = parameter(default=60.0)
+    drift_time: ArrayLike = parameter(default=60.0, positive=True)
     """Correlation time of that error, s. () or (n_worlds, n_drones)"""
-    offset_spread: ArrayLike = parameter(default=0.0)
+    offset_spread: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of an error that is constant in an episode, Pa. () or (n_worlds, n_drones)"""
-    altitude: ArrayLike = parameter(default=0.0)
+    altitude: ArrayLike = parameter(default=0.0, low=-500.0, high=9000.0)
     """Altitude of the origin above sea level, m. () or (n_worlds, n_drones)"""
-    resolution: ArrayLike | None = parameter(default=None)
+    resolution: ArrayLike | None = parameter(default=None, positive=True)
     """Smallest difference of two measurements, Pa; None for none. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     freq: int | None = 50
@@ -71,21 +71,6 @@ class Barometer(Sensor):
         """Names and lengths of the parts of a measurement."""
         return {"pressure": 1, "height": 1}
 
-    def record(self, sim: Simulation) -> BarometerData:
-        """Return the barometer before its first measurement."""
-        resolution = check_resolution(sim, self.resolution)
-        return BarometerData(
-            samples=self.samples(sim),
-            drift=zeros(sim, 1),
-            offset=zeros(sim, 1),
-            noise=check_parameter(sim, "noise", self.noise, low=0.0),
-            drift_deviation=check_parameter(sim, "drift", self.drift, low=0.0),
-            drift_time=check_parameter(sim, "drift_time", self.drift_time, positive=True),
-            offset_spread=check_parameter(sim, "offset_spread", self.offset_spread, low=0.0),
-            altitude=check_parameter(sim, "altitude", self.altitude, low=-500.0, high=9000.0),
-            resolution=resolution,
-        )
-
     def ideal(self, data: SimData) -> Array:
         """Return the pressure, Pa, and the height, m. (2,)"""
         height = data.states.pos[2:]
@@ -94,16 +79,16 @@ class Barometer(Sensor):
     def begin(self, data: SimData, record: BarometerData, key: Array) -> BarometerData:
         """Draw the offset of one barometer, and where its drift begins."""
         noise = jax.random.normal(key, (2,), record.offset.dtype)
-        return record.replace(offset=record.offset_spread * noise[:1], drift=record.drift_deviation * noise[1:])
+        return record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
 
-    def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, BarometerData]:
         """Return the pressure and the height of one barometer, and the record after it."""
         noise = jax.random.normal(key, (2,), record.offset.dtype)
-        drift = correlated(record.drift, record.drift_deviation, record.drift_time, self.interval(data), noise[:1])
-        pressure = self.ideal(data)[:1] + record.offset + drift + record.noise * noise[1:]
+        wander = correlated(record.wander, record.drift, record.drift_time, self.interval(data), noise[:1])
+        pressure = self.ideal(data)[:1] + record.offset + wander + record.noise * noise[1:]
         pressure = quantise(pressure, record.resolution)
         height = altitude_of(pressure) - record.altitude
-        return jnp.concatenate([pressure, height]), record.replace(drift=drift)
+        return jnp.concatenate([pressure, height]), record.replace(wander=wander)
 
 
 def pressure_at(altitude: Array) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.core.plugin import Simulation, parameter
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import Samples, Sensor
 from crazysim.pytree import PyTree, leaf, on_device
@@ -55,13 +54,13 @@ class UWB(Sensor):
 
     anchors: ArrayLike = parameter()
     """Positions of the anchors, world frame, m. (n_anchors, 3)"""
-    noise: ArrayLike = parameter(default=0.0)
+    noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of a distance, m; of a difference it is sqrt(2) times that. () or (n_worlds, n_drones)"""
     bias: ArrayLike = parameter(default=0.0)
     """Error of every distance, m; differences have none. () or (n_worlds, n_drones)"""
-    outliers: ArrayLike = parameter(default=0.0)
+    outliers: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Probability that a distance is measured along a detour, 0 to 1. () or (n_worlds, n_drones)"""
-    detour: ArrayLike = parameter(default=1.0)
+    detour: ArrayLike = parameter(default=1.0, low=0.0)
     """Mean length of a detour, m. () or (n_worlds, n_drones)"""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Position of the antenna relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
@@ -80,21 +79,14 @@ class UWB(Sensor):
 
     def record(self, sim: Simulation) -> UWBData:
         """Return the system before its first measurement."""
-        return UWBData(
-            anchors=on_device(_places("anchors", self.anchors, 2 if self.tdoa else 1), sim.data.states.pos.dtype),
-            samples=self.samples(sim),
-            pos=check_parameter(sim, "pos", self.pos, (3,)),
-            bias=check_parameter(sim, "bias", self.bias),
-            noise=check_parameter(sim, "noise", self.noise, low=0.0),
-            outliers=check_parameter(sim, "outliers", self.outliers, low=0.0, high=1.0),
-            detour=check_parameter(sim, "detour", self.detour, low=0.0),
-        )
+        anchors = _places("anchors", self.anchors, 2 if self.tdoa else 1)
+        return self.filled(sim, UWBData, anchors=on_device(anchors, sim.data.states.pos.dtype))
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, or their differences, m. (n,)"""
         return self._output(self._distances(data))
 
-    def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, UWBData]:
         """Return the distances of one drone, or their differences, m, and the record."""
         distance = self._distances(data)
         keys, shape, dtype = jax.random.split(key, 3), distance.shape, distance.dtype
@@ -139,7 +131,7 @@ class Lighthouse(Sensor):
     """Positions of the base stations, world frame, m. (n_stations, 3)"""
     rpy: ArrayLike = parameter()
     """Roll, pitch and yaw of the base stations, world frame, rad. (n_stations, 3)"""
-    noise: ArrayLike = parameter(default=0.0)
+    noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of an angle, rad. () or (n_worlds, n_drones)"""
     diodes: ArrayLike = parameter(default=((0.0, 0.0, 0.0),))
     """Positions of the photodiodes relative to the centre of mass, body frame, m. (n_diodes, 3)"""
@@ -160,12 +152,12 @@ class Lighthouse(Sensor):
         if stations.shape != rpy.shape:
             raise ConfigError(f"expected rpy of shape {stations.shape}, one for each station, got {rpy.shape}")
         dtype = sim.data.states.pos.dtype
-        return LighthouseData(
+        return self.filled(
+            sim,
+            LighthouseData,
             stations=on_device(stations, dtype),
             quat=jax.jit(rotation.from_rpy)(on_device(rpy, dtype)),
             diodes=on_device(_places("diodes", self.diodes, 1), dtype),
-            samples=self.samples(sim),
-            noise=check_parameter(sim, "noise", self.noise, low=0.0),
         )
 
     def ideal(self, data: SimData) -> Array:
@@ -180,7 +172,7 @@ class Lighthouse(Sensor):
         angle = jnp.where(visible[..., None], angle, 0.0)
         return jnp.concatenate([angle.reshape(-1), visible.astype(angle.dtype).reshape(-1)])
 
-    def measure(self, data: SimData, record: LighthouseData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: LighthouseData, key: Array) -> tuple[Array, LighthouseData]:
         """Return the angles of one drone, rad, with where they are in view, and the record."""
         truth = self.ideal(data)
         n = truth.shape[0] // 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.core.plugin import parameter
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.sensors.sensor import Samples, Sensor, check_resolution, per_axis, quantise
+from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
 from crazysim.pytree import PyTree, leaf
 
 PIXELS_PER_RADIAN = 35.0 / 0.71674
@@ -53,13 +53,14 @@ class OpticalFlow(Sensor):
     crazyflie-firmware). The ground is taken to be level; a drone on its side or upside down measures no motion.
     """
 
-    noise: ArrayLike = parameter(default=0.0)
+    kind: ClassVar[type[PyTree]] = OpticalFlowData
+    noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of a measurement, pixels. (), (2,) or (n_worlds, n_drones, 2)"""
-    scale: ArrayLike = parameter(default=PIXELS_PER_RADIAN)
+    scale: ArrayLike = parameter(default=PIXELS_PER_RADIAN, positive=True)
     """Pixels by which the image moves per radian. () or (n_worlds, n_drones)"""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Position of the camera relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    resolution: ArrayLike | None = parameter(default=None)
+    resolution: ArrayLike | None = parameter(default=None, positive=True)
     """Smallest difference of two measurements, pixels; None for none. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     freq: int | None = 100
@@ -71,17 +72,6 @@ class OpticalFlow(Sensor):
         """Names and lengths of the parts of a measurement."""
         return {"flow": 2}
 
-    def record(self, sim: Simulation) -> OpticalFlowData:
-        """Return the camera before its first measurement."""
-        resolution = check_resolution(sim, self.resolution)
-        return OpticalFlowData(
-            samples=self.samples(sim),
-            noise=per_axis(sim, "noise", self.noise, 0.0, 2),
-            scale=check_parameter(sim, "scale", self.scale, positive=True),
-            pos=check_parameter(sim, "pos", self.pos, (3,)),
-            resolution=resolution,
-        )
-
     def ideal(self, data: SimData) -> Array:
         """Return the motion of the image, pixels per interval. (2,)"""
         record, s = self.read(data), data.states
@@ -91,7 +81,7 @@ class OpticalFlow(Sensor):
         rate = vel[:2] / jnp.where(distance > LOWEST, distance, LOWEST) + turn
         return jnp.where(sees, record.scale * self.interval(data) * rate, 0.0)
 
-    def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, OpticalFlowData]:
         """Return the motion of the image of one camera, pixels, and the record."""
         truth = self.ideal(data)
         value = truth + record.noise * jax.random.normal(key, (2,), truth.dtype)
@@ -123,15 +113,16 @@ class TimeOfFlight(Sensor):
     ``noise + far_noise (1 + exp(2.92 (d - 2.5)))``, by default what the filter of the Crazyflie assumes.
     """
 
-    noise: ArrayLike = parameter(default=0.0)
+    kind: ClassVar[type[PyTree]] = TimeOfFlightData
+    noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation at any distance, m. () or (n_worlds, n_drones)"""
-    far_noise: ArrayLike = parameter(default=FAR_NOISE[2])
+    far_noise: ArrayLike = parameter(default=FAR_NOISE[2], low=0.0)
     """Scale of the standard deviation that grows with the distance, m. () or (n_worlds, n_drones)"""
-    max_range: ArrayLike = parameter(default=4.0)
+    max_range: ArrayLike = parameter(default=4.0, positive=True)
     """Largest distance measured, m. () or (n_worlds, n_drones)"""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Position of the sensor relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    resolution: ArrayLike | None = parameter(default=0.001)
+    resolution: ArrayLike | None = parameter(default=0.001, positive=True)
     """Smallest difference of two measurements, m; None for none. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     freq: int | None = 10
@@ -143,18 +134,6 @@ class TimeOfFlight(Sensor):
         """Names and lengths of the parts of a measurement."""
         return {"distance": 1}
 
-    def record(self, sim: Simulation) -> TimeOfFlightData:
-        """Return the sensor before its first measurement."""
-        resolution = check_resolution(sim, self.resolution)
-        return TimeOfFlightData(
-            samples=self.samples(sim),
-            noise=check_parameter(sim, "noise", self.noise, low=0.0),
-            far_noise=check_parameter(sim, "far_noise", self.far_noise, low=0.0),
-            max_range=check_parameter(sim, "max_range", self.max_range, positive=True),
-            pos=check_parameter(sim, "pos", self.pos, (3,)),
-            resolution=resolution,
-        )
-
     def ideal(self, data: SimData) -> Array:
         """Return the distance to the ground, m. (1,)"""
         record = self.read(data)
@@ -162,7 +141,7 @@ class TimeOfFlight(Sensor):
         distance = jnp.where(distance > 0, distance, 0.0)
         return jnp.where(sees & (distance < record.max_range), distance, record.max_range)
 
-    def measure(self, data: SimData, record: TimeOfFlightData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: TimeOfFlightData, key: Array) -> tuple[Array, TimeOfFlightData]:
         """Return the distance of one sensor, m, and the record."""
         truth = self.ideal(data)
         growth, at, _ = FAR_NOISE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
-from crazysim.plugins.effects.moving_air import zeros
-from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, per_axis
+from crazysim.core.plugin import parameter
+from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated
 from crazysim.pytree import PyTree, leaf
 
 
@@ -24,11 +23,11 @@ class GPSData(PyTree):
 
     samples: Samples
     """Measurements."""
-    drift: Array = leaf("drone", 1)
+    wander: Array = leaf("drone", 1, (3,))
     """Error of the position that wanders, world frame, m. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a position, m. (3,)"""
-    drift_deviation: Array = leaf("parameter", 1, (3,), sparse=True)
+    drift: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of the error that wanders, m. (3,)"""
     drift_time: Array = leaf("parameter", 1, (1,))
     """Its correlation time, s. (1,)"""
@@ -41,14 +40,15 @@ class GPSData(PyTree):
 class GPS(Sensor):
     """Position, m, and velocity, m/s, of the antenna, world frame."""
 
-    noise: ArrayLike = parameter(default=0.0)
+    kind: ClassVar[type[PyTree]] = GPSData
+    noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of a position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
-    drift: ArrayLike = parameter(default=0.0)
+    drift: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of an error of the position that wanders, world frame, m. (), (3,) or
     (n_worlds, n_drones, 3)"""
-    drift_time: ArrayLike = parameter(default=60.0)
+    drift_time: ArrayLike = parameter(default=60.0, positive=True)
     """Correlation time of that error, s. () or (n_worlds, n_drones)"""
-    vel_noise: ArrayLike = parameter(default=0.0)
+    vel_noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of a velocity, world frame, m/s. (), (3,) or (n_worlds, n_drones, 3)"""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Position of the antenna relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
@@ -62,18 +62,6 @@ class GPS(Sensor):
         """Names and lengths of the parts of a measurement."""
         return {"pos": 3, "vel": 3}
 
-    def record(self, sim: Simulation) -> GPSData:
-        """Return the receiver before its first measurement."""
-        return GPSData(
-            samples=self.samples(sim),
-            drift=zeros(sim, 3),
-            noise=per_axis(sim, "noise", self.noise, 0.0),
-            drift_deviation=per_axis(sim, "drift", self.drift, 0.0),
-            drift_time=check_parameter(sim, "drift_time", self.drift_time, positive=True),
-            vel_noise=per_axis(sim, "vel_noise", self.vel_noise, 0.0),
-            pos=check_parameter(sim, "pos", self.pos, (3,)),
-        )
-
     def ideal(self, data: SimData) -> Array:
         """Return position and velocity of the antenna. (6,)"""
         pos, s = self.read(data).pos, data.states
@@ -82,15 +70,14 @@ class GPS(Sensor):
 
     def begin(self, data: SimData, record: GPSData, key: Array) -> GPSData:
         """Draw where the drift of one receiver begins."""
-        return record.replace(drift=record.drift_deviation * jax.random.normal(key, (3,), record.drift.dtype))
+        return record.replace(wander=record.drift * jax.random.normal(key, (3,), record.wander.dtype))
 
-    def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, GPSData]:
         """Return position and velocity from one receiver, and the record after it."""
-        noise = jax.random.normal(key, (9,), record.drift.dtype)
-        dt = self.interval(data)
-        drift = correlated(record.drift, record.drift_deviation, record.drift_time, dt, noise[:3])
-        error = jnp.concatenate([drift + record.noise * noise[3:6], record.vel_noise * noise[6:]])
-        return self.ideal(data) + error, record.replace(drift=drift)
+        noise = jax.random.normal(key, (9,), record.wander.dtype)
+        wander = correlated(record.wander, record.drift, record.drift_time, self.interval(data), noise[:3])
+        error = jnp.concatenate([wander + record.noise * noise[3:6], record.vel_noise * noise[6:]])
+        return self.ideal(data) + error, record.replace(wander=wander)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
         """Return position and velocity, as if the antenna were at the centre of mass."""

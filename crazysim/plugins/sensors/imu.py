@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Simulation, parameter, per_drone
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.plugins.effects.ground_effect import rotor_positions
-from crazysim.plugins.effects.moving_air import require_rotors, zeros
+from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
@@ -92,9 +92,9 @@ class IMUData(PyTree):
     """Errors of the gyroscope, rad/s."""
     accel: TriadData
     """Errors of the accelerometer, m/s^2."""
-    vel: Array = leaf("drone", 1)
+    vel: Array = leaf("drone", 1, (3,))
     """Velocity before the step, world frame, m/s. (n_worlds, n_drones, 3)"""
-    ang_vel: Array = leaf("drone", 1)
+    ang_vel: Array = leaf("drone", 1, (3,))
     """Angular velocity before the step, body frame, rad/s. (n_worlds, n_drones, 3)"""
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
     """Position of the accelerometer relative to the centre of mass, body frame, m. (3,)"""
@@ -124,7 +124,7 @@ class IMU(Sensor):
     """Position relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     rpy: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Roll, pitch and yaw of the sensor in the body frame, rad. (3,) or (n_worlds, n_drones, 3)"""
-    imbalance: ArrayLike | None = parameter(default=None)
+    imbalance: ArrayLike | None = parameter(default=None, low=0.0)
     """Mass of a rotor times the distance of its centre from its axis, kg m; None for no vibration.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     _: dataclasses.KW_ONLY
@@ -152,21 +152,17 @@ class IMU(Sensor):
 
     def record(self, sim: Simulation) -> IMUData:
         """Return the unit before its first measurement."""
-        n_rotors = sim.data.states.rotor_vel.shape[-1]
         shakes = self.imbalance is not None
         if shakes:
             require_rotors(sim, "vibration")
-        return IMUData(
-            samples=self.samples(sim),
+        return self.filled(
+            sim,
+            IMUData,
             gyro=self.gyro.record(sim, "gyro"),
             accel=self.accel.record(sim, "accel"),
-            vel=zeros(sim, 3),
-            ang_vel=zeros(sim, 3),
-            pos=check_parameter(sim, "pos", self.pos, (3,)),
             quat=mounting(sim, self.rpy),
-            imbalance=check_parameter(sim, "imbalance", self.imbalance, (n_rotors,), 0.0) if shakes else None,
             rotor_pos=rotor_positions(sim) if shakes else None,
-            phase=zeros(sim, n_rotors) if shakes else None,
+            phase=per_drone(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if shakes else None,
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

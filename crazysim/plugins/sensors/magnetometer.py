@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.core.plugin import Simulation, parameter
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
@@ -52,12 +51,8 @@ class Magnetometer(Sensor):
 
     def record(self, sim: Simulation) -> MagnetometerData:
         """Return the magnetometer before its first measurement."""
-        return MagnetometerData(
-            samples=self.samples(sim),
-            errors=self.errors.record(sim, "errors"),
-            field=check_parameter(sim, "field", self.field, (3,)),
-            quat=mounting(sim, self.rpy),
-        )
+        errors, quat = self.errors.record(sim, "errors"), mounting(sim, self.rpy)
+        return self.filled(sim, MagnetometerData, errors=errors, quat=quat)
 
     def ideal(self, data: SimData) -> Array:
         """Return the field in the sensor's frame, T. (3,)"""
@@ -68,7 +63,7 @@ class Magnetometer(Sensor):
         """Draw the errors of one magnetometer."""
         return record.replace(errors=record.errors.begin(self.ideal(data), key))
 
-    def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, MagnetometerData]:
         """Return the field that one magnetometer measures, T, and the record after it."""
         value, errors = record.errors.measure(self.ideal(data), key, self.interval(data))
         return value, record.replace(errors=errors)

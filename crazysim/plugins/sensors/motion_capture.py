@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +13,8 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
-from crazysim.plugins.effects.moving_air import zeros
-from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting, per_axis
+from crazysim.core.plugin import Simulation, parameter
+from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.pytree import PyTree, leaf
 
 
@@ -25,9 +23,9 @@ class MotionCaptureData(PyTree):
 
     samples: Samples
     """Measurements."""
-    last: Array = leaf("drone", 1)
+    last: Array = leaf("drone", 1, (3,))
     """Position measured last, world frame, m. (n_worlds, n_drones, 3)"""
-    vel: Array = leaf("drone", 1)
+    vel: Array = leaf("drone", 1, (3,))
     """Low-passed difference quotient of the positions, m/s. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a position, m. (3,)"""
@@ -48,11 +46,11 @@ class MotionCapture(Sensor):
     of laboratories form it, so noise of the position is in it too.
     """
 
-    noise: ArrayLike = parameter(default=0.0)
+    noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of a position, m. (), (3,) or (n_worlds, n_drones, 3)"""
-    angle_noise: ArrayLike = parameter(default=0.0)
+    angle_noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of the attitude about each axis, rad. (), (3,) or (n_worlds, n_drones, 3)"""
-    bandwidth: ArrayLike = parameter(default=20.0)
+    bandwidth: ArrayLike = parameter(default=20.0, positive=True)
     """Corner frequency of the low-pass filter of the velocity, Hz. () or (n_worlds, n_drones)"""
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Origin of the tracked body relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
@@ -70,16 +68,7 @@ class MotionCapture(Sensor):
 
     def record(self, sim: Simulation) -> MotionCaptureData:
         """Return the system before its first measurement."""
-        return MotionCaptureData(
-            samples=self.samples(sim),
-            last=zeros(sim, 3),
-            vel=zeros(sim, 3),
-            noise=per_axis(sim, "noise", self.noise, 0.0),
-            angle_noise=per_axis(sim, "angle_noise", self.angle_noise, 0.0),
-            bandwidth=check_parameter(sim, "bandwidth", self.bandwidth, positive=True),
-            pos=check_parameter(sim, "pos", self.pos, (3,)),
-            quat=mounting(sim, self.rpy),
-        )
+        return self.filled(sim, MotionCaptureData, quat=mounting(sim, self.rpy))
 
     def ideal(self, data: SimData) -> Array:
         """Return the pose and the velocity of the tracked body. (10,)"""
@@ -93,7 +82,7 @@ class MotionCapture(Sensor):
         pos, vel = jnp.split(self.ideal(data), (7,))
         return record.replace(last=pos[:3] - self.interval(data) * vel, vel=vel)
 
-    def measure(self, data: SimData, record: MotionCaptureData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: MotionCaptureData, key: Array) -> tuple[Array, MotionCaptureData]:
         """Return position, attitude and velocity of one tracked body, and the record after it."""
         truth, dt = self.ideal(data), self.interval(data)
         noise = jax.random.normal(key, (6,), truth.dtype)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, parameter
+from crazysim.core.plugin import Simulation, parameter
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import BatteryData
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.plugins.sensors.range_finder import RangeFinderData
-from crazysim.plugins.sensors.sensor import Samples, Sensor, check_resolution, quantise
+from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
 from crazysim.pytree import PyTree, leaf
 
 ERPM = 100.0
@@ -39,20 +39,15 @@ class NoisyData(PyTree):
 class Noisy(Sensor):
     """Base class of sensors whose measurement is the true one with white noise, rounded."""
 
-    noise: ArrayLike = parameter(default=0.0)
+    kind: ClassVar[type[PyTree]] = NoisyData
+    noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of a measurement, in its unit. () or (n_worlds, n_drones)"""
-    resolution: ArrayLike | None = parameter(default=None)
+    resolution: ArrayLike | None = parameter(default=None, positive=True)
     """Smallest difference of two measurements, in its unit; None for none. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     name: str = "noisy"
 
-    def record(self, sim: Simulation) -> NoisyData:
-        """Return the sensor before its first measurement."""
-        resolution = check_resolution(sim, self.resolution)
-        noise = check_parameter(sim, "noise", self.noise, low=0.0)
-        return NoisyData(self.samples(sim), noise, resolution)
-
-    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
         """Return the measurement of one drone, and the record."""
         truth = self.ideal(data)
         value = truth + record.noise * jax.random.normal(key, truth.shape, truth.dtype)
@@ -82,7 +77,7 @@ class RotorSpeeds(Noisy):
         """Names and lengths of the parts of a measurement."""
         return {"speed": self.n_rotors}
 
-    def record(self, sim: Simulation) -> NoisyData:
+    def record(self, sim: Simulation) -> PyTree:
         """Return the sensor before its first measurement."""
         require_rotors(sim, "measuring rotor speeds")
         own = sim.data.states.rotor_vel.shape[-1]
@@ -114,7 +109,7 @@ class BatteryVoltage(Noisy):
         """Names and lengths of the parts of a measurement."""
         return {"voltage": 1}
 
-    def record(self, sim: Simulation) -> NoisyData:
+    def record(self, sim: Simulation) -> PyTree:
         """Return the sensor before its first measurement."""
         if not isinstance(sim.data.plugins.get(self.battery), BatteryData):
             raise ConfigError(f"expected a Battery named {self.battery!r}, got none. Use sim.add(Battery()) first.")
@@ -145,7 +140,7 @@ class MultiRanger(Noisy):
         """Names and lengths of the parts of a measurement."""
         return {"distance": self.n_rays}
 
-    def record(self, sim: Simulation) -> NoisyData:
+    def record(self, sim: Simulation) -> PyTree:
         """Return the sensor before its first measurement."""
         found = sim.data.plugins.get(self.range_finder)
         if not isinstance(found, RangeFinderData):
@@ -162,7 +157,7 @@ class MultiRanger(Noisy):
         """Return the distances, m. (n_rays,)"""
         return data.plugins[self.range_finder].distance
 
-    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, Any]:
+    def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
         """Return the distances of one drone, m, and the record."""
         value, record = super().measure(data, record, key)
         far = data.plugins[self.range_finder].max_range

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +12,10 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.stage import Stage
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.moving_air import zeros
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.rotation import safe_clip, safe_norm
 
@@ -61,11 +59,11 @@ class Radar(Plugin):
     """Positions of the radars, world frame, m. (3,) or (n_radars, 3)"""
     size: ArrayLike = parameter(default=5.0)
     """Half the range, m. () or (n_radars,)"""
-    exponent: Any = parameter(default=1.3)
+    exponent: ArrayLike = parameter(default=1.3)
     """Exponent of the lobe, 1: larger ones are thinner near the radar. () or (n_radars,)"""
-    height_scale: Any = parameter(default=1.0)
+    height_scale: ArrayLike = parameter(default=1.0)
     """Factor of the thickness of the lobe, 1. () or (n_radars,)"""
-    tilt: Any = parameter(default=0.0)
+    tilt: ArrayLike = parameter(default=0.0)
     """Elevation of the lobe, rad, positive upwards. () or (n_radars,)"""
     visible: bool = False
     """True to draw the lobes into images, in red where a drone is detected."""
@@ -92,7 +90,7 @@ class Radar(Plugin):
                 bounds = "positive" if low > 0 else f"from {low:.4g} to {high:.4g}"
                 raise ConfigError(f"expected {name} to be finite and {bounds}, got {getattr(self, name)!r}")
             found[name] = on_device(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=on_device(pos, dtype), **found, exposure=zeros(sim, len(pos)))
+        return RadarData(pos=on_device(pos, dtype), **found, exposure=per_drone(sim, 0.0, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that counts the time within the lobes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
 from crazysim.core.random import drone_key
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage, tick
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.moving_air import zeros
 from crazysim.pytree import PyTree, leaf, on_device
+
+R = TypeVar("R", bound=PyTree)
 
 MAX_ROWS = 64
 """Most measurements of one sensor in transit."""
@@ -53,10 +54,13 @@ class Samples(PyTree):
 class Sensor(Plugin):
     """Base class of sensors that measure at a rate, and whose measurements may arrive late or never.
 
-    A subclass defines ``channels``, ``record``, ``ideal`` and ``measure``, and ``begin`` if a sensor has errors of its
-    own, drawn once an episode. Its record has a field ``samples``. Measurements are taken after the state of the step
-    is known; the latest one is held. A measurement that is overtaken by a newer one is discarded.
+    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``begin`` if a sensor has
+    errors of its own, drawn once an episode. Its record has a field ``samples``. Measurements are taken after the state
+    of the step is known; the latest one is held. A measurement that is overtaken by a newer one is discarded.
     """
+
+    kind: ClassVar[type[PyTree]]
+    """Class of the record."""
 
     _: dataclasses.KW_ONLY
     freq: int | None = None
@@ -88,6 +92,14 @@ class Sensor(Plugin):
         """Return the record with the errors of one sensor, which stay the same in an episode, drawn at random."""
         return record
 
+    def record(self, sim: Simulation) -> PyTree:
+        """Return the sensor before its first measurement."""
+        return self.filled(sim, self.kind)
+
+    def filled(self, sim: Simulation, kind: type[R], **given: Any) -> R:
+        """Return a record as ``Plugin.filled`` does, with measurements in its field ``samples``."""
+        return super().filled(sim, kind, samples=self.samples(sim), **given)
+
     def samples(self, sim: Simulation) -> Samples:
         """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
         period = steps_between(self, sim)
@@ -107,11 +119,11 @@ class Sensor(Plugin):
             transit = {
                 "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, longest),
                 "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, longest),
-                "queue": on_device(np.zeros((*shape, rows, k)), sim.data.states.pos.dtype),
+                "queue": per_drone(sim, 0.0, rows, k),
                 "due": on_device(np.full((*shape, rows), NEVER), np.int32),
             }
         return Samples(
-            value=zeros(sim, k),
+            value=per_drone(sim, 0.0, k),
             taken=on_device(np.full((*shape, 1), -1), np.int32),
             delay=transit.get("delay"),
             jitter=transit.get("jitter"),
@@ -214,12 +226,6 @@ def steps_between(sensor: Any, sim: Simulation) -> int:
     return 1 if sensor.freq is None else steps // dividing_rate(f"freq of {sensor.name!r}", sensor.freq, steps)
 
 
-def per_axis(sim: Simulation, name: str, value: ArrayLike, low: float = -np.inf, n: int = 3) -> Array:
-    """Return a setting as ``check_parameter`` does; one number counts for all axes. (n,) or (n_worlds, n_drones, n)"""
-    value = np.full(n, value) if np.ndim(value) == 0 else value
-    return check_parameter(sim, name, value, (n,), low)
-
-
 def mounting(sim: Simulation, rpy: ArrayLike) -> Array:
     """Return the attitude of a sensor, sensor to body, as a parameter of quaternions, xyzw.
 
@@ -228,11 +234,6 @@ def mounting(sim: Simulation, rpy: ArrayLike) -> Array:
         rpy: Roll, pitch and yaw of the sensor's frame in the body frame, rad. (3,) or (n_worlds, n_drones, 3)
     """
     return jax.jit(rotation.from_rpy)(check_parameter(sim, "rpy", rpy, (3,)))
-
-
-def check_resolution(sim: Simulation, resolution: ArrayLike | None) -> Array | None:
-    """Return the resolution of each drone's sensor; None without one."""
-    return None if resolution is None else check_parameter(sim, "resolution", resolution, positive=True)
 
 
 def quantise(x: Array, resolution: Array | None) -> Array:

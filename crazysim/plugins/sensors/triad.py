@@ -12,9 +12,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.core.plugin import Simulation, check_parameter
-from crazysim.plugins.effects.moving_air import per_drone, zeros
-from crazysim.plugins.sensors.sensor import correlated, per_axis, quantise
+from crazysim.core.plugin import Simulation, check_parameter, per_drone
+from crazysim.plugins.sensors.sensor import correlated, quantise
 from crazysim.pytree import PyTree, leaf
 
 
@@ -128,7 +127,7 @@ class Triad:
         """Return the record before the first measurement; ``name`` is that of the sensor in messages."""
 
         def vector(field: str, low: float = -np.inf) -> Array:
-            return per_axis(sim, f"{field} of {name}", getattr(self, field), low)
+            return check_parameter(sim, f"{field} of {name}", getattr(self, field), (3,), low, per_axis=True)
 
         def joined(*fields: str, low: float = -np.inf) -> Array:
             parts = [np.asarray(vector(field, low)) for field in fields]
@@ -138,19 +137,17 @@ class Triad:
 
         def optional(field: str, n: int) -> Array | None:
             value = getattr(self, field)
-            if value is None:
-                return None
-            value = np.full(n, value) if np.ndim(value) == 0 else value
-            return check_parameter(sim, f"{field} of {name}", value, (n,), positive=True)
+            named = f"{field} of {name}"
+            return None if value is None else check_parameter(sim, named, value, (n,), positive=True, per_axis=True)
 
         mean = joined("bias", "scale", "misalignment")
-        each = per_drone(sim, mean)
+        each = per_drone(sim, mean, 9)
         return TriadData(
             bias=each[..., :3],
             scale=each[..., 3:6],
             misalignment=each[..., 6:],
-            wander=zeros(sim, 3),
-            filtered=None if self.bandwidth is None else zeros(sim, 3),
+            wander=per_drone(sim, 0.0, 3),
+            filtered=None if self.bandwidth is None else per_drone(sim, 0.0, 3),
             noise=vector("noise", 0.0),
             random_walk=vector("random_walk", 0.0),
             instability=vector("instability", 0.0),

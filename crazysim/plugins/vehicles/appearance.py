@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import Objects
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_rgba
+from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
 from crazysim.plugins.vehicles.state import ackermann, heading_quat, tilted
 from crazysim.plugins.vehicles.trailer import trailer_axles
@@ -62,7 +64,7 @@ def wheel_places(vehicle: VehicleModel) -> np.ndarray:
     return np.array([(x, y) for x in (front, rear) for y in sides])
 
 
-def with_poses(objects: Objects, cars: Any, car: Any) -> Objects:
+def with_poses(objects: Objects, cars: Any, car: CarData) -> Objects:
     """Return the objects of a world with those of its cars at their poses.
 
     Args:
@@ -74,15 +76,10 @@ def with_poses(objects: Objects, cars: Any, car: Any) -> Objects:
     rows = {"body": (car.pos, car.quat), "wheel": _wheels(vehicle, car)}
     if cars.trailer:
         rows |= _trailers(vehicle, car)
-    pos, turned = objects.pos, objects.quat
-    for part, (at, attitude) in rows.items():
-        where = np.array([objects.names.index(f"{_kind(cars, part)}:{k}") for k in range(at.shape[0])])
-        pos = pos.at[where].set(at.astype(pos.dtype))
-        turned = turned.at[where].set(attitude.astype(turned.dtype))
-    return objects.replace(pos=pos, quat=turned)
+    return objects.with_poses({_kind(cars, part): row for part, row in rows.items()})
 
 
-def _wheels(vehicle: VehicleModel, car: Any) -> tuple[Array, Array]:
+def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
     places = wheel_places(vehicle)
     shape = (car.pos.shape[0], len(places))
@@ -112,7 +109,7 @@ def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]
     return {"drawbar": (front, bar), "trailer": (front, deck), "trailer_wheel": wheel}
 
 
-def _above_plane(at: Array, car: Any, height: float) -> Array:
+def _above_plane(at: Array, car: CarData, height: float) -> Array:
     """Return places, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
     off, normal = at - car.pos[:, :2], car.normal
     rise = -(normal[:, :1] * off[:, :1] + normal[:, 1:2] * off[:, 1:]) / normal[:, 2:]
@@ -125,13 +122,15 @@ def _rolled(angle: Array) -> Array:
     return jnp.concatenate([zero, jnp.sin(angle / 2), zero, jnp.cos(angle / 2)], axis=-1)
 
 
-def _geom(kind: str, size: Any, pos: Any, rgba: Any, bits: str, more: str = "") -> str:
+def _geom(
+    kind: str, size: Iterable[float], pos: Iterable[float], rgba: Iterable[float], bits: str, more: str = ""
+) -> str:
     text = " ".join(f"{float(x):.6g}" for x in size), " ".join(f"{float(x):.6g}" for x in pos)
     colour = " ".join(f"{float(x):.3g}" for x in rgba)
     return f'<geom type="{kind}" size="{text[0]}" pos="{text[1]}" rgba="{colour}" {bits} {more}/>'
 
 
-def _body(vehicle: VehicleModel, rgba: Any) -> str:
+def _body(vehicle: VehicleModel, rgba: Iterable[float]) -> str:
     """Return geoms of a car in the frame of its centre of mass: a plate, a hood, a cabin with a flat roof, bumpers."""
     length, width, height = (vehicle.number(f"shape.{x}") / 2 for x in ("length", "width", "height"))
     front, floor = vehicle.number("axles.front"), 0.02

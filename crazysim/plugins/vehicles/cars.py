@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
@@ -24,7 +25,7 @@ from crazysim.plugins.vehicles import appearance, starts
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.following import PathController, PurePursuit, motor_reference, path_state
 from crazysim.plugins.vehicles.kinematic import kinematic
-from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
+from crazysim.plugins.vehicles.model import VehicleModel, VehicleSource, load_vehicle
 from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.path import Path
 from crazysim.plugins.vehicles.single_track import single_track
@@ -50,31 +51,31 @@ class Cars(Population):
 
     members: int | Sequence[str] = 1
     """Number of cars in each world, or their names."""
-    vehicle: Any = "f1tenth_ros"
+    vehicle: VehicleSource = "f1tenth_ros"
     """Vehicle model, as for ``load_vehicle``."""
-    pos: Any = parameter(default=None)
+    pos: ArrayLike | None = parameter(default=None)
     """Positions at the start, x and y, m; None for the start of the path, or a row along y with gaps of 1 m.
     (2,), (n_members, 2) or (n_worlds, n_members, 2)"""
-    yaw: Any = parameter(default=None)
+    yaw: ArrayLike | None = parameter(default=None)
     """Headings at the start, rad; None for that of the path, or zero. (), (n_members,) or (n_worlds, n_members)"""
     level: Literal["drive", "speed"] = "drive"
     """Command level of cars without a path."""
-    path: Any = None
+    path: Path | Trajectory | Sequence[Path | Trajectory] | None = None
     """Path, trajectory, or a sequence of them to follow; None to drive by commands."""
     controller: PathController | None = None
     """Controller that follows paths; None for ``PurePursuit()``."""
     reference: Literal["time", "arc"] = "time"
     """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the place where the car is."""
-    index: Any = parameter(default=None)
+    index: ArrayLike | None = parameter(default=None)
     """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
-    start: Any = parameter(default=None)
+    start: ArrayLike | None = parameter(default=None)
     """Time at which a car is at the start of its path, s; None for zero, and at equal intervals for the cars of one
     closed path. () or (n_worlds, n_members)"""
     trailer: bool = False
     """True for cars that tow a trailer."""
     rate: int | None = None
     """Rate of the controller, Hz, a divisor of the simulation's rate; None for the largest one up to 50 Hz."""
-    rgba: Any = None
+    rgba: ArrayLike | None = None
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
     """True to put the cars into the scene, where they are drawn and reported as contacts of drones."""
@@ -250,7 +251,7 @@ class Cars(Population):
             )
         return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in given])
 
-    def _indices(self, paths: Path) -> Any:
+    def _indices(self, paths: Path) -> ArrayLike:
         return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index
 
 
@@ -262,6 +263,6 @@ def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | Non
 class Bicycles(Cars):
     """Bicycles of AIMotionLab-Virtual: the motor reference is the torque of the rear wheel, N m; no steering."""
 
-    vehicle: Any = "bicycle"
+    vehicle: VehicleSource = "bicycle"
     name: str = "bicycles"
     prefix: ClassVar[str] = "Bicycle"

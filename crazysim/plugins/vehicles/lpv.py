@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -66,9 +67,9 @@ class LPV(PathController):
     """
 
     backwards: ClassVar[bool] = False
-    lateral: Any = LATERAL["aiml_head"]
+    lateral: Sequence[Sequence[float]] = LATERAL["aiml_head"]
     """Gains k1, k2, k3 as polynomials of the speed, highest power first."""
-    longitudinal: Any = LONGITUDINAL
+    longitudinal: Sequence[Sequence[float]] = LONGITUDINAL
     """Gains kl1, kl2 as polynomials of p, highest power first."""
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> LPVGains:
@@ -108,7 +109,7 @@ class LPV(PathController):
         return hold + by_lag * at.lag + by_speed * (speed - vx)
 
 
-def polynomial(coefficients: Any, x: Array) -> Array:
+def polynomial(coefficients: Sequence[float], x: Array) -> Array:
     """Return a polynomial, highest power first, at x. (...)"""
     value = jnp.full_like(x, coefficients[0])
     for c in coefficients[1:]:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, UnknownNameError, shown
-from crazysim.storage import is_file, read_toml
+from crazysim.errors import ConfigError, shown
 from crazysim.tables import (
     INERTIA,
     LARGEST,
@@ -24,10 +22,11 @@ from crazysim.tables import (
     POSITIVE,
     UNLIMITED,
     Key,
+    Layout,
     Range,
-    as_numbers,
     check_numbers,
     extended,
+    read_source,
 )
 
 FOLDER = Path(__file__).parent
@@ -80,7 +79,8 @@ KEYS: dict[str, Key] = {
 """Shapes and ranges of all numbers, by table and key."""
 OPTIONAL = ("tyres.front", "tyres.rear", "drive.", "trailer.")
 """Beginnings of the keys that a vehicle may lack; ``drive`` needs its force or its torque."""
-TOP_LEVEL = ("name", "base", "model", "sources")
+LAYOUT = Layout(KEYS, ("name", "base", "model", "sources"), GUIDE)
+"""Keys of vehicles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +123,16 @@ class VehicleModel:
         return f"VehicleModel({self.name!r})"
 
 
+VehicleSource = str | Path | Mapping[str, Any] | VehicleModel
+"""Name of a built-in vehicle, path of a TOML file, dict, or vehicle model."""
+
+
 def vehicle_names() -> tuple[str, ...]:
     """Return the names of the built-in vehicle models."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
 
 
-def load_vehicle(source: str | Path | Mapping[str, Any] | VehicleModel) -> VehicleModel:
+def load_vehicle(source: VehicleSource) -> VehicleModel:
     """Return the vehicle model of a name, a TOML file anywhere on disk, or a dict of the same tables.
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
@@ -149,11 +153,11 @@ def _load(source: Any, bases: tuple[str, ...]) -> VehicleModel:
     if isinstance(source, VehicleModel):
         return source
     bases = extended(bases, source)
-    name, tables = ("custom", dict(source)) if isinstance(source, Mapping) else _read(source)
-    name = str(tables.get("name", name))
+    stem, origin, tables = read_source(source, "vehicle", "a VehicleModel", FOLDER, vehicle_names(), GUIDE)
+    name = str(tables.get("name", stem))
     base = _load(tables["base"], bases) if "base" in tables else None
     numbers = dict(base.numbers) if base is not None else {}
-    own = dict(_numbers(name, {key: table for key, table in tables.items() if key not in TOP_LEVEL}))
+    own = dict(LAYOUT.numbers(f"vehicle {name!r}{origin}", tables))
     for kind, other in (("torque", "force"), ("force", "torque")):
         if f"drive.{kind}" in own:
             numbers = {key: x for key, x in numbers.items() if not key.startswith(f"drive.{other}")}
@@ -161,36 +165,6 @@ def _load(source: Any, bases: tuple[str, ...]) -> VehicleModel:
     vehicle = VehicleModel(name, dynamics, numbers | own)
     _check(vehicle)
     return vehicle
-
-
-def _read(source: Any) -> tuple[str, Mapping[str, Any]]:
-    """Return the name of a vehicle and its tables."""
-    if not isinstance(source, (str, Path)):
-        raise ConfigError(
-            f"expected a vehicle as a name, the path of a TOML file, a dict or a VehicleModel, got {shown(source)}"
-        )
-    path = FOLDER / f"{source}.toml" if str(source) in vehicle_names() else Path(source)
-    if not is_file(path):
-        raise UnknownNameError(
-            f"expected a vehicle as one of {', '.join(vehicle_names())}, the path of a .toml file, or a dict, got "
-            f"{shown(str(source))}, and no file of that path exists"
-        )
-    return path.stem, read_toml(path, GUIDE)
-
-
-def _numbers(name: str, node: Any, prefix: str = "") -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Yield the key and the value of every number, and check that the key exists."""
-    for key, item in node.items():
-        path = f"{prefix}{key}"
-        is_table = isinstance(item, Mapping) and not prefix
-        if is_table and any(known.startswith(f"{path}.") for known in KEYS):
-            yield from _numbers(name, item, f"{path}.")
-            continue
-        if path not in KEYS:
-            near = get_close_matches(path, KEYS, n=3) or [k for k in KEYS if k.rpartition(".")[2] == key]
-            hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
-            raise ConfigError(f"vehicle {name!r}: expected a key that exists, got {path!r}. {hint}{GUIDE} lists all.")
-        yield path, as_numbers(f"vehicle {name!r}", path, item)
 
 
 def _check(vehicle: VehicleModel) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,10 +88,7 @@ class Path(PyTree):
         Raises:
             ConfigError: If the path has no length, stops on its way, or repeats without ending at its start.
         """
-        pieces = PieceTable.of([trajectory])
-
-        def curve(t: Floats, order: int) -> Floats:
-            return pieces.at(np.zeros(len(t), int), t, order)[:, :2]
+        pieces, curve = _level_curve(trajectory)
 
         times = np.linspace(0.0, pieces.duration, SAMPLES)
         speed = np.hypot(*curve(times, 1).T)
@@ -135,10 +132,7 @@ class Path(PyTree):
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         trajectory = spline(knots, np.pad(xy, ((0, 0), (0, 1))), at_rest=False)
         begin, end = (knots[REPEATED], knots[-1 - REPEATED]) if closed else (0.0, knots[-1])
-        pieces = PieceTable.of([trajectory])
-
-        def curve(t: Floats, order: int) -> Floats:
-            return pieces.at(np.zeros(len(t), int), t, order)[:, :2]
+        _, curve = _level_curve(trajectory)
 
         times = np.linspace(begin, end, SAMPLES)
         rate = np.hypot(*curve(times, 1).T)
@@ -163,9 +157,7 @@ class Path(PyTree):
             coefficients = np.concatenate([path.coefficients, last], axis=1)
             speeds = np.concatenate([path.speeds, np.repeat(path.speeds[:, -1:], more, axis=1)], axis=1)
             padded.append(path.replace(coefficients=coefficients, speeds=speeds))
-        fields = ("coefficients", "length", "spacing", "closed", "speeds", "progress", "duration")
-        joined: dict[str, Any] = {name: np.concatenate([getattr(path, name) for path in padded]) for name in fields}
-        return Path(**joined)
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *padded)
 
     @property
     def n_paths(self) -> int:
@@ -182,7 +174,7 @@ class Path(PyTree):
         """True if a path is driven backwards; on the host."""
         return bool(np.any(np.asarray(self.speeds) < 0))
 
-    def at(self, index: Any, s: Array) -> PathPoint:
+    def at(self, index: Array | int, s: Array) -> PathPoint:
         """Return a path at an arc length; a closed one continues from its start, an open one stays at its ends.
 
         Args:
@@ -192,14 +184,14 @@ class Path(PyTree):
         piece, u = self._locate(index, s)
         return _evaluate(_take(self.coefficients, index, piece), u)
 
-    def speed_at(self, index: Any, s: Array) -> Array:
+    def speed_at(self, index: Array | int, s: Array) -> Array:
         """Return the speed at an arc length, m/s; it decreases to zero before the end of an open path. (1,)"""
         piece, _ = self._locate(index, s)
         rest = safe_clip((_take(self.length, index) - s) / STOPPING, 0.0, 1.0)
         share = jnp.where(_take(self.closed, index), 1.0, rest)
         return (share * _take(self.speeds, index, piece))[None]
 
-    def time_reference(self, index: Any, t: Array) -> tuple[Array, Array]:
+    def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
         """Return the arc length, m, and the speed, m/s, at a time; before the start and after the end at rest.
 
         On a closed path the arc length increases with every round, and the motion continues.
@@ -226,7 +218,7 @@ class Path(PyTree):
         sign = jnp.where(_take(self.speeds, index, 0) < 0, -1.0, 1.0)
         return (s + rounds * _take(self.length, index))[None], (sign * v)[None]
 
-    def project(self, index: Any, pos: Array, guess: Array) -> Array:
+    def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
         """Return the arc length of the point of a path next to a position, from a guess nearby; within a step.
 
         Newton's method, whose steps ``(p - r) . t / (1 - curvature e)`` are limited to ``REACH``. On a closed path the
@@ -275,7 +267,7 @@ class Path(PyTree):
         x, y = np.asarray(point.tangent, float) * (-1 if np.asarray(self.speeds)[index, 0] < 0 else 1)
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
-    def _locate(self, index: Any, s: Array) -> tuple[Array, Array]:
+    def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
         """Return the piece at an arc length, and the share of its length."""
         length, spacing = _take(self.length, index), _take(self.spacing, index)
         wrapped = s - length * lax.floor(s / length)
@@ -289,6 +281,12 @@ def _point_at_time(path: Path, index: Array, t: Array) -> tuple[PathPoint, Array
     """Return a point at a time since the start, s, and its arc length, m (1,)."""
     arc, _ = path.time_reference(index, t)
     return path.at(index, arc[0]), arc
+
+
+def _level_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, int], Floats]]:
+    """Return the pieces of a trajectory, and its derivatives along x and y as a function of times and order."""
+    pieces = PieceTable.of([trajectory])
+    return pieces, lambda t, order: pieces.at(np.zeros(len(t), int), t, order)[:, :2]
 
 
 def _of_curve(
@@ -364,6 +362,6 @@ def _evaluate(coefficients: Array, u: Array) -> PathPoint:
     return PathPoint(pos, rate * inverse, bend[None])
 
 
-def _take(x: Any, *index: Any) -> Array:
+def _take(x: Array, *index: Array | int) -> Array:
     """Return an entry of an array; an index that is too large or too small means the last or first one."""
     return jnp.asarray(x).at[index].get(mode="clip", wrap_negative_indices=False)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from crazysim.control.lqr import as_weights, solve_on_host
 from crazysim.control.riccati import gain_discrete
@@ -45,7 +46,7 @@ class PathLQR(PathController):
     velocity of steady cornering, at which the offset is zero.
     """
 
-    Q: Any = (100.0, 0.1, 10.0, 0.1)
+    Q: ArrayLike = (100.0, 0.1, 10.0, 0.1)
     """Weights of offset, sideways velocity, heading error and yaw rate. (4,) or (4, 4)"""
     R: float = 20.0
     """Weight of the steering angle."""
@@ -75,7 +76,7 @@ class PathLQR(PathController):
         return row[4:] * at.curvature - jnp.sum(row[:4] * x, keepdims=True), memory
 
 
-def lateral_model(model: Any, car: CarParams, speed: Array) -> tuple[Array, Array]:
+def lateral_model(model: Callable[..., CarState], car: CarParams, speed: Array) -> tuple[Array, Array]:
     """Return matrices A (4, 4) and B (4, 1) of offset, sideways velocity, heading and yaw rate at a speed, m/s. ()"""
     reference = motor_reference(speed[None], jnp.zeros(1, speed.dtype), car)
 
@@ -90,7 +91,9 @@ def lateral_model(model: Any, car: CarParams, speed: Array) -> tuple[Array, Arra
     return jax.jacfwd(rates)(x, steer), jax.jacfwd(rates, argnums=1)(x, steer)
 
 
-def lateral_gains(model: Any, car: CarParams, speed: Array, period: ArrayLike, Q: Array, R: Array) -> Array:
+def lateral_gains(
+    model: Callable[..., CarState], car: CarParams, speed: Array, period: Array | float, Q: Array, R: Array
+) -> Array:
     """Return the gain of the regulator at a speed and the feed-forward of curvature. (5,)"""
     A, B = lateral_model(model, car, speed)
     block = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
@@ -105,7 +108,7 @@ def lateral_gains(model: Any, car: CarParams, speed: Array, period: ArrayLike, Q
     return jnp.concatenate([K, (steer + K @ steady)[None]])
 
 
-def _rows(model: Any, car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
+def _rows(model: Callable[..., CarState], car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
     """Return ``lateral_gains`` at several speeds. (n, 5)"""
     return jax.vmap(lambda speed: lateral_gains(model, car, speed, period, Q, R))(speeds)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.path import Path
@@ -15,12 +15,12 @@ GAP = 1.0
 """Distance between neighbours that start in a row, m."""
 
 
-def in_a_row(n: int) -> NDArray[Any]:
+def in_a_row(n: int) -> NDArray:
     """Return positions in a row along y around the origin, m. (n, 2)"""
     return np.stack([np.zeros(n), GAP * (np.arange(n) - (n - 1) / 2)], axis=1)
 
 
-def per_member(name: str, value: Any, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
+def per_member(name: str, value: ArrayLike, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
     """Return positions or headings for all cars, or for each, checked. (..., *core)
 
     Args:
@@ -43,7 +43,7 @@ def per_member(name: str, value: Any, counts: tuple[int, int], core: tuple[int, 
     return array
 
 
-def numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = None) -> NDArray[Any]:
+def numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None = None) -> NDArray:
     """Return a number for all cars, (1,), or for each, (n_worlds, n_members, 1).
 
     Args:
@@ -69,9 +69,7 @@ def numbers(name: str, value: Any, counts: tuple[int, int], n: int | None = None
     return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
 
 
-def on_path(
-    paths: Path, index: NDArray[Any], start: NDArray[Any], counts: tuple[int, int]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def on_path(paths: Path, index: NDArray, start: NDArray, counts: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray]:
     """Return positions, m, headings, rad, and arc lengths, m, of cars on their paths at time zero.
 
     Args:
@@ -85,7 +83,7 @@ def on_path(
     """
     index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
     pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
-    found: dict[tuple[int, float], tuple[Any, ...]] = {}
+    found: dict[tuple[int, float], tuple[ArrayLike, float, float]] = {}
     for at in np.ndindex(counts):
         key = int(index[at][0]), float(start[at][0])
         if key not in found:
@@ -94,7 +92,7 @@ def on_path(
     return pos, yaw, arc
 
 
-def projected(paths: Any, index: Any, pos: NDArray[Any], arc: NDArray[Any]) -> NDArray[Any]:
+def projected(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
     """Return the arc lengths of the points of paths that are nearest to cars, m. (n_worlds, n_members, 1)
 
     Args:
@@ -112,7 +110,7 @@ def projected(paths: Any, index: Any, pos: NDArray[Any], arc: NDArray[Any]) -> N
     return found
 
 
-def spread(paths: Path, index: NDArray[Any], n: int) -> NDArray[Any]:
+def spread(paths: Path, index: NDArray, n: int) -> NDArray:
     """Return start times of n cars, s: spaced equally over the duration of a closed path, zero on others. (n,)"""
     own = np.broadcast_to(index.reshape(-1)[:n], (n,))
     times = np.zeros(n)

@@ -29,26 +29,6 @@ class CarState(NamedTuple):
     joints: Array | None = None
     """Headings of drawbar and trailer, rad, not wrapped; None without a trailer. (..., 2)"""
 
-    @staticmethod
-    def at_rest(pos: Array, yaw: Array, trailer: bool = False) -> CarState:
-        """Return a vehicle at rest, its wheels and its trailer straight.
-
-        Args:
-            pos: Position, world frame, m. (..., 3)
-            yaw: Heading, rad. (..., 1)
-            trailer: True for a vehicle with a trailer.
-        """
-        zero = jnp.zeros_like(yaw)
-        return CarState(
-            pos=pos,
-            yaw=yaw,
-            body_vel=jnp.concatenate([zero, zero], axis=-1),
-            yaw_rate=zero,
-            steer=zero,
-            distance=zero,
-            joints=jnp.concatenate([yaw, yaw], axis=-1) if trailer else None,
-        )
-
 
 def heading_quat(yaw: Array) -> Array:
     """Return the rotation about z by an angle, (..., 1), as a quaternion, xyzw. (..., 4)"""

@@ -62,14 +62,14 @@ def parse_json(content: bytes | str, place: str) -> Any:
         raise ConfigError(f"expected JSON in {place}, got {type(error).__name__}: {str(error)[:100]}") from error
 
 
-def record(value: Any, place: str) -> dict[str, Any]:
+def record(value: object, place: str) -> dict[str, Any]:
     """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
         refuse("an object {...}", shown(value), place)
     return value
 
 
-def sequence(value: Any, n_max: int, place: str) -> list[Any]:
+def sequence(value: object, n_max: int, place: str) -> list[Any]:
     """Return a value that must be a JSON array of at most some entries."""
     if not isinstance(value, list):
         refuse("an array [...]", shown(value), place)
@@ -85,21 +85,21 @@ def version_one(value: dict[str, Any], place: str) -> None:
         refuse("version 1", shown(version), place)
 
 
-def number(value: Any, place: str, low: float = -np.inf, high: float = np.inf) -> float:
+def number(value: object, place: str, low: float = -np.inf, high: float = np.inf) -> float:
     """Return a value that must be a finite number in a range."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
         refuse("a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}", shown(value), place)
     return float(value)
 
 
-def text(value: Any, place: str, n_max: int = 200) -> str:
+def text(value: object, place: str, n_max: int = 200) -> str:
     """Return a value that must be a string of at most some characters."""
     if not isinstance(value, str) or len(value) > n_max:
         refuse(f"a text of at most {n_max} characters", shown(value), place)
     return value
 
 
-def numbers(value: Any, lengths: Sequence[int], bound: float, place: str) -> NDArray:
+def numbers(value: object, lengths: Sequence[int], bound: float, place: str) -> NDArray:
     """Return a value that must be an array of finite numbers, of one of some lengths, up to a bound in size."""
     if isinstance(value, tuple):
         value = list(value)

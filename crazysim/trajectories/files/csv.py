@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.errors import ConfigError, shown
 from crazysim.storage import read_text
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import trajectory_of
 from crazysim.trajectories.files.polynomials import of_rows, rows_of
+from crazysim.trajectories.splines import of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLYNOMIALS = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
@@ -78,7 +78,7 @@ def _of_samples(rows: NDArray, place: str) -> Trajectory:
     start, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
     # Cubic Hermite polynomial of u in [0, 1].
     c = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
-    return trajectory_of(times[1:], np.stack(c, axis=-1))
+    return of_unit_pieces(np.diff(times), np.stack(c, axis=-1))
 
 
 def save_csv(trajectory: Trajectory, path: str | Path) -> None:

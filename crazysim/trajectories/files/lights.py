@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ class Lights(PyTree):
     """Colour that each piece approaches at the start of the next; ``starts`` where it is constant. (n_pieces, 3)"""
 
     @staticmethod
-    def of_pieces(times: ArrayLike, starts: Any, ends: ArrayLike | None = None) -> Lights:
+    def of_pieces(times: ArrayLike, starts: ArrayLike, ends: ArrayLike | None = None) -> Lights:
         """Return the lights of one drone.
 
         Args:
@@ -56,13 +55,13 @@ class Lights(PyTree):
         return Lights(*(x.astype(floating()) for x in (t, a, b)))  # type: ignore[arg-type]
 
     @staticmethod
-    def constant(color: Any = (1.0, 1.0, 1.0)) -> Lights:
+    def constant(color: ArrayLike = (1.0, 1.0, 1.0)) -> Lights:
         """Return lights of one colour; white by default.
 
         Args:
             color: Red, green and blue, 0 to 1. (3,)
         """
-        return Lights.of_pieces([0.0], [color])
+        return Lights.of_pieces([0.0], np.asarray(color)[None])
 
     @staticmethod
     def stack(lights: Sequence[Lights]) -> Lights:
@@ -75,13 +74,12 @@ class Lights(PyTree):
             raise ConfigError("expected the lights of at least one drone, got none. Pass a list with one per drone.")
         n = max(x.times.shape[-1] for x in lights)
 
-        def padded(x: Any) -> Any:
-            x = np.asarray(x)
+        def padded(x: Array) -> np.ndarray:
             return np.concatenate([x, np.repeat(x[-1:], n - len(x), axis=0)])
 
         return jax.tree.map(lambda *leaves: np.stack([padded(x) for x in leaves]), *lights)
 
-    def evaluate(self, t: Any) -> Array:
+    def evaluate(self, t: ArrayLike) -> Array:
         """Return the colour of one drone at one time, 0 to 1; where two pieces meet, the later one counts.
 
         Args:

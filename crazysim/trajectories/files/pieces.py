@@ -85,13 +85,3 @@ def split(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray
         for k, start, end in zip(piece, from_cuts, cuts, strict=True)
     ]
     return cuts, np.stack(parts)
-
-
-def trajectory_of(ends: NDArray, coefficients: NDArray) -> Trajectory:
-    """Return the trajectory of pieces as ``pieces_of`` returns them.
-
-    Raises:
-        ConfigError: If there is no piece, or a number is not finite.
-    """
-    lengths = np.diff(ends, prepend=0.0)
-    return Trajectory.of_pieces(lengths, coefficients / lengths[:, None, None] ** np.arange(coefficients.shape[2]))

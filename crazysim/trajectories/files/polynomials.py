@@ -16,7 +16,8 @@ from crazysim.errors import ConfigError
 from crazysim.storage import read_bytes
 from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split, trajectory_of
+from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split
+from crazysim.trajectories.splines import of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLY4D_FLOATS = 33
@@ -90,13 +91,19 @@ def of_rows(rows: NDArray, place: str) -> Trajectory:
     return Trajectory.of_pieces(lengths, c)
 
 
-def rows_of(trajectory: Trajectory) -> NDArray:
-    """Return duration and coefficients per second of each piece. (n_pieces, 33)"""
+def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
+    """Return the pieces of a trajectory, checked to be of a degree that the Crazyflie flies."""
     ends, c = pieces_of(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
             f"expected polynomials of degree 7 at most, as the Crazyflie flies, got degree {c.shape[2] - 1}"
         )
+    return ends, c
+
+
+def rows_of(trajectory: Trajectory) -> NDArray:
+    """Return duration and coefficients per second of each piece. (n_pieces, 33)"""
+    ends, c = _pieces(trajectory)
     lengths = np.diff(ends, prepend=0.0)
     c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / lengths[:, None, None] ** np.arange(8)
     return np.concatenate([lengths[:, None], c.reshape(len(c), -1)], axis=1)
@@ -115,12 +122,8 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
         ConfigError: If its degree is higher, a piece does not begin where the one before ends, or it leaves the 32.767
             m and 3276.7 degrees that 16 bits can hold.
     """
-    ends, c = pieces_of(trajectory)
+    ends, c = _pieces(trajectory)
     require_no_jumps(ends, c)
-    if c.shape[2] > 8:
-        raise ConfigError(
-            f"expected polynomials of degree 7 at most, as the Crazyflie flies, got degree {c.shape[2] - 1}"
-        )
     ends, c = split(ends, c, np.arange(MAX_PIECE, ends[-1], MAX_PIECE))
     c = c / UNITS[:, None]
     stamps = np.round(ends / MILLISECOND).astype(int)
@@ -183,7 +186,7 @@ def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Tra
     ends = MILLISECOND * np.cumsum(durations)
     if not pieces or ends[-1] > checks.MAX_TIME:
         checks.refuse(f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", place)
-    return trajectory_of(ends, np.stack(pieces) * UNITS[:, None])
+    return of_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * UNITS[:, None])
 
 
 def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, shown
 from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split, trajectory_of
+from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split
+from crazysim.trajectories.splines import of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 ENCODINGS = ("COMPRESSED", "POLY4D")
@@ -18,7 +20,7 @@ TOLERANCE = 1e-6
 """Size of coefficients that a file omits, m or rad."""
 
 
-def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[Trajectory, str]:
+def parse_trajectory(value: object, place: str, yaw_control: object = None) -> tuple[Trajectory, str]:
     """Return the trajectory in a ``trajectory.json``, from the start of the show on, and its encoding.
 
     Each point is ``[t, [x, y, z], [control points]]``: the end of a Bezier curve that begins at the previous point,
@@ -73,11 +75,11 @@ def parse_trajectory(value: Any, place: str, yaw_control: Any = None) -> tuple[T
     return _of_curves(np.array(ends), curves, yaw_control, place), encoding
 
 
-def _is_point(point: Any) -> bool:
+def _is_point(point: object) -> TypeGuard[list[Any]]:
     return isinstance(point, list) and 2 <= len(point) <= 3 and isinstance(point[1], list)
 
 
-def _of_curves(ends: Any, curves: list, yaw_control: Any, place: str) -> Trajectory:
+def _of_curves(ends: NDArray, curves: list, yaw_control: object, place: str) -> Trajectory:
     """Return the trajectory of Bezier curves."""
     degree = max(len(curve) for curve in curves) - 1
     c = np.zeros((len(curves), 4, max(degree, 1) + 1))
@@ -86,10 +88,10 @@ def _of_curves(ends: Any, curves: list, yaw_control: Any, place: str) -> Traject
     c[:, 3] = np.deg2rad(c[:, 3])
     if yaw_control is not None:
         ends, c = _with_yaw(ends, c, yaw_control, f"{place}, yawControl")
-    return trajectory_of(ends, c)
+    return of_unit_pieces(np.diff(ends, prepend=0.0), c)
 
 
-def _with_yaw(ends: Any, c: Any, yaw_control: Any, place: str) -> tuple[Any, Any]:
+def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, place: str) -> tuple[NDArray, NDArray]:
     """Return the pieces with the yaw of setpoints that are connected linearly, in the time of the show."""
     value = checks.record(yaw_control, place)
     checks.version_one(value, place)
@@ -131,7 +133,7 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
     require_no_jumps(ends, c)
     digits = np.asarray(trajectory.coefficients).dtype
 
-    def written(point: Any) -> list[float]:
+    def written(point: NDArray) -> list[float]:
         point = np.array(point)
         point[3:] = np.rad2deg(point[3:])
         return [float(str(x)) for x in point.astype(digits)]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, shown
 from crazysim.storage import read_bytes
@@ -103,7 +104,7 @@ def _bound(n_pieces: int, place: str) -> None:
         checks.refuse(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), place)
 
 
-def _drone(archive: Archive, value: Any, place: str, index: int) -> dict[str, Any]:
+def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str, Any]:
     """Return what the show says about one drone; its lights are not yet decoded."""
     value, place = archive.resolve(value, place)
     settings, place = archive.resolve(checks.record(value, place).get("settings"), f"{place}, settings")
@@ -130,11 +131,11 @@ def _drone(archive: Archive, value: Any, place: str, index: int) -> dict[str, An
     }
 
 
-def _position(value: Any, default: Any, place: str) -> Any:
+def _position(value: object, default: NDArray, place: str) -> NDArray:
     return default if value is None else checks.numbers(value, [3], checks.MAX_COORDINATE, place)
 
 
-def _parameters(value: Any, place: str) -> tuple[ParameterChange, ...]:
+def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
     changes = []
     for i, entry in enumerate(checks.sequence(value, checks.MAX_POINTS, place) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
@@ -145,7 +146,7 @@ def _parameters(value: Any, place: str) -> tuple[ParameterChange, ...]:
     return tuple(changes)
 
 
-def _cues(archive: Archive, value: Any, place: str) -> tuple[Cue, ...]:
+def _cues(archive: Archive, value: object, place: str) -> tuple[Cue, ...]:
     if value is None:
         return ()
     value, place = archive.resolve(value, place)
@@ -179,7 +180,7 @@ def _lights(
     return Lights.constant()
 
 
-def parse_colors(value: Any, place: str) -> Lights:
+def parse_colors(value: object, place: str) -> Lights:
     """Return the lights of the lab's ``colors``, in either form.
 
     The newer form is ``[[time, [red, green, blue]], ...]``, each colour from its time on, the older

@@ -27,8 +27,8 @@ def ours(model, command, duration, speed=0.0, trailer=False, **changes):
     """Return the states of our vehicle at 1000 Hz, by Euler's method."""
     car = CarParams.create(vehicle(), 1000, trailer)
     car = car.replace(stiffness=np.full(2, STIFF), slip_speed=np.full(1, 0.2)).replace(**changes)
-    start = CarState.at_rest(np.zeros(3, np.float32), np.zeros(1, np.float32), trailer)
-    start = start._replace(body_vel=np.array([speed, 0.0]))
+    zero, joints = np.zeros(1, np.float32), np.zeros(2, np.float32) if trailer else None
+    start = CarState(np.zeros(3, np.float32), zero, np.array([speed, 0.0]), zero, zero, zero, joints)
     return jax.tree.map(np.asarray, _path(model, start, np.array(command), car, round(1000 * duration)))
 
 

@@ -1,0 +1,91 @@
+"""Airframes from names, files and dicts, with the bases that they extend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.drones.airframe import TUNED, Airframe, AirframeSource, airframe_names
+from crazysim.drones.checks import check_airframe
+from crazysim.drones.keys import LAYOUT
+from crazysim.storage import is_file
+from crazysim.tables import extended, read_source
+
+FOLDER = Path(__file__).parent
+BODY = (
+    "rigid_body.mass",
+    "rigid_body.inertia",
+    "rotors.position",
+    "rotors.yaw_torque_sign",
+    "rotors.thrust_max",
+    "rotors.thrust_curve",
+)
+"""Numbers that gains and fits of an airframe assume."""
+
+
+def load_airframe(source: AirframeSource) -> Airframe:
+    """Return the airframe of a name, a TOML file anywhere on disk, or a dict of the same tables.
+
+    A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
+    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. Another body
+    (``BODY``) does not inherit gains and fits (``TUNED``).
+
+    Args:
+        source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).
+
+    Raises:
+        UnknownNameError: If the source is neither the name of an airframe nor a file.
+        ConfigError: If a table or key does not exist, or the numbers cannot be those of a drone.
+    """
+    return _load(source, ())
+
+
+def is_airframe_file(source: object) -> bool:
+    """Return True for the path of a file, and False for a name of a built-in airframe or anything else."""
+    return isinstance(source, (str, Path)) and str(source) not in airframe_names() and is_file(source)
+
+
+def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
+    """Return the airframe of a source, which is the base of others."""
+    if isinstance(source, Airframe):
+        return source
+    bases = extended(bases, source)
+    stem, origin, tables = read_source(source, "drone", "an Airframe", FOLDER, airframe_names(), LAYOUT.guide)
+    name = str(tables.get("name", stem))
+    numbers, why = dict(LAYOUT.numbers(f"airframe {name!r}{origin}", tables)), ""
+    if tables.get("base") is not None:
+        inherited, why = _inherited(_load(tables["base"], bases), numbers)
+        numbers = inherited | numbers
+    airframe = Airframe(name, numbers, why)
+    check_airframe(airframe)
+    return airframe
+
+
+def _inherited(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, NDArray[np.float64]], str]:
+    """Return the numbers that an airframe inherits, and why not all of them.
+
+    Args:
+        base: The base.
+        changes: The airframe's own numbers, by dotted path.
+    """
+    old = base.values
+    changed = [path for path in BODY if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))]
+    lost = [table for table in TUNED if table in base.tables]
+    if not changed or not lost:
+        return dict(old), base.not_inherited
+    numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED}
+    ratio = "controller.thrust2torque"
+    if ratio in old and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
+        numbers[ratio] = old[ratio]  # of the propellers alone
+    names = _listed(f"[{table}]" for table in lost)
+    why = f"Its base {base.name!r} has {names}, which fit another {_listed(changed)} and are not inherited."
+    return numbers, why
+
+
+def _listed(names: Iterable[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
