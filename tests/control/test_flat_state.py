@@ -1,7 +1,5 @@
 """State and wrench of a flat trajectory: they obey Newton's and Euler's laws, by finite differences in float64."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazysim import rotation
-from crazysim.control.flatness import attitude_of_thrust
+from crazysim.control.flatness import flat_state
 from crazysim.control.setpoint import Setpoint
 
 pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
@@ -19,28 +17,6 @@ pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
 MASS, INERTIA = 0.5, np.array([[2e-3, 1e-4, 0.0], [1e-4, 3e-3, 2e-4], [0.0, 2e-4, 5e-3]])
 GRAVITY = np.array([0.0, 0.0, -9.81])
 STEP = 1e-4
-
-
-class FlatState(NamedTuple):
-    """Attitude, rates and wrench of a drone that flies a setpoint exactly."""
-
-    quat: jax.Array
-    ang_vel: jax.Array
-    thrust: jax.Array
-    torque: jax.Array
-
-
-def flat_state(setpoint):
-    """Return the thrust along the acceleration without gravity, and the torque by Euler's equation."""
-    s, thrust = setpoint, setpoint.acc - GRAVITY
-    attitude = attitude_of_thrust(thrust, s.jerk, s.snap, s.yaw, s.yaw_rate, s.yaw_acc)
-    momentum = rotation.matvec(INERTIA, attitude.ang_vel)
-    return FlatState(
-        quat=rotation.quat_from_axes(*(attitude.matrix[..., k] for k in range(3))),
-        ang_vel=attitude.ang_vel,
-        thrust=MASS * rotation.safe_norm(thrust),
-        torque=rotation.matvec(INERTIA, attitude.ang_acc) + rotation.cross(attitude.ang_vel, momentum),
-    )
 
 
 def wave(amplitude, rate, phase, order, t):
@@ -55,8 +31,8 @@ def at(curve, t):
     return Setpoint(*derivatives, *heading)
 
 
-state_at = jax.jit(lambda curve, t: flat_state(at(curve, t)))
-state_of = jax.jit(flat_state)
+state_at = jax.jit(lambda curve, t: flat_state(at(curve, t), MASS, INERTIA))
+state_of = jax.jit(lambda setpoint: flat_state(setpoint, MASS, INERTIA))
 setpoint_at = jax.jit(at)
 three = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 
@@ -109,6 +85,6 @@ def test_law_01_and_07_many_setpoints_free_fall_and_finite_gradients():
             np.testing.assert_allclose(a, b[k], atol=1e-12)
 
     def total(setpoint):
-        return sum(jnp.sum(x) for x in jax.tree.leaves(flat_state(setpoint)))
+        return sum(jnp.sum(x) for x in jax.tree.leaves(flat_state(setpoint, MASS, INERTIA)))
 
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((together, jax.jit(jax.grad(total))(setpoints))))
