@@ -73,7 +73,7 @@ def test_a_file_and_a_dict_of_a_user(tmp_path):
         ("f1tenth", "aiml_apr24, aiml_head"),
         (3, "expected a vehicle as a name"),
         ({"base": "aiml_head", "rigid_body": {"mas": 1.0}}, "Did you mean 'rigid_body.mass'"),
-        ({"base": "aiml_head", "wheel": {"radius": 1.0}}, "expected a key that exists"),
+        ({"base": "aiml_head", "wheel": {"radius": 1.0}}, "expected a table that exists"),
         ({"base": "aiml_head", "rigid_body": {"mass": -1.0}}, "rigid_body.mass to be from 1e-6 to 1e6 kg, got -1"),
         (
             {"base": "aiml_head", "rigid_body": {"mass": 1e-300}},
