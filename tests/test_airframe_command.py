@@ -7,7 +7,7 @@ import pytest
 
 from crazysim import load_airframe
 from crazysim.__main__ import main
-from crazysim.airframe_check import describe_airframe
+from crazysim.commands.airframe_check import describe_airframe
 
 NUMBERS = ("--mass", "1.2", "--propeller", "0.127", "--thrust-to-weight", "4")
 

@@ -14,9 +14,10 @@ from crazysim.cache import announce, announced, default_cache, enable_cache, ena
 
 PROGRAM = """
 import sys
-from crazysim.__main__ import COMMANDS, main
+from crazysim.__main__ import main
+from crazysim.commands import info, training
 import jax, jax.numpy as jnp
-COMMANDS["info"] = COMMANDS["train"] = lambda options: print(jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((3, 3)))[0, 0])
+info.run = training.train = lambda options: print(jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((3, 3)))[0, 0])
 sys.exit(main([sys.argv[1], *["hover"] * (sys.argv[1] == "train")]))
 """
 """A command that compiles something."""

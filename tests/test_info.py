@@ -11,7 +11,7 @@ import pytest
 
 import crazysim
 from crazysim.__main__ import main
-from crazysim.info import OPTIONAL, PACKAGES, VARIABLES
+from crazysim.commands.info import OPTIONAL, PACKAGES, VARIABLES
 
 
 def lines(text):

@@ -10,15 +10,18 @@ import pytest
 from pictures import frames_of
 
 from crazysim import Sim
-from crazysim.__main__ import COMMANDS, EXTRAS, main
+from crazysim.__main__ import EXTRAS, main
 from crazysim.demos import DEMOS, flight
 from crazysim.media import Flight, Recorder
 from crazysim.scene.software import film_size
 
+COMMANDS = ("demo", "replay", "show", "live", "train", "evaluate", "export", "render", "airframe", "identify", "info")
+
 
 def test_without_a_command_it_lists_what_there_is(capsys):
     assert main([]) == 0
-    assert "demo" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert all(f"\n    {name} " in out for name in COMMANDS)
 
 
 def test_as_a_module_in_a_process_of_its_own():
@@ -155,7 +158,7 @@ class Missing:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Missing())
-from crazysim.__main__ import COMMANDS, main
+from crazysim.__main__ import main
 sys.exit(main(sys.argv[2:]))
 """
 """The command line of an installation without the packages of the first argument."""

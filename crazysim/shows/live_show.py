@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
-from crazysim.errors import ConfigError
-from crazysim.live.browser import Browser
 from crazysim.live.loop import Live
 from crazysim.live.pace import Speed
-from crazysim.live.window import Window
-from crazysim.shows.flight import at_start, planned_at
-from crazysim.shows.view import camera_around
+from crazysim.shows.flight import at_start
 from crazysim.trajectories.files.show import Show
-
-if TYPE_CHECKING:
-    from argparse import Namespace
-
 
 LIGHT_FREQ = 50
 """Rate at which the LEDs change, Hz."""
@@ -59,23 +48,3 @@ def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
     live = Live(sim, speed=speed)
     live.add(ShowLights(show), freq=LIGHT_FREQ, name="lights")
     return live
-
-
-def run_live(show: Show, options: Namespace, **settings: Any) -> None:
-    """Run ``crazysim show --live``, and print the report of the loop.
-
-    Raises:
-        ConfigError: If a setting is invalid, or a file is to be written.
-        RenderError: If this machine cannot show a viewer, or a port is in use.
-    """
-    written = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
-    if written is not None:
-        raise ConfigError(f"expected --live or --{written}, got both. Leave one of them out.")
-    with live_show(show, **settings) as live:
-        if options.window:
-            planned = planned_at(show.trajectories, jnp.linspace(0.0, show.duration, 50))
-            live.show(Window(cam_config=camera_around(np.asarray(planned))))
-        if options.browser:
-            print(f"open {live.show(Browser(options.port, options.host)).url}; stop with Ctrl-C", flush=True)
-        seconds = show.duration if options.seconds is None else min(options.seconds, show.duration)
-        print(live.run(seconds))

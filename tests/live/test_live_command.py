@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim.__main__ import main
-from crazysim.live.program import CLIMB, HEIGHT, PERIOD, RADIUS, circling
+from crazysim.live.circles import CLIMB, HEIGHT, PERIOD, RADIUS, circling
 from crazysim.media import Flight
 
 

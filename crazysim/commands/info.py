@@ -1,7 +1,8 @@
-"""Everything about an installation that a report of a bug needs, as plain text."""
+"""``crazysim info``: everything about an installation that a report of a bug needs, as plain text."""
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 import importlib.util
 import os
@@ -11,6 +12,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import crazysim
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
 """Packages that crazysim needs."""
@@ -23,18 +26,25 @@ VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XL
 """Environment variables that change what runs."""
 
 
-def info() -> str:
-    """Return versions, devices, compiler, caches and rendering of this installation, a line each.
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command that describes the installation."""
+    parser = commands.add_parser("info", help="print versions, devices, compiler and caches, for reports of bugs")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print versions, devices, compiler, caches and rendering of this installation, a line each.
 
     A part that is missing or broken is a line with the reason.
     """
+    del options
     text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _parts())
-    return text.replace(f"{Path.home()}{os.sep}", f"~{os.sep}")  # reports are public
+    print(text.replace(f"{Path.home()}{os.sep}", f"~{os.sep}"))  # reports are public
 
 
 def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the name of every line, and the function that returns the rest."""
-    yield "crazysim", _own_version
+    yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
     yield "system", lambda: f"{platform.platform()}, {_cores()} CPU cores"
     for name in PACKAGES:
@@ -60,12 +70,6 @@ def _or_reason(value: Callable[[], str]) -> str:
 
 def _first_line(text: str) -> str:
     return text.strip().partition("\n")[0][:300]
-
-
-def _own_version() -> str:
-    from crazysim.version import __version__
-
-    return f"{__version__}, {Path(__file__).parent}"
 
 
 def _cores() -> int:

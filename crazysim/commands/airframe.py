@@ -1,0 +1,103 @@
+"""``crazysim airframe``: airframes from a few numbers, and their checks."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from crazysim.commands.options import DefaultsFormatter
+
+NUMBERS = (
+    "mass", "propeller", "arm", "n_rotors", "layout", "thrust_to_weight", "motor_table", "pitch", "inertia",
+    "time_constant", "cells", "capacity", "resistance",
+)  # fmt: skip
+"""Options of ``new`` that are arguments of ``estimate_airframe``."""
+SPINS = {"ccw": 1, "cw": -1}
+"""Senses of rotation."""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the commands that make and check airframes."""
+    airframe = commands.add_parser("airframe", help="make an airframe of your own from a few numbers, or check one")
+    actions = airframe.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)
+    parser = actions.add_parser(
+        "new",
+        help="estimate an airframe from mass, rotors and thrust; write a TOML file with a source for every number",
+        epilog="example: crazysim airframe new mine.toml --mass 1.2 --arm 0.12 --propeller 0.127 --thrust-to-weight 4",
+        formatter_class=DefaultsFormatter,
+    )
+    parser.set_defaults(run=new)
+    add = parser.add_argument
+    add("file", type=Path, help=".toml file to write")
+    add("--mass", type=float, required=True, metavar="KG", help="mass with the battery")
+    add("--propeller", type=float, required=True, metavar="M", help="diameter of the propellers")
+    add("--arm", type=float, metavar="M", help="distance of the rotors from the centre")
+    add("--rotors", type=int, default=4, dest="n_rotors", metavar="N", help="number of rotors on a circle")
+    add("--layout", default="x", choices=("x", "+"), help="nose between two rotors, or on the first rotor")
+    positions = "rotors from the centre of mass, m, instead of --arm: X,Y or X,Y,Z each"
+    add("--positions", metavar="'X,Y ...'", help=positions)
+    spins = "sense of rotation of each rotor seen from above; by default they alternate from ccw"
+    add("--spins", nargs="+", metavar="CCW|CW", help=spins)
+    add("--thrust-to-weight", type=float, metavar="RATIO", help="largest thrust of all rotors over weight")
+    table = (
+        "data sheet of one motor with its propeller instead of --thrust-to-weight, .csv with columns thrust_g or "
+        "thrust_n, and if known rpm, torque_nm, power_w"
+    )
+    add("--motor-table", type=Path, metavar="FILE", help=table)
+    add("--pitch", type=float, metavar="M", help="pitch of the propellers; by default half the diameter")
+    add("--inertia", type=float, nargs=3, metavar="KGM2", help="moments; by default estimated")
+    add("--time-constant", type=float, metavar="S", help="of the rotors; by default estimated")
+    add("--cells", type=int, metavar="N", help="battery cells in series; by default estimated")
+    add("--capacity", type=float, metavar="AH", help="of the battery, A h; by default estimated")
+    add("--resistance", type=float, metavar="OHM", help="of the whole battery; by default estimated")
+    add("--name", help="name of the airframe; by default that of the file")
+
+    text = "print what an airframe can do and what it lacks, and draw it"
+    parser = actions.add_parser("check", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=check)
+    parser.add_argument("file", help="path of a .toml file, or the name of a built-in airframe")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="picture of the body to write, .png")
+
+
+def new(options: argparse.Namespace) -> None:
+    """Estimate an airframe, and write its file."""
+    import tomllib
+
+    from crazysim.drones import estimate_airframe, load_airframe
+
+    path: Path = options.file
+    if path.suffix != ".toml" or not path.parent.is_dir():
+        raise ValueError(f"expected a .toml file in an existing folder, got {str(path)!r}")
+    if path.exists():
+        raise ValueError(f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it")
+    if wrong := [x for x in options.spins or () if x.lower() not in SPINS]:
+        raise ValueError(f"expected --spins of ccw and cw, got {wrong[0]!r}")
+    try:
+        places = (options.positions or "").split()
+        positions = [[float(x) for x in f"{place},0".split(",")][:3] for place in places] or None
+    except ValueError:
+        raise ValueError(f"expected --positions such as '0.1,-0.1 0.1,0.1', got {options.positions!r}") from None
+    text = estimate_airframe(
+        **{name: getattr(options, name) for name in NUMBERS},
+        positions=positions,
+        spins=options.spins and [SPINS[x.lower()] for x in options.spins],
+        name=options.name or path.stem,
+    )
+    tables = tomllib.loads(text)
+    load_airframe(tables)
+    path.write_text(text, encoding="utf-8")
+    estimates = [key for key, source in tables["sources"].items() if source.startswith("estimate: ")]
+    print(f"wrote {path}; estimated: {', '.join(estimates)}")
+    print(f"next: crazysim airframe check {path} --picture {path.with_suffix('.png')}")
+
+
+def check(options: argparse.Namespace) -> None:
+    """Describe an airframe, and draw it."""
+    from crazysim.commands.airframe_check import describe_airframe, draw_airframe
+    from crazysim.drones import load_airframe
+
+    airframe = load_airframe(options.file)
+    print(describe_airframe(airframe))
+    if options.picture is not None:
+        draw_airframe(airframe, options.picture)
+        print(f"wrote {options.picture}")

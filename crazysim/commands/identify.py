@@ -1,0 +1,59 @@
+"""``crazysim identify``: airframes from logs of real flights."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from crazysim.commands.options import DefaultsFormatter
+from crazysim.identify import Columns, errors_table, identify, prediction_errors, read_log
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command that fits airframes to flights."""
+    text = "fit an airframe to logs of real flights"
+    parser = commands.add_parser("identify", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("logs", type=Path, nargs="+", metavar="LOG", help="logs to fit, .csv or .npz")
+    add("--airframe", default="cf21B_500", help="airframe to start from: a name or a TOML file")
+    add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
+    add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
+    add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
+    add("--columns", nargs="+", default=[], metavar="FIELD=NAMES", help="columns, such as time=s pos=px,py,pz")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fit an airframe, print its errors, and write its file."""
+    if options.out.suffix != ".toml" or not options.out.parent.is_dir() or options.out.exists():
+        raise ValueError(f"expected a new .toml file in an existing folder, got {str(options.out)!r}")
+    columns = _columns(options.columns) if options.columns else None
+    logs, held_out = ([read_log(path, columns) for path in paths] for paths in (options.logs, options.test))
+    for log in logs + held_out:
+        for repair in log.repairs:
+            print(f"{log.name}: {repair}")
+    result = identify(logs, options.airframe, mass=options.mass)
+    for name, x in result.values.items():
+        print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
+    if result.doubtful:
+        print(f"doubtful, more than three times from the airframe: {', '.join(result.doubtful)}")
+    for title, flights in (("fitted logs", logs), ("held-out logs", held_out)):
+        if flights:
+            print(f"{title}\n{errors_table(prediction_errors(flights, result.model))}")
+    names = ", ".join(log.name for log in logs)
+    text = result.toml(f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {names}")
+    options.out.write_text(text, encoding="utf-8")
+    print(f"wrote {options.out}")
+
+
+def _columns(texts: Sequence[str]) -> Columns:
+    """Return the columns of FIELD=NAMES pairs."""
+    fields = {name: names for name, _, names in (text.partition("=") for text in texts)}
+    unknown = sorted(set(fields) - set(Columns.__dataclass_fields__))
+    if unknown:
+        raise ValueError(f"expected fields of {', '.join(Columns.__dataclass_fields__)}, got {unknown[0]!r}")
+    convert: dict[str, Callable[[str], Any]] = {"time": str, "rpm_per_unit": float}
+    return Columns(**{k: convert.get(k, lambda x: tuple(x.split(",")))(x) for k, x in fields.items()})

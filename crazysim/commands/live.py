@@ -1,0 +1,94 @@
+"""``crazysim live``: drones that circle, and can be watched, piloted, commanded and recorded."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from pathlib import Path
+from typing import Literal
+
+from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given
+from crazysim.errors import ConfigError
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command that flies live."""
+    text = "fly in real time: watch, pilot, command and record; print the factor of real time"
+    parser = commands.add_parser("live", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("--drones", type=int, default=4, metavar="N", help="drones in each world")
+    add("--worlds", type=int, default=1, metavar="N", help="number of worlds")
+    add("--seconds", type=float, help="simulated time, s; by default until all viewers are closed")
+    add("--speed", default="1", help="simulated seconds per second, or max for as fast as possible")
+    add("--window", action="store_true", help="show a window; by default where there is a screen")
+    add("--browser", action="store_true", help="show a page in a browser; by default where there is no screen")
+    add("--headless", action="store_true", help="show nothing; requires --seconds")
+    add_page(parser)
+    add("--fps", type=float, default=50.0, help="pictures per second, sent to viewers")
+    add("--control-freq", type=int, default=100, metavar="HZ", help="rate of control steps, Hz")
+    add("--freq", type=int, default=500, metavar="HZ", help="rate of physics steps, Hz")
+    add("--record", type=Path, metavar="FILE", help="file to record to, for crazysim replay")
+    add("--pilot", action="store_true", help="pilot the first drone with arrow keys, W, S, A, D and clicks")
+    add("--gamepad", action="store_true", help="pilot the first drone with a gamepad and the keyboard")
+    add("--commands", action="store_true", help="listen for commands over TCP, at ports 7000 and 7002")
+    add_simulation(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fly drones live, and print the figures."""
+    from crazysim.live import Browser, CommandServer, Fleet, Gamepad, Live, Pilot, RemoteCommands, Window
+    from crazysim.live.circles import Circles
+    from crazysim.live.piloting import Sticks, keyboard_sticks
+    from crazysim.sim.sim import Sim
+
+    viewers = [name for name in ("window", "browser") if getattr(options, name)]
+    if options.headless and viewers:
+        raise ConfigError(f"expected --headless or --{viewers[0]}, got both. Leave one out.")
+    if options.headless and options.seconds is None:
+        raise ConfigError("expected --seconds with --headless, got none. Use --seconds 20, for example.")
+    if not options.headless and not viewers:
+        viewers = ["window" if _has_screen() else "browser"]
+    speed, piloted = _speed(options.speed), options.pilot or options.gamepad
+    if options.commands and piloted:
+        raise ConfigError(
+            "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
+        )
+    n_worlds, control_freq = options.worlds, options.control_freq
+    settings = given(options, "drone", "controller", "device")
+    sim = Sim(n_worlds, options.drones, control="state", freq=options.freq, state_freq=control_freq, **settings)
+    with contextlib.ExitStack() as stack:
+        live = stack.enter_context(Live(sim, control_freq, speed, options.fps))
+        if options.commands:
+            fleet = Fleet(sim, teleport=False)
+            live.add(RemoteCommands(fleet, stack.enter_context(CommandServer())), name="commands")
+        else:
+            live.add(Circles(live, piloted), name="circles")
+        if piloted:
+            sticks: list[Sticks] = [keyboard_sticks, *([Gamepad()] if options.gamepad else [])]
+            pilot = Pilot(sticks)
+            live.add(pilot, name="pilot")
+            live.on_click = pilot.go_to
+        for viewer in viewers:
+            if viewer == "browser":
+                browser = live.show(Browser(options.port, options.host, contacts=n_worlds == 1))
+                print(f"open {browser.url}; stop with Ctrl-C", flush=True)
+            else:
+                live.show(Window(worlds=tuple(range(min(n_worlds, 9)))))
+        if options.record is not None:
+            print(f"recording to {live.record(options.record)}", flush=True)
+        print(live.run(options.seconds))
+
+
+def _speed(text: str) -> float | Literal["max"]:
+    """Return a speed: a number, or ``max``."""
+    try:
+        return "max" if text == "max" else float(text)
+    except ValueError:
+        raise ConfigError(f"expected a positive speed or max, got {text!r}") from None
+
+
+def _has_screen() -> bool:
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

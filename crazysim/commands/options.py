@@ -1,0 +1,36 @@
+"""Help texts and options that several commands have."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+
+class DefaultsFormatter(argparse.HelpFormatter):
+    """Help that states the defaults which are numbers or names; a help text that says "by default" states its own."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        text, default = action.help, action.default
+        states_none = default == [] or any(default is x for x in (None, False, argparse.SUPPRESS))
+        if text is None or states_none or "by default" in text:
+            return text
+        return f"{text} (default: %(default)s)"
+
+
+def add_page(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a command that serves a page."""
+    parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free port")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the page; 0.0.0.0 to accept other machines")
+
+
+def add_simulation(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a command that are settings of ``Sim``."""
+    add = parser.add_argument
+    add("--drone", help="airframe: a name or the path of a TOML file; by default cf21B_500")
+    add("--controller", help="controller that follows the setpoints, such as mellinger; by default auto")
+    add("--device", help="device: cpu, gpu; by default cpu")
+
+
+def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the values of the options that were given, by name."""
+    return {name: x for name in names if (x := getattr(options, name)) is not None}

@@ -1,0 +1,33 @@
+"""``crazysim replay``: recorded flights in a browser."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from crazysim.commands.options import DefaultsFormatter, add_page
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command that plays recorded flights."""
+    text = "play a recorded flight in a browser"
+    parser = commands.add_parser("replay", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("flight", type=Path, help="flight saved by crazysim.media.Flight or recorded live")
+    add("--world", type=int, help="world to show; by default the first that was recorded")
+    add_page(parser)
+    add("--export", type=Path, metavar="FILE", help="write the page to an .html file instead of serving it")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Serve the page of a flight, or write it."""
+    from crazysim.media.flight import Flight
+    from crazysim.media.web import export, serve
+
+    flight = Flight.load(options.flight)
+    if options.export is None:
+        serve(flight, options.world, options.port, options.host)
+    else:
+        export(flight, options.export, options.world)
+        print(f"wrote {options.export}")

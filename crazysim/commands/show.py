@@ -1,0 +1,92 @@
+"""``crazysim show``: light shows."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given
+from crazysim.errors import ConfigError
+from crazysim.trajectories.files import Show, load_show
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the command that flies light shows."""
+    text = "fly a light show; print separation and tracking errors, write a film or a report"
+    parser = commands.add_parser("show", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("file", type=Path, help="show to fly, a .skyc file")
+    add("--film", type=Path, metavar="FILE", help="film to write, .mp4 or .gif")
+    add("--page", type=Path, metavar="FILE", help="page to write, .html, which plays the show in a browser")
+    add("--browser", action="store_true", help="play the show on a page in a browser, until Ctrl-C")
+    add_page(parser)
+    add("--window", action="store_true", help="play the show in a window")
+    live = "fly in real time while --window or --browser shows it; no report of distances"
+    add("--live", action="store_true", help=live)
+    add("--report", type=Path, metavar="FILE", help="figures to write, .json")
+    add("--seconds", type=float, help="duration of the flight, s; by default that of the show")
+    add("--fps", type=float, default=25.0, help="frames per second of the film")
+    add_simulation(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fly a show, and write figures, films and pages of it."""
+    from crazysim.progress import progress
+    from crazysim.shows import film, fly, page, report, summary
+    from crazysim.shows.view import play
+
+    for path, suffixes in ((options.report, (".json",)), (options.page, (".html",)), (options.film, (".mp4", ".gif"))):
+        if path is not None and path.suffix not in suffixes:
+            raise ConfigError(f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}")
+        if path is not None and not path.parent.is_dir():
+            raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
+    show = load_show(options.file)
+    settings = given(options, "drone", "controller", "device")
+    if options.live:
+        _run_live(show, options, settings)
+        return
+    flight = fly(show, options.seconds, progress, **settings)
+    figures = report(flight)
+    print(summary(flight, figures))
+    if options.report is not None:
+        options.report.write_text(json.dumps(figures))
+        print(f"wrote {options.report}")
+    if options.film is not None:
+        film(flight, options.film, options.fps, progress=True)
+        print(f"wrote {options.film}")
+    if options.window:
+        play(flight)
+    if options.page is not None or options.browser:
+        html = page(flight)
+        if options.page is not None:
+            options.page.write_text(html, encoding="utf-8")
+            print(f"wrote {options.page}")
+        if options.browser:
+            from crazysim.media.web import serve_page
+
+            serve_page(html, options.port, options.host)
+
+
+def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any]) -> None:
+    """Fly a show in real time, and print the report of the loop."""
+    import numpy as np
+
+    from crazysim.live import Browser, Window
+    from crazysim.shows.flight import planned_at
+    from crazysim.shows.live_show import live_show
+    from crazysim.shows.view import camera_around
+
+    written = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
+    if written is not None:
+        raise ConfigError(f"expected --live or --{written}, got both. Leave one of them out.")
+    with live_show(show, **settings) as live:
+        if options.window:
+            planned = planned_at(show.trajectories, np.linspace(0.0, show.duration, 50))
+            live.show(Window(cam_config=camera_around(np.asarray(planned))))
+        if options.browser:
+            print(f"open {live.show(Browser(options.port, options.host)).url}; stop with Ctrl-C", flush=True)
+        seconds = show.duration if options.seconds is None else min(options.seconds, show.duration)
+        print(live.run(seconds))

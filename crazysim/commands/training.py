@@ -1,0 +1,149 @@
+"""``crazysim train``, ``evaluate``, ``export`` and ``render``: policies."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from crazysim.commands.options import DefaultsFormatter, given
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the commands that train, evaluate, export and film policies."""
+    text = "train a policy; write checkpoint, learning curve, policy and film"
+    parser = commands.add_parser("train", help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=train)
+    add = parser.add_argument
+    task = "name of a task, such as hover, or place of your own, FILE.py:CLASS; list prints all names"
+    add("task", help=task)
+    add("--algorithm", help="ppo or apg; by default that of the task's recipe")
+    add("--seed", type=int, help="random seed; by default 0")
+    add("--worlds", type=int, help="number of parallel worlds; by default that of the task's recipe")
+    iterations = "number of rollouts, each with its updates; by default that of the task's recipe"
+    add("--iterations", type=int, help=iterations)
+    add("--out", type=Path, help="folder of the run; by default out/TASK")
+    resume = "continue from the checkpoint in that folder, with its settings where none are given"
+    add("--resume", action="store_true", help=resume)
+    add("--device", help="device: cpu, gpu; by default cpu")
+    add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
+    add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
+    add("--no-film", action="store_true", help="write no film")
+
+    add = _of_run(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
+    add("--worlds", type=int, default=1000, help="number of initial states")
+    add("--seed", type=int, help="seed of other initial states than the held-out ones")
+    add("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
+    _add_place(add)
+
+    add = _of_run(commands, "export", "write a trained policy as ONNX or as a C header", export)
+    add("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
+    add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
+
+    add = _of_run(commands, "render", "film a trained policy", render)
+    add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
+    add("--worlds", type=int, default=4, help="number of worlds side by side")
+    add("--seed", type=int, default=1, help="seed of the initial states")
+    _add_place(add)
+
+
+def _of_run(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
+    """Add a command that reads the folder of a run, and return the function that adds its arguments."""
+    parser = commands.add_parser(name, help=text, formatter_class=DefaultsFormatter)
+    parser.set_defaults(run=run)
+    parser.add_argument("folder", type=Path, help="folder of the run")
+    return parser.add_argument
+
+
+def _add_place(add: Any) -> None:
+    """Add the options of a command that makes the environment of a run again."""
+    place = "place of a task of your own, if it is not where it was in training"
+    add("--task", metavar="FILE.py:CLASS", help=place)
+    add("--device", help="device: cpu, gpu; by default that of the training")
+
+
+def _pairs(texts: Sequence[str]) -> dict[str, Any]:
+    """Return NAME=VALUE pairs as a dict; a value that is not JSON is a string."""
+    pairs = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ValueError(f"expected NAME=VALUE, got {text!r}; write for example seconds=5")
+        try:
+            pairs[name] = json.loads(value)
+        except ValueError:
+            pairs[name] = value
+    return pairs
+
+
+def train(options: argparse.Namespace) -> None:
+    """Train a policy, or print the names of all tasks."""
+    from crazysim.envs.registry import TASKS
+
+    if options.task == "list":
+        for name, entry in TASKS.items():
+            print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
+        return
+    from crazysim.train.runs import run
+
+    run(
+        options.task,
+        options.out,
+        resume=options.resume,
+        film=not options.no_film,
+        algorithm=options.algorithm,
+        seed=options.seed,
+        n_worlds=options.worlds,
+        options=_pairs(options.set) | given(options, "device"),
+        config=_pairs(options.config) | given(options, "iterations"),
+    )
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    """Print the figures of a policy."""
+    import jax
+
+    from crazysim.train.evaluation import TERM, evaluate, outcome
+    from crazysim.train.show import plot_episode
+    from crazysim.train.training import load_policy
+
+    policy, config, _ = load_policy(options.folder, options.task)
+    env = config.with_device(options.device).make_env(options.worlds)
+    key = None if options.seed is None else jax.random.key(options.seed)
+    metrics = evaluate(env, policy, key)
+    terms = ", ".join(f"{k.removeprefix(TERM)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM))
+    print(
+        f"{config.title}, {options.worlds:,} starts: success {metrics['success']:.1%}, "
+        f"{outcome(metrics, env.task.unit)}, mean return {metrics['reward']:.4g} ({terms})"
+    )
+    if options.plot is not None:
+        plot_episode(env, policy, options.plot, key)
+        print(f"wrote {options.plot}")
+
+
+def export(options: argparse.Namespace) -> None:
+    """Write a policy in other formats."""
+    from crazysim.train.export import to_c, to_onnx
+    from crazysim.train.training import load_policy
+
+    if options.onnx is None and options.c is None:
+        raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or both")
+    policy, _, meta = load_policy(options.folder)
+    for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
+        if path is not None:
+            write(policy, path, meta)
+            print(f"wrote {path}")
+
+
+def render(options: argparse.Namespace) -> None:
+    """Film a policy."""
+    from crazysim.train.show import film
+    from crazysim.train.training import load_policy
+
+    policy, config, _ = load_policy(options.folder, options.task)
+    path = options.film or options.folder / "policy.mp4"
+    env = config.with_device(options.device).make_env(options.worlds)
+    film(env, policy, path, options.worlds, options.seed, progress=True)
+    print(f"wrote {path}")
