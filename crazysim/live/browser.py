@@ -9,13 +9,14 @@ import socket
 import threading
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from crazysim.errors import ConfigError, RenderError
 from crazysim.live.browser_panel import BrowserPanel
 from crazysim.live.browser_scene import BrowserScene
+from crazysim.live.loop import Live
 from crazysim.live.picture import PictureSource
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.viewer import Viewer
@@ -23,9 +24,6 @@ from crazysim.media.access import LOCAL, Access, guarded_server
 from crazysim.media.web import FOV, free_port, import_viser
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
 
 MAX_WORLDS = 64
 """Most worlds that are shown unless they are listed."""
@@ -37,7 +35,7 @@ STOP = 0.5
 log = logging.getLogger(__name__)
 
 
-class Browser(Viewer):
+class Browser(Viewer[Live]):
     """Viewer in any number of browsers, by viser, which runs in threads of its own.
 
         browser = live.show(Browser(port=8080))

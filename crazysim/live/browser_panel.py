@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from crazysim.live.browser_scene import BrowserScene
+from crazysim.live.loop import Live
+from crazysim.live.pace import Speed
 from crazysim.live.picture import Picture, quantities
 from crazysim.live.scene_bodies import DRONE, SceneBodies
-from crazysim.live.viewer import Slider
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
+from crazysim.live.viewer import Control, Slider
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
 """Speeds to choose from."""
@@ -135,11 +135,8 @@ class BrowserPanel:
 
     def _add_time(self, gui: Any, live: Live) -> None:
         calls = {
-            "pause": lambda live: setattr(live, "paused", not live.paused),
-            "step": lambda live: live.advance(),
-            "reset": lambda live: live.reset(),
-            "record": lambda live: live.toggle_recording(),
-        }
+            "pause": Live.toggle_pause, "step": Live.advance, "reset": Live.reset, "record": Live.toggle_recording,
+        }  # fmt: skip
         buttons = gui.add_button_group("", tuple(calls))
         buttons.on_click(lambda _: live.post(calls[buttons.value]))
         speed = gui.add_dropdown("speed", SPEEDS, initial_value=_nearest(live.speed))
@@ -204,9 +201,9 @@ class BrowserPanel:
             self._scene.visible[layer] = box.value
 
     @staticmethod
-    def _add_control(gui: Any, live: Live, control: Any) -> None:
+    def _add_control(gui: Any, live: Live, control: Control) -> None:
         if not isinstance(control, Slider):
-            _post(gui.add_button(control.name), live, control.call)
+            _post(gui.add_button(control.name), live, lambda _: control.call())
             return
         step = (control.high - control.low) / 200
         slider = gui.add_slider(control.name, control.low, control.high, step, control.value)
@@ -217,12 +214,12 @@ class BrowserPanel:
             live.post(lambda live: live.set_value(control.name, value))
 
 
-def _post(button: Any, live: Live, call: Any) -> None:
+def _post(button: Any, live: Live, call: Callable[[Live], object]) -> None:
     """Let a button post a function to the loop."""
     button.on_click(lambda _: live.post(call))
 
 
-def _nearest(speed: Any) -> str:
+def _nearest(speed: Speed) -> str:
     """Return the choice that is nearest to a speed."""
     if speed == "max":
         return "max"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.live.attitude import rotate
 from crazysim.live.browser_trails import Trails, finite_rows
-from crazysim.live.mocap.frames import rotate
 from crazysim.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
 from crazysim.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
 from crazysim.media.trail import colors_of

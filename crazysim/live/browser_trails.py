@@ -6,7 +6,7 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.media.trail import MIN_ALPHA
 
@@ -60,7 +60,7 @@ class Trails:
         return np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
 
 
-def finite_rows(values: NDArray, rest: Any = 0.0) -> NDArray:
+def finite_rows(values: NDArray, rest: ArrayLike = 0.0) -> NDArray:
     """Return rows of numbers, (..., k), with rows that are not finite replaced by ``rest``, () or (k,)."""
     bad = ~np.isfinite(values).all(-1, keepdims=True)
     return np.where(bad, np.asarray(rest, float), values)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.live.attitude import from_yaw
 from crazysim.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.live.paths import Path
 from crazysim.plugins.follow import Follow
@@ -74,7 +75,7 @@ class Fleet:
         pos = np.asarray(sim.data.states.pos[0], float)
         self._active = [_hover(np.append(p, 0.0)) for p in pos]
         self._starts = np.zeros(sim.n_drones)
-        self._uploaded: list[Trajectory | None] = [None] * sim.n_drones
+        self._uploaded: dict[int, Trajectory] = {}
         self._untouched = [True] * sim.n_drones
         self.parameters = [{} for _ in range(sim.n_drones)]
         self._lights: Lights | None = None
@@ -108,7 +109,7 @@ class Fleet:
         self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
             self._fly(drone, _hover(np.append(pos, 0.0)))
-            self._untouched[drone] = self._uploaded[drone] is None
+            self._untouched[drone] = drone not in self._uploaded
 
     def colors(self) -> NDArray:
         """Return the present colours of the LEDs, those of the received show once it has started. (n_drones, 3)"""
@@ -137,17 +138,16 @@ class Fleet:
                 self._receive(drone, trajectory)
             self._lights, self._show_start = show.lights, None
         elif isinstance(command, StartShow):
-            drones = [i for i, trajectory in enumerate(self._uploaded) if trajectory is not None]
-            if not drones:
+            if not self._uploaded:
                 raise ConfigError("expected trajectories to start, got none. Upload some first.")
-            for drone in drones:
+            for drone in self._uploaded:
                 self._start(drone, relative=False)
             self._show_start = self._now()
         else:
             if isinstance(command, Upload):
                 self._check(command.trajectory)
             drones = self._drones(command.drone)
-            if isinstance(command, Start) and any(self._uploaded[drone] is None for drone in drones):
+            if isinstance(command, Start) and any(drone not in self._uploaded for drone in drones):
                 raise ConfigError("expected a trajectory to start, got none. Upload one first.")
             for drone in drones:
                 self._apply_to(command, drone)
@@ -197,16 +197,13 @@ class Fleet:
             begin = Path.of(trajectory).at(0.0)
             states = self.sim.data.states
             pos = states.pos.at[0, drone].set(jnp.asarray(begin[:3], states.pos.dtype))
-            half = begin[3] / 2
-            quat = states.quat.at[0, drone].set(jnp.asarray([0, 0, np.sin(half), np.cos(half)], states.quat.dtype))
+            quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(begin[3]), states.quat.dtype))
             self.sim.data = self.sim.data.replace(states=states.replace(pos=pos, quat=quat))
             self._fly(drone, _hover(begin))
         self._untouched[drone] = False
 
     def _start(self, drone: int, relative: bool) -> None:
         trajectory = self._uploaded[drone]
-        if trajectory is None:
-            raise ConfigError("expected a trajectory to start, got none. Upload one first.")
         if relative:
             trajectory = trajectory.moved((self.setpoint(drone) - Path.of(trajectory).at(0.0))[:3])
         self._fly(drone, trajectory)

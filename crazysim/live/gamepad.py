@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
+from crazysim.live.loop import Live
 
 DEADBAND = 0.12
 """Deflection below which a stick counts as released, 0 to 1."""
@@ -44,7 +42,7 @@ class Gamepad:
         if not found:
             raise ConfigError("expected a gamepad, got none. Connect it before the program starts.")
         self._number = found[0]
-        self._calls: dict[int, Callable[[Live], Any]] = {}
+        self._calls: dict[int, Callable[[Live], object]] = {}
         self._before: list[int] = []
 
     @property
@@ -53,7 +51,7 @@ class Gamepad:
         name = self._glfw.get_gamepad_name(self._number)
         return name.decode(errors="replace") if isinstance(name, bytes) else str(name or "disconnected")
 
-    def bind(self, button: str, call: Callable[[Live], Any]) -> None:
+    def bind(self, button: str, call: Callable[[Live], object]) -> None:
         """Let a button call a function of the loop.
 
         Args:

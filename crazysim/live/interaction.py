@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from functools import partial
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.live.keyboard import Keyboard
@@ -15,16 +16,13 @@ from crazysim.live.scene_bodies import DRONE, SceneBodies
 from crazysim.live.viewer import Button, Control, Slider
 from crazysim.sim.sim import Sim
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
-
 
 class Interaction:
     """The part of ``Live`` that viewers and people use."""
 
     sim: Sim
     """The simulation."""
-    keyboard: Keyboard
+    keyboard: Keyboard[Self]
     """Keys that are held in a viewer."""
     controls: list[Control]
     """Buttons and sliders that viewers show."""
@@ -35,30 +33,28 @@ class Interaction:
     lights: NDArray
     """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
     (n_worlds, n_drones, 3)"""
-    quantities: dict[str, Callable[[Live], Any]]
+    quantities: dict[str, Callable[[Self], ArrayLike]]
     """Further quantities that viewers can plot: by name, functions of the loop that return numbers. (k,)"""
-    on_click: Callable[[Live, int, NDArray], Any] | None
+    on_click: Callable[[Self, int, NDArray], object] | None
     """Function that is called with the loop, a world and a point of its ground, m, that was clicked in a viewer."""
 
     def __init__(self, sim: Sim):
-        """Begin with the first drone selected, and with the keys that every live simulation has."""
+        """Begin with the first drone selected."""
         self.sim = sim
         self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
         self.selected, self.on_click = (0, 0), None
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
         self._followed: tuple[int, str, int] | None = None
         self._slider = 0
-        self._posted: deque[Callable[[Live], Any]] = deque()
-        for key, call in BINDINGS.items():
-            self.keyboard.bind(key, call)
+        self._posted: deque[Callable[[Self], object]] = deque()
 
-    def button(self, name: str, call: Callable[[Live], Any], key: str | None = None) -> None:
+    def button(self, name: str, call: Callable[[Self], object], key: str | None = None) -> None:
         """Add a button to viewers that are shown from now on, and a key that does the same."""
-        self.controls.append(Button(name, call, key))
+        self.controls.append(Button(name, partial(call, self), key))
         if key is not None:
             self.keyboard.bind(key, call)
 
-    def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Live, float], Any]) -> None:
+    def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Self, float], object]) -> None:
         """Add a slider to viewers that are shown from now on; the function is called with the loop and the value.
 
         Raises:
@@ -68,7 +64,7 @@ class Interaction:
             raise ConfigError(f"expected low <= value <= high of slider {name!r}, got {low!r}, {value!r}, {high!r}")
         if name in self.values:
             raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
-        self.controls.append(Slider(name, low, high, value, call))
+        self.controls.append(Slider(name, low, high, value, partial(call, self)))
         self.values[name] = float(value)
 
     def set_value(self, name: str, value: float) -> None:
@@ -81,7 +77,7 @@ class Interaction:
         if found is None or not np.isfinite(value):
             raise ConfigError(f"expected a slider of {list(self.values)} and a finite value, got {name!r}, {value!r}")
         self.values[name] = float(np.clip(value, found.low, found.high))
-        found.call(cast("Live", self), self.values[name])
+        found.call(self.values[name])
 
     @property
     def control_lines(self) -> tuple[str, ...]:
@@ -121,6 +117,11 @@ class Interaction:
             )
         self.selected, self._followed = (int(world), int(drone)), None
 
+    def select_next(self) -> None:
+        """Select the next drone of the selected world."""
+        world, drone = self.selected or (0, -1)
+        self.select(world, (drone + 1) % self.sim.n_drones)
+
     @property
     def followed(self) -> tuple[int, str, int] | None:
         """World, kind and index of the body that viewers mark and follow: the selected drone, or that of ``follow``."""
@@ -156,44 +157,8 @@ class Interaction:
             point: Point, world frame, m. (3,)
         """
         if self.on_click is not None:
-            self.on_click(self, world, point)  # type: ignore[arg-type]  # mixed into Live
+            self.on_click(self, world, point)
 
-    def post(self, call: Callable[[Live], Any]) -> None:
+    def post(self, call: Callable[[Self], object]) -> None:
         """Let the loop call a function between two steps; may be called from any thread."""
         self._posted.append(call)
-
-
-KEY_TURN = 0.05
-"""Part of a slider's range by which a key moves it."""
-
-
-def _toggle(live: Live) -> None:
-    live.paused = not live.paused
-
-
-def _scale(factor: float) -> Callable[[Live], None]:
-    def call(live: Live) -> None:
-        live.speed = factor * (1.0 if live.speed == "max" else live.speed)
-
-    return call
-
-
-def _select_next(live: Live) -> None:
-    world, drone = live.selected or (0, -1)
-    live.select(world, (drone + 1) % live.sim.n_drones)
-
-
-BINDINGS: dict[str, Callable[[Live], Any]] = {
-    "space": _toggle,
-    ".": lambda live: live.advance(),
-    "backspace": lambda live: live.reset(),
-    "tab": _select_next,
-    "+": _scale(2.0),
-    "-": _scale(0.5),
-    "r": lambda live: live.toggle_recording(),
-    "[": lambda live: live.turn(-KEY_TURN),
-    "]": lambda live: live.turn(KEY_TURN),
-    "'": lambda live: live.choose_next_slider(),
-    "escape": lambda live: live.stop(),
-}
-"""Keys that every live simulation has, and the functions that they call."""

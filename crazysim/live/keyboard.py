@@ -6,25 +6,27 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Generic, TypeVar
 
 from crazysim.errors import ConfigError
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
+L = TypeVar("L")
 
 NAMES = ("up", "down", "left", "right", "space", "tab", "backspace", "escape", "enter")
 """Names of keys that are not characters."""
 
 
-class Keyboard:
-    """Keys by name: a lower-case character, or one of ``NAMES``. Viewers press and release them from any thread."""
+class Keyboard(Generic[L]):
+    """Keys by name: a lower-case character, or one of ``NAMES``. Viewers press and release them from any thread.
+
+    ``L`` is the loop whose functions they call.
+    """
 
     def __init__(self) -> None:
         """Begin with all keys released and without functions."""
         self._held: dict[str, float] = {}
         self._pressed: deque[str] = deque(maxlen=100)
-        self._calls: dict[str, Callable[[Live], Any]] = {}
+        self._calls: dict[str, Callable[[L], object]] = {}
 
     def press(self, key: str) -> None:
         """Note that a key is pressed."""
@@ -51,7 +53,7 @@ class Keyboard:
         """Return 1, -1 or 0 for two opposite keys."""
         return float(self.is_held(positive)) - float(self.is_held(negative))
 
-    def bind(self, key: str, call: Callable[[Live], Any]) -> None:
+    def bind(self, key: str, call: Callable[[L], object]) -> None:
         """Let a key call a function of the loop when it is pressed, in place of what it did before.
 
         Raises:
@@ -61,7 +63,7 @@ class Keyboard:
             raise ConfigError(f"expected a lower-case character or one of {', '.join(NAMES)} as a key, got {key!r}")
         self._calls[key] = call
 
-    def run(self, live: Live) -> None:
+    def run(self, live: L) -> None:
         """Call the functions of the keys that were pressed since the last call."""
         while self._pressed:
             call = self._calls.get(self._pressed.popleft())

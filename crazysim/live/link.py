@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
-from crazysim.live.mocap.frames import rotate
+from crazysim.live.attitude import rotate
 from crazysim.live.swarm import DroneState, Swarm
 
 
@@ -109,7 +109,9 @@ class TrainedPolicy:
     ``crazysim.train.load_policy`` returns the policy and its ``meta``, whose actions name the level of its commands.
     """
 
-    def __init__(self, policy: Callable[[dict[str, Any]], Any], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)):
+    def __init__(
+        self, policy: Callable[[dict[str, NDArray]], ArrayLike], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)
+    ):
         """Check that the observations follow from a drone's state.
 
         Args:

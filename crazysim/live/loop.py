@@ -6,9 +6,10 @@ import contextlib
 import logging
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import perf_counter, sleep
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -22,7 +23,6 @@ from crazysim.live.interaction import Interaction
 from crazysim.live.pace import LiveReport, Pace, Speed, undisturbed
 from crazysim.live.process import Event, OnError, Process, RateLimit, period_of
 from crazysim.live.recordings import Recordings
-from crazysim.live.run_report import make_report
 from crazysim.live.staging import StagedCommands
 from crazysim.live.viewer import Viewer
 from crazysim.live.viewers import Viewers
@@ -35,7 +35,7 @@ ALARM = 0.02
 ALARM_PERIOD = 10.0
 """Time from one such warning to the next, s."""
 
-V = TypeVar("V", bound=Viewer)
+V = TypeVar("V", bound="Viewer[Live]")
 log = logging.getLogger(__name__)
 
 
@@ -96,12 +96,14 @@ class Live(Interaction, Closing):
         self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
         self._processes: list[Process] = []
         self._events: dict[int, list[Event]] = defaultdict(list)
-        self._viewers = Viewers(fps)
-        self._recordings = Recordings()
+        self._viewers = Viewers[Live](fps, self.stop)
+        self._recordings = Recordings(sim, control_freq)
         self._paused = self._stopped = self._in_step = False
         self._refused = 0
         self._factor = (perf_counter(), 0, 0.0)
         self._may_warn = RateLimit(ALARM_PERIOD)
+        for key, call in KEYS.items():
+            self.keyboard.bind(key, call)
 
     # Time -----------------------------------------------------------------------------------------------------------
 
@@ -128,6 +130,10 @@ class Live(Interaction, Closing):
     def paused(self, paused: bool) -> None:
         self._paused = bool(paused)
         self._pace.restart()
+
+    def toggle_pause(self) -> None:
+        """Pause, or continue."""
+        self.paused = not self.paused
 
     def advance(self, n_steps: int = 1) -> None:
         """Advance by control steps as fast as possible, even while paused: the single step of a paused simulation."""
@@ -163,7 +169,7 @@ class Live(Interaction, Closing):
 
     def add(
         self,
-        process: Callable[[Live], Any],
+        process: Callable[[Live], object],
         freq: float | None = None,
         name: str | None = None,
         on_error: OnError = "raise",
@@ -185,10 +191,12 @@ class Live(Interaction, Closing):
         if on_error not in ("raise", "report"):
             raise ConfigError(f"expected on_error 'raise' or 'report', got {on_error!r}")
         label = str(name or getattr(process, "__name__", type(process).__name__))
-        self._processes.append(Process(label, process, period_of(freq, self.control_freq, label), on_error))
+        period = period_of(freq, self.control_freq, label)
+        reset = getattr(process, "reset", lambda _: None)
+        self._processes.append(Process(label, partial(process, self), partial(reset, self), period, on_error))
         return self._processes[-1]
 
-    def at(self, time: float, call: Callable[[Live], Any], name: str | None = None) -> None:
+    def at(self, time: float, call: Callable[[Live], object], name: str | None = None) -> None:
         """Call a function of the loop once the simulation reaches a time, again after every reset.
 
         Raises:
@@ -197,7 +205,7 @@ class Live(Interaction, Closing):
         step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
         if step < self.step:
             raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
-        self._events[step].append(Event(step, call, name or getattr(call, "__name__", "event")))
+        self._events[step].append(Event(step, partial(call, self), name or getattr(call, "__name__", "event")))
 
     def show(self, viewer: V) -> V:
         """Show the simulation in a viewer, and return that; ``run`` ends when all viewers have been closed.
@@ -223,7 +231,7 @@ class Live(Interaction, Closing):
         Raises:
             ConfigError: If the file cannot be created, or the rate is invalid.
         """
-        return self._recordings.start(self, path, period_of(freq, self.control_freq, "recording"))
+        return self._recordings.start(path, period_of(freq, self.control_freq, "recording"))
 
     @property
     def is_recording(self) -> bool:
@@ -267,7 +275,7 @@ class Live(Interaction, Closing):
         simulated = (self.flown - first) * self._dt
         failures = self._refused + self._viewers.failures + self._recordings.failures
         drawn = self._viewers.n_pictures - pictures
-        return make_report(self._pace, self._processes, simulated, wall, drawn, failures)
+        return self._pace.report(self._processes, simulated, wall, drawn, failures)
 
     def close(self) -> None:
         """Finish the recording and close the viewers."""
@@ -317,17 +325,17 @@ class Live(Interaction, Closing):
                 self._history.add(Snapshot(self.step, self.sim.data, self._commands.copy()))
             for process in self._processes:
                 if self.step % process.period == 0:
-                    process.run(self)
+                    process.run(self.time)
             for event in self._events.get(self.step, ()):
                 log.info("%s at %.2f s", event.name, self.time)
-                event.call(self)
+                event.call()
             self._commands.stage()
             self.sim.step(self.n_substeps)
         finally:
             self._in_step = False
         self.step += 1
         self.flown += 1
-        self._recordings.add(self)
+        self._recordings.add()
 
     def _run_posted(self) -> None:
         try:
@@ -338,7 +346,7 @@ class Live(Interaction, Closing):
             self._refused += 1
             log.warning("refused at %.2f s: %s", self.time, error)
 
-    def _between_steps(self, call: Callable[[Live], Any]) -> None:
+    def _between_steps(self, call: Callable[[Live], object]) -> None:
         """Call a function now, or after the control step that is under way."""
         if self._in_step:
             self.post(call)
@@ -372,7 +380,7 @@ class Live(Interaction, Closing):
 
     def _jumped(self) -> None:
         for process in self._processes:
-            process.reset(self)
+            process.reset()
         self._pace.restart()
 
     def _warm_up(self) -> None:
@@ -384,3 +392,30 @@ class Live(Interaction, Closing):
         self.sim.data = data
         self._viewers.update(self)
         self._viewers.next_at = perf_counter()
+
+
+KEY_TURN = 0.05
+"""Part of a slider's range by which a key moves it."""
+
+
+def _scale(factor: float) -> Callable[[Live], None]:
+    def call(live: Live) -> None:
+        live.speed = factor * (1.0 if live.speed == "max" else live.speed)
+
+    return call
+
+
+KEYS: dict[str, Callable[[Live], object]] = {
+    "space": Live.toggle_pause,
+    ".": Live.advance,
+    "backspace": Live.reset,
+    "tab": Live.select_next,
+    "+": _scale(2.0),
+    "-": _scale(0.5),
+    "r": Live.toggle_recording,
+    "[": lambda live: live.turn(-KEY_TURN),
+    "]": lambda live: live.turn(KEY_TURN),
+    "'": Live.choose_next_slider,
+    "escape": Live.stop,
+}
+"""Keys that every live simulation has, and the functions that they call."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Literal
@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from crazysim.errors import ConfigError
+from crazysim.live.process import Process
 
 Speed = float | Literal["max"]
 """Simulated seconds per second, or ``"max"`` for as fast as possible."""
@@ -26,6 +27,8 @@ SWITCH_INTERVAL = 5e-4
 """Time after which another thread of Python gives way to the loop, s."""
 N_BINS = 5000
 """Number of their bins; the last one holds everything above."""
+LISTED = 3
+"""Most processes that a report lists."""
 
 
 def check_speed(speed: Speed) -> Speed:
@@ -166,6 +169,26 @@ class Pace:
             return 0.0
         k = int(np.searchsorted(np.cumsum(self._counts), part * total))
         return min((k + 1) * BIN, self.worst) if k < N_BINS - 1 else self.worst
+
+    def report(
+        self, processes: Sequence[Process], simulated_s: float, wall_s: float, pictures: int, failures: int
+    ) -> LiveReport:
+        """Return the figures of a run.
+
+        Args:
+            processes: Processes of the loop.
+            simulated_s: Simulated time, s.
+            wall_s: Time without pauses, s.
+            pictures: Number of pictures.
+            failures: Number of errors of viewers and recordings that were passed over.
+        """
+        longest = sorted(processes, key=lambda process: -process.longest)[:LISTED]
+        slowest = ", ".join(f"{p.name} {1e3 * p.longest:.1f} ms at {p.longest_at:.2f} s" for p in longest)
+        failures += sum(process.failures for process in processes)
+        return LiveReport(
+            simulated_s, wall_s, self.steps, self.late, self.quantile(0.999), self.worst, self.worst_at, self.lost,
+            pictures, slowest, failures,
+        )  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +12,13 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.core.stage import over_drones, over_worlds
+from crazysim.live.loop import Live
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.media.poses import mocap_poses
 from crazysim.plugins.effects.wind import WindData
 from crazysim.plugins.effects.wind_field import WindFieldData
 from crazysim.pytree import has_members, scopes
 from crazysim.sim.sim import Sim
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
 
 LIGHT_RADIUS = 0.06
 """Radius of the glow around a lit drone, m."""
@@ -174,5 +171,5 @@ def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
     return [(_path(path), scope, x) for (path, x), scope in named if getattr(x.dtype, "kind", "O") in "fiub"]
 
 
-def _path(path: Any) -> str:
+def _path(path: jax.tree_util.KeyPath) -> str:
     return ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
+from crazysim.live.attitude import from_yaw, yaw_of
+from crazysim.live.loop import Live
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
-
-Sticks = Callable[["Live"], NDArray]
+Sticks = Callable[[Live], NDArray]
 """Function of the loop that returns forward, left, up and turn left, each from -1 to 1. (4,)"""
 
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
@@ -133,18 +131,15 @@ def require_state_control(live: Live) -> None:
 
 def setpoint_of(command: NDArray) -> NDArray:
     """Return position, m, and yaw, rad, of a state command. (4,)"""
-    x, y, z, w = command[9:13]
-    return np.append(command[:3], np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    return np.append(command[:3], yaw_of(command[9:13]))
 
 
-def hold(command: NDArray, point: Any) -> None:
+def hold(command: NDArray, point: NDArray | Sequence[float]) -> None:
     """Write a setpoint at rest into a state command.
 
     Args:
         command: State command. (16,)
         point: Position, world frame, m, and yaw, rad. (4,)
     """
-    half = 0.5 * point[3]
     command[:] = 0.0
-    command[:3] = point[:3]
-    command[11:13] = np.sin(half), np.cos(half)
+    command[:3], command[9:13] = point[:3], from_yaw(point[3])

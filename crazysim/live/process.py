@@ -7,12 +7,9 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from crazysim.errors import ConfigError
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
 
 OnError = Literal["raise", "report"]
 """Reaction of the loop to an error of a process: end with it, or log it and continue."""
@@ -20,60 +17,6 @@ QUIET = 1.0
 """Least time between two log messages of one kind, s."""
 
 log = logging.getLogger(__name__)
-
-
-@dataclass
-class Process:
-    """A function that is called every so many control steps, with figures of its calls."""
-
-    name: str
-    """Name in messages."""
-    call: Callable[[Live], Any]
-    """The function; it must return at once, as the loop waits for it."""
-    period: int
-    """Control steps from one call to the next."""
-    on_error: OnError = "raise"
-    """``"raise"`` or ``"report"``."""
-    longest: float = 0.0
-    """Longest call, s."""
-    longest_at: float = 0.0
-    """Simulated time at which it began, s."""
-    failures: int = 0
-    """Number of errors that were reported."""
-    _reported: float = field(default=-QUIET, repr=False)
-
-    def run(self, live: Live) -> None:
-        """Call the function, and measure it."""
-        begin = time.perf_counter()
-        try:
-            self.call(live)
-        except Exception as error:
-            if self.on_error == "raise":
-                raise
-            self.failures += 1
-            if begin - self._reported >= QUIET:
-                self._reported = begin
-                log.warning("%s failed at %.3f s (%d in all): %s", self.name, live.time, self.failures, error)
-        took = time.perf_counter() - begin
-        if took > self.longest:
-            self.longest, self.longest_at = took, live.time
-
-    def reset(self, live: Live) -> None:
-        """Call the method ``reset`` of the function, if it has one, after a reset or a jump in time."""
-        if hasattr(self.call, "reset"):
-            self.call.reset(live)  # type: ignore[attr-defined]
-
-
-@dataclass(frozen=True)
-class Event:
-    """A function that is called once the simulation reaches a time."""
-
-    step: int
-    """Control step before which it is called."""
-    call: Callable[[Live], Any]
-    """The function."""
-    name: str
-    """Name in messages."""
 
 
 class RateLimit:
@@ -94,6 +37,56 @@ class RateLimit:
             return False
         self._last = now
         return True
+
+
+@dataclass
+class Process:
+    """A function that is called every so many control steps, with figures of its calls."""
+
+    name: str
+    """Name in messages."""
+    call: Callable[[], object]
+    """The function; it must return at once, as the loop waits for it."""
+    reset: Callable[[], object]
+    """Function that is called after a reset or a jump in time."""
+    period: int
+    """Control steps from one call to the next."""
+    on_error: OnError = "raise"
+    """``"raise"`` or ``"report"``."""
+    longest: float = 0.0
+    """Longest call, s."""
+    longest_at: float = 0.0
+    """Simulated time at which it began, s."""
+    failures: int = 0
+    """Number of errors that were reported."""
+    _may_warn: RateLimit = field(default_factory=RateLimit, repr=False)
+
+    def run(self, now: float) -> None:
+        """Call the function at a simulated time, s, and measure it."""
+        begin = time.perf_counter()
+        try:
+            self.call()
+        except Exception as error:
+            if self.on_error == "raise":
+                raise
+            self.failures += 1
+            if self._may_warn():
+                log.warning("%s failed at %.3f s (%d in all): %s", self.name, now, self.failures, error)
+        took = time.perf_counter() - begin
+        if took > self.longest:
+            self.longest, self.longest_at = took, now
+
+
+@dataclass(frozen=True)
+class Event:
+    """A function that is called once the simulation reaches a time."""
+
+    step: int
+    """Control step before which it is called."""
+    call: Callable[[], object]
+    """The function."""
+    name: str
+    """Name in messages."""
 
 
 def period_of(freq: float | None, control_freq: int, name: str) -> int:

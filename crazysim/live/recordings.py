@@ -5,56 +5,11 @@ from __future__ import annotations
 import logging
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crazysim.media.flight_recorder import Recorder
 from crazysim.sim.sim import Sim
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
-
 log = logging.getLogger(__name__)
-
-
-class LiveRecording:
-    """A file that poses are appended to."""
-
-    path: Path
-    """Path of the file."""
-
-    def __init__(self, sim: Sim, path: str | Path, period: int):
-        """Create the file.
-
-        Args:
-            sim: Simulation.
-            path: Path; numbered if it exists, so that no earlier recording is lost.
-            period: Control steps from one sample to the next.
-
-        Raises:
-            ConfigError: If it cannot be created.
-        """
-        self.path = free_path(Path(path))
-        self._recorder = Recorder(sim, path=self.path)
-        self._period = period
-        self._begin: int | None = None
-
-    def add(self, live: Live) -> bool:
-        """Write a sample if one is due, and return False if it cannot be written, as on a full disk."""
-        if self._begin is None:
-            self._begin = live.flown
-        flown = live.flown - self._begin
-        if flown % self._period:
-            return True
-        try:
-            self._recorder.add(flown / live.control_freq)
-        except OSError as error:
-            log.warning("recording %s ended at %.2f s: %s", self.path, live.time, error)
-            return False
-        return True
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._recorder.close()
 
 
 class Recordings:
@@ -65,43 +20,60 @@ class Recordings:
     failures: int
     """Number of recordings that ended because they could not be written."""
 
-    def __init__(self) -> None:
-        """Begin without a recording."""
+    def __init__(self, sim: Sim, control_freq: int):
+        """Begin without a recording.
+
+        Args:
+            sim: Simulation.
+            control_freq: Rate of control steps, Hz.
+        """
         self.last_path, self.failures = None, 0
-        self._open: LiveRecording | None = None
+        self._sim, self._control_freq = sim, control_freq
+        self._recorder: Recorder | None = None
 
     @property
     def is_open(self) -> bool:
         """True while a recording is being written."""
-        return self._open is not None
+        return self._recorder is not None
 
-    def start(self, live: Live, path: str | Path, period: int) -> Path:
-        """Finish the present recording, begin another, and return its path.
+    def start(self, path: str | Path, period: int) -> Path:
+        """Finish the present recording, begin another with a first sample, and return its path.
 
         Args:
-            live: Loop.
-            path: Path; numbered if it exists.
+            path: Path; numbered if it exists, so that no earlier recording is lost.
             period: Control steps from one sample to the next.
 
         Raises:
             ConfigError: If it cannot be created.
         """
         self.close()
-        self._open, self.last_path = LiveRecording(live.sim, path, period), Path(path)
-        self._open.add(live)
-        return self._open.path
+        self.last_path, free = Path(path), free_path(Path(path))
+        self._recorder, self._period, self._steps = Recorder(self._sim, path=free), period, 0
+        self.add()
+        return free
 
-    def add(self, live: Live) -> None:
-        """Write a sample if one is due; a recording that cannot be written ends, and the flight continues."""
-        if self._open is not None and not self._open.add(live):
+    def add(self) -> None:
+        """Write a sample if one is due, at the start and after every control step.
+
+        A recording that cannot be written, as on a full disk, ends, and the flight continues.
+        """
+        if self._recorder is None:
+            return
+        step, self._steps = self._steps, self._steps + 1
+        if step % self._period:
+            return
+        try:
+            self._recorder.add(step / self._control_freq)
+        except OSError as error:
+            log.warning("recording %s ended after %.2f s: %s", self.last_path, step / self._control_freq, error)
             self.failures += 1
             self.close()
 
     def close(self) -> None:
         """Finish the recording, if there is one."""
-        if self._open is not None:
-            self._open.close()
-            self._open = None
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None
 
 
 def free_path(path: Path) -> Path:

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from crazysim.live.fleet import Fleet
+from crazysim.live.loop import Live
 from crazysim.live.server import CommandQueue
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
 
 
 class RemoteCommands:

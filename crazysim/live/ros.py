@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
-from crazysim.live.mocap.frames import rotate, to_rpy
+from crazysim.live.attitude import rotate, to_rpy
+from crazysim.live.loop import Live
 from crazysim.live.swarm import DroneState, Swarm
 
 MESSAGES = {
@@ -122,8 +123,8 @@ class RosBridge:
             ):
                 node.create_subscription(kind, f"/{name}/{topic}", self._guarded(k, take), DEPTH)
 
-    def __call__(self, live: Any) -> None:
-        """Publish, for a loop such as ``Live``."""
+    def __call__(self, live: Live) -> None:
+        """Publish, as a process of a live loop."""
         del live
         self.update()
 
@@ -143,7 +144,7 @@ class RosBridge:
             publishers["odom"].publish(self._odometry(stamp, state, self.swarm.names[k]))
             publishers["imu"].publish(self._imu(stamp, state, self.swarm.names[k]))
         if self._rows:
-            objects: Any = self.swarm.sim.data.objects
+            objects = self.swarm.sim.data.objects
             pos, quat = (np.asarray(x[0, 0], float) for x in (objects.pos, objects.quat))
             for name, row in self._rows.items():
                 self._of_objects[name].publish(self._pose_message(stamp, pos[row], quat[row]))
@@ -182,7 +183,7 @@ class RosBridge:
 
     # Commands -------------------------------------------------------------------------------------------------------
 
-    def _guarded(self, drone: int, take: Any) -> Any:
+    def _guarded(self, drone: int, take: Callable[[int, Any], None]) -> Callable[[Any], None]:
         """Return the callback of a subscription: a refused command is reported."""
 
         def callback(message: Any) -> None:

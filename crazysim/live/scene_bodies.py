@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.live.mocap.frames import rotate
+from crazysim.live.attitude import rotate
 from crazysim.scene.visual_geoms import VisualGeom
 from crazysim.sim.sim import Sim
 

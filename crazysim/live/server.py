@@ -12,8 +12,7 @@ import socket
 import socketserver
 import threading
 import time
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 from crazysim.closing import Closing
 from crazysim.errors import ConfigError
@@ -237,11 +236,11 @@ class _Listener(socketserver.ThreadingTCPServer):
 
     allow_reuse_address, daemon_threads, block_on_close = True, True, False
 
-    def __init__(self, address: tuple[str, int], serve: Any):
+    def __init__(self, address: tuple[str, int], serve: Callable[[socket.socket, str], None]):
         self._serve, self._n_peers = serve, threading.BoundedSemaphore(MAX_PEERS)
         super().__init__(address, socketserver.BaseRequestHandler)
 
-    def finish_request(self, request: Any, client_address: Any) -> None:
+    def finish_request(self, request: socket.socket, client_address: tuple[str, int]) -> None:
         name = f"{client_address[0]}:{client_address[1]}"
         if not self._n_peers.acquire(blocking=False):
             log.warning("%s refused: %d clients are connected already", name, MAX_PEERS)
@@ -254,7 +253,7 @@ class _Listener(socketserver.ThreadingTCPServer):
 
 
 @contextlib.contextmanager
-def _logged(name: str) -> Any:
+def _logged(name: str) -> Iterator[None]:
     """Log why a connection ends, in place of an error."""
     try:
         yield
@@ -265,7 +264,7 @@ def _logged(name: str) -> Any:
         log.warning("%s lost: %s", name, error)
 
 
-def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> Any:
+def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> Iterator[Message | Request | ShowFile]:
     """Yield the messages of a connection until it ends, or the server stops.
 
     Raises:

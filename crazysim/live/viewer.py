@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Generic, TypeVar
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
+L = TypeVar("L")
 
 
 @dataclass(frozen=True)
@@ -16,8 +15,8 @@ class Button:
 
     name: str
     """Text on the button."""
-    call: Callable[[Live], None]
-    """Function of the loop."""
+    call: Callable[[], object]
+    """Function."""
     key: str | None = None
     """Key that does the same; None for none."""
 
@@ -34,17 +33,17 @@ class Slider:
     """Greatest value."""
     value: float
     """Initial value."""
-    call: Callable[[Live, float], None]
-    """Function of the loop and the value."""
+    call: Callable[[float], object]
+    """Function of the value."""
 
 
 Control = Button | Slider
 
 
-class Viewer:
-    """Base of viewers. The loop calls the methods in its thread; they must not wait."""
+class Viewer(Generic[L]):
+    """Base of viewers of a loop ``L``, which calls the methods in its thread; they must not wait."""
 
-    def open(self, live: Live) -> None:
+    def open(self, live: L) -> None:
         """Show the simulation of a loop from now on, with the controls that it has.
 
         Raises:
@@ -52,7 +51,7 @@ class Viewer:
         """
         raise NotImplementedError
 
-    def update(self, live: Live) -> None:
+    def update(self, live: L) -> None:
         """Show the simulation as it is now."""
         raise NotImplementedError
 

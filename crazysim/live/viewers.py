@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Generic, TypeVar
 
 from crazysim.live.viewer import Viewer
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
+L = TypeVar("L")
 
 log = logging.getLogger(__name__)
 
 
-class Viewers:
+class Viewers(Generic[L]):
     """Open viewers, which get pictures at one rate; a viewer that fails is closed, and the others continue."""
 
     period: float
@@ -27,22 +27,24 @@ class Viewers:
     next_at: float
     """Time at which the next picture is due, s, by ``time.perf_counter``."""
 
-    def __init__(self, fps: float):
+    def __init__(self, fps: float, on_last_closed: Callable[[], object]):
         """Begin without viewers.
 
         Args:
             fps: Pictures per second.
+            on_last_closed: Function that is called when no viewer is left.
         """
         self.period = 1.0 / fps
         self.n_pictures = self.failures = 0
         self.next_at = 0.0
-        self._open: list[Viewer] = []
+        self._open: list[Viewer[L]] = []
+        self._on_last_closed = on_last_closed
 
     def __bool__(self) -> bool:
         """Return True if a viewer is open."""
         return bool(self._open)
 
-    def open(self, live: Live, viewer: Viewer) -> None:
+    def open(self, live: L, viewer: Viewer[L]) -> None:
         """Open a viewer.
 
         Raises:
@@ -51,7 +53,7 @@ class Viewers:
         viewer.open(live)
         self._open.append(viewer)
 
-    def draw(self, live: Live, due: float) -> bool:
+    def draw(self, live: L, due: float) -> bool:
         """Send a picture to every viewer if it is due, and return True if it was.
 
         Args:
@@ -65,8 +67,8 @@ class Viewers:
         self.update(live)
         return True
 
-    def update(self, live: Live) -> None:
-        """Send a picture to every viewer, remove those that are closed or fail, and stop the loop when none is left."""
+    def update(self, live: L) -> None:
+        """Send a picture to every viewer, and remove those that are closed or fail."""
         for viewer in list(self._open):
             try:
                 if viewer.is_open:
@@ -74,11 +76,11 @@ class Viewers:
                     continue
             except Exception as error:
                 self.failures += 1
-                log.warning("%s failed at %.2f s and is closed: %s", type(viewer).__name__, live.time, error)
+                log.warning("%s failed and is closed: %s", type(viewer).__name__, error)
             self._open = [other for other in self._open if other is not viewer]  # viewers can be equal
             viewer.close()
             if not self._open:
-                live.stop()
+                self._on_last_closed()
         self.n_pictures += bool(self._open)
 
     def close(self) -> None:

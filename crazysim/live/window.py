@@ -12,15 +12,16 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 import crazysim
 from crazysim.errors import ConfigError, RenderError
+from crazysim.live.loop import Live
 from crazysim.live.picture import Picture, PictureSource, quantities
 from crazysim.live.scene_bodies import SceneBodies
 from crazysim.live.viewer import Viewer
@@ -28,9 +29,6 @@ from crazysim.media.worlds import world_indices
 from crazysim.scene.render import camera_id, require_size
 from crazysim.scene.visual_geoms import visual_geoms
 from crazysim.scene.window import require_screen
-
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
 
 START = 60.0
 """Longest time until the window must be open, s."""
@@ -43,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass
-class Window(Viewer):
+class Window(Viewer[Live]):
     """Viewer in a window, ``live.show(Window())``; show several for several views.
 
     The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
@@ -61,7 +59,7 @@ class Window(Viewer):
     """Height, pixels."""
     camera: int | str = -1
     """Name or id of a camera; -1 is the free camera, which the mouse moves."""
-    cam_config: dict[str, Any] | None = None
+    cam_config: Mapping[str, ArrayLike] | None = None
     """Settings of the free camera at first: lookat, distance, azimuth, elevation."""
     follow: bool = False
     """True to let the free camera look at the followed body."""
@@ -183,7 +181,7 @@ def model_bytes(model: mujoco.MjModel) -> bytes:
     return buffer.tobytes()
 
 
-def _send(process: subprocess.Popen[bytes], message: Any) -> None:
+def _send(process: subprocess.Popen[bytes], message: object) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
     process.stdin.write(LENGTH.pack(len(content)) + content)
     process.stdin.flush()

@@ -8,7 +8,7 @@ import pickle
 import sys
 import threading
 import time
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TextIO
 
 import mujoco
 import numpy as np
@@ -89,7 +89,7 @@ class Leds:
 class Program:
     """Window, model and what is drawn into it."""
 
-    def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: Any):
+    def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: TextIO):
         """Open the window.
 
         Args:
@@ -211,7 +211,7 @@ class Program:
         else:
             self._say("click", world, point.tolist())
 
-    def _say(self, *message: Any) -> None:
+    def _say(self, *message: object) -> None:
         try:
             self._out.write(json.dumps(message) + "\n")
             self._out.flush()

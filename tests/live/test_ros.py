@@ -8,7 +8,7 @@ import pytest
 
 from crazysim import Sim, rotation
 from crazysim.errors import ConfigError
-from crazysim.live.mocap.frames import from_rpy
+from crazysim.live.attitude import from_rpy
 from crazysim.live.ros import MESSAGES, RosBridge, ros_messages
 from crazysim.live.swarm import Swarm
 

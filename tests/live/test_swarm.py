@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from crazysim import Sim
 from crazysim.control import Control
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.live.loop import Live
 from crazysim.live.paths import Path, paths_of
 from crazysim.live.swarm import Commander, DroneState, Swarm
 from crazysim.live.swarm.plan import Plan, move, nearest_yaw
@@ -343,14 +344,13 @@ def test_a_thread_flies_in_real_time(swarm):
     swarm.advance(0.1)
 
 
-def test_a_loop_calls_the_swarm(swarm):
-    class Loop:
-        sim = swarm.sim
-
-    swarm(Loop)
-    Loop.sim = None
+def test_a_loop_calls_the_swarm_and_shows_its_colours(swarm):
+    swarm.colors[0] = (1.0, 0.5, 0.0)
+    live = Live(swarm.sim)
+    swarm(live)
+    np.testing.assert_array_equal(live.lights[0], swarm.colors)
     with pytest.raises(ConfigError, match="that of another"):
-        swarm(Loop)
+        swarm(Live(Sim(control="state")))
 
 
 def test_wrong_swarms(swarm):

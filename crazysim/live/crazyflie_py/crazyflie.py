@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.live.attitude import from_yaw
 from crazysim.live.crazyflie_py.uav_trajectory import Trajectory
-from crazysim.live.mocap.frames import from_rpy
 from crazysim.live.swarm import Commander, Swarm
 from crazysim.live.swarm.parameters import SOLID
 from crazysim.live.swarm.sensors import battery_of
@@ -75,7 +75,7 @@ class Crazyflie:
         """Sink to a height, m, within a time, s, and stop the motors."""
         self._command(lambda c: c.land(targetHeight, duration), groupMask)
 
-    def goTo(self, goal: Any, yaw: float, duration: float, relative: bool = False, groupMask: int = 0) -> None:
+    def goTo(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, groupMask: int = 0) -> None:
         """Move to a position, m, and yaw, rad, within a time, s."""
         self._command(lambda c: c.go_to(goal, yaw, duration, relative), groupMask)
 
@@ -102,9 +102,9 @@ class Crazyflie:
         """Arm or disarm."""
         self._commander.arm(arm)
 
-    def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: Any, yaw: float, omega: Any) -> None:
+    def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, yaw: float, omega: ArrayLike) -> None:
         """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, yaw, rad, body rates, rad/s."""
-        self._command(lambda c: c.full_state(pos, vel, acc, from_rpy([0.0, 0.0, float(yaw)]), omega))
+        self._command(lambda c: c.full_state(pos, vel, acc, from_yaw(float(yaw)), omega))
 
     def cmdPosition(self, pos: ArrayLike, yaw: float = 0.0) -> None:
         """Stream a position, m, and yaw, rad."""
@@ -169,7 +169,7 @@ class Crazyflie:
             **dict.fromkeys(("num_rx_broadcast", "num_tx_broadcast", "num_rx_unicast", "num_tx_unicast"), 0),
         }
 
-    def _command(self, call: Any, group: int = 0) -> None:
+    def _command(self, call: Callable[[Commander], object], group: int = 0) -> None:
         """Carry out a command; a refused one is reported and the drone continues, as over the radio."""
         with self._swarm.lock:
             if not self._commander.in_group(group):
@@ -209,7 +209,7 @@ class CrazyflieServer:
         """Let all sink to a height, m, within a time, s, and stop their motors."""
         self._all(lambda cf: cf.land(targetHeight, duration, groupMask))
 
-    def goTo(self, goal: Any, yaw: float, duration: float, groupMask: int = 0) -> None:
+    def goTo(self, goal: ArrayLike, yaw: float, duration: float, groupMask: int = 0) -> None:
         """Move all by an offset, m, and turn them by an angle, rad, within a time, s."""
         self._all(lambda cf: cf.goTo(goal, yaw, duration, True, groupMask))
 
@@ -232,11 +232,11 @@ class CrazyflieServer:
         """Set a parameter of all."""
         self._all(lambda cf: cf.setParam(name, value))
 
-    def cmdFullState(self, pos: Sequence[float], vel: ArrayLike, acc: Any, yaw: float, omega: Any) -> None:
+    def cmdFullState(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, yaw: float, omega: ArrayLike) -> None:
         """Stream one state to all."""
         self._all(lambda cf: cf.cmdFullState(pos, vel, acc, yaw, omega))
 
-    def _all(self, call: Any) -> None:
+    def _all(self, call: Callable[[Crazyflie], object]) -> None:
         with self._swarm.lock:
             for cf in self.crazyflies:
                 call(cf)

@@ -53,7 +53,7 @@ def _driver(swarm: Swarm) -> type:
             super().__init__()
             self.needs_resending = False
             self._device: CrtpDevice | None = None
-            self._queue: queue.Queue[Any] = queue.Queue()
+            self._queue: queue.Queue[CRTPPacket] = queue.Queue()
 
         def connect(self, uri: str, *callbacks: Any) -> None:
             """Connect to ``sim://NAME``."""
@@ -63,13 +63,13 @@ def _driver(swarm: Swarm) -> type:
             self._device = CrtpDevice(swarm, parts.netloc)
             swarm.listeners.append(self._send_due)
 
-        def send_packet(self, pk: Any) -> None:
+        def send_packet(self, pk: CRTPPacket) -> None:
             """Hand a packet to the drone, and queue its answers."""
             if self._device is not None:
                 for answer in self._device.handle(bytes([pk.header, *pk.data])):
                     self._put(answer)
 
-        def receive_packet(self, wait: float = 0) -> Any:
+        def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
             """Return the next packet; None if there is none within a time, s."""
             try:
                 return self._queue.get(wait != 0, None if wait < 0 else wait)

@@ -6,15 +6,13 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from crazysim.errors import ConfigError
+from crazysim.live.swarm import Commander, DroneState, Swarm
 from crazysim.live.swarm.sensors import battery_of, ranges_of
-
-if TYPE_CHECKING:
-    from crazysim.live.swarm import Commander, DroneState, Swarm
 
 LOG_TYPES = {
     "uint8_t": (1, "<B"), "uint16_t": (2, "<H"), "uint32_t": (3, "<I"), "int8_t": (4, "<b"), "int16_t": (5, "<h"),
@@ -35,7 +33,7 @@ RANGES = {"down": "zrange"}
 GRAVITY = 9.81
 """Unit of log variables of acceleration, m/s^2."""
 
-Reading = Callable[["DroneState", "Commander"], float]
+Reading = Callable[[DroneState, Commander], float]
 """Value of a log variable of a drone."""
 
 

@@ -15,7 +15,6 @@ import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -69,9 +68,8 @@ class MotionCaptureSource(ThreadSource):
 
     def stream(self, stopped: threading.Event) -> Iterator[Frame]:
         """Yield the frames that the worker prints."""
-        output: Any = self._worker.stdout
         while not stopped.is_set():
-            line = output.readline(LINE)
+            line = self._worker.stdout.readline(LINE)
             if not line:
                 raise ConnectionError(f"the worker ended with code {self._worker.wait()}")
             message = json.loads(line)

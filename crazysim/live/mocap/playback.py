@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -44,7 +43,7 @@ class Playback(Plugin):
     """Attitudes, body to world, xyzw. (n_samples, n_objects, 4)"""
     freq: float
     """Samples per second, Hz."""
-    start: Any = 0.0
+    start: ArrayLike = 0.0
     """Time of the recording at the reset of a world, s. () or (n_worlds,)"""
     name: str = "playback"
 
@@ -93,7 +92,7 @@ class Playback(Plugin):
         share, k = at - before, before.astype(jnp.int32)
         pos, quat, vel = (x[k] + share * (x[k + 1] - x[k]) for x in (record.pos, record.quat, record.vel))
         quat = quat / jnp.sqrt(jnp.sum(quat * quat, axis=-1, keepdims=True))
-        objects: Any = data.objects
+        objects = data.objects
         rows = {handle.rows[0]: i for i, handle in enumerate(self.handles)}
 
         def placed(old: Array, new: Array) -> Array:

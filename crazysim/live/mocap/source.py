@@ -7,13 +7,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.live.mocap.frames import Convention, Frame, from_rpy
+from crazysim.live.attitude import from_yaw
+from crazysim.live.mocap.frames import Convention, Frame
 from crazysim.live.paths import paths_of
 from crazysim.trajectories import Trajectory
 
@@ -67,7 +69,7 @@ class FunctionSource(MocapSource):
 
     def __init__(
         self,
-        function: Callable[[float], Mapping[str, tuple[Any, Any]]],
+        function: Callable[[float], Mapping[str, tuple[ArrayLike, ArrayLike]]],
         freq: float = 120.0,
         convention: Convention | None = None,
         name: str = "function",
@@ -123,9 +125,9 @@ def show_source(
             f"vcf1, ..."
         )
 
-    def bodies(stamp: float) -> dict[str, tuple[Any, Any]]:
+    def bodies(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
         points = [path.at(stamp) for path in given]
-        return {n: (p[:3], from_rpy([0.0, 0.0, p[3]])) for n, p in zip(names, points, strict=True)}
+        return {n: (p[:3], from_yaw(p[3])) for n, p in zip(names, points, strict=True)}
 
     return FunctionSource(bodies, freq, name="show")
 

@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.closing import Closing
 from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.live.mocap.frames import from_rpy, multiply, rotate, to_rpy
+from crazysim.live.attitude import from_rpy, multiply, rotate, to_rpy
+from crazysim.live.loop import Live
 from crazysim.live.mocap.playback import Playback
 from crazysim.live.mocap.poll_recording import MocapRecorder
 from crazysim.live.mocap.source import MocapSource
@@ -141,8 +142,8 @@ class Twins(Closing):
         """Reports of the source and its bodies."""
         return self.tracker.reports
 
-    def __call__(self, live: Any) -> None:
-        """Update the simulation of a loop such as ``Live``, which has it as ``live.sim``."""
+    def __call__(self, live: Live) -> None:
+        """Update the simulation of a live loop."""
         self.update(live.sim)
 
     def update(self, sim: Sim) -> None:
@@ -182,7 +183,7 @@ class Twins(Closing):
         return tuple(x[k].copy() for x in self._poses)  # type: ignore[return-value]
 
     def playback(
-        self, source: MocapSource, seconds: float, freq: int = 100, start: Any = 0.0, name: str = "playback"
+        self, source: MocapSource, seconds: float, freq: int = 100, start: ArrayLike = 0.0, name: str = "playback"
     ) -> Playback:
         """Return a plugin that moves the objects within the compiled step, in every world, for ``sim.add``.
 
@@ -265,7 +266,7 @@ def discover(source: MocapSource, twins: Mapping[str, Twin], seconds: float = 1.
 
 
 @jax.jit
-def _written(old: tuple[Array, Array, Array], rows: Array, new: tuple[Any, Any, Any]) -> list[Array]:
+def _written(old: tuple[Array, Array, Array], rows: Array, new: tuple[NDArray, NDArray, NDArray]) -> list[Array]:
     """Return poses and velocities of all objects with some rows replaced in every world."""
     return [x.at[..., rows, :].set(jnp.asarray(y, x.dtype)) for x, y in zip(old, new, strict=True)]
 

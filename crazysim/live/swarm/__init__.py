@@ -2,6 +2,7 @@
 
 from crazysim.live.swarm.commander import Commander
 from crazysim.live.swarm.plan import Plan
-from crazysim.live.swarm.swarm import DroneState, Swarm
+from crazysim.live.swarm.state import DroneState
+from crazysim.live.swarm.swarm import Swarm
 
 __all__ = ["Commander", "DroneState", "Plan", "Swarm"]

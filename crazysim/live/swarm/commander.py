@@ -8,19 +8,17 @@ commander.h of crazyflie-firmware). Until the first command, and after landing, 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
+from crazysim.live.attitude import yaw_of
 from crazysim.live.paths import Path
 from crazysim.live.swarm.estimate import EstimateFrame
 from crazysim.live.swarm.plan import Plan, move, nearest_yaw
-
-if TYPE_CHECKING:
-    from crazysim.live.swarm.swarm import DroneState
+from crazysim.live.swarm.state import DroneState
 
 STABILIZE, SHUTDOWN = 0.5, 2.0
 """Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
@@ -113,7 +111,7 @@ class Commander:
         if relative:
             goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
         end = [*goal, nearest_yaw(begin[0, 3], yaw)]
-        self._start(Plan(move(begin, end, _duration(duration), linear), self.now))
+        self._plan = Plan(move(begin, end, _duration(duration), linear), self.now)
 
     def stop(self) -> None:
         """Stop the motors."""
@@ -175,7 +173,7 @@ class Commander:
             shift[:3] = begin[:3] - first[:3]
             if relative_yaw and identity not in self._compressed:
                 shift[3] = begin[3] - nearest_yaw(begin[3], first[3])
-        self._start(plan._replace(shift=shift))
+        self._plan = plan._replace(shift=shift)
 
     # Streamed setpoints ---------------------------------------------------------------------------------------------
 
@@ -305,7 +303,7 @@ class Commander:
         if self.control != Control.state:
             return self._streamed_attitude(kind, x, dt)
         if kind == "command":
-            self._last = np.array([[*x[:3], _yaw(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
+            self._last = np.array([[*x[:3], yaw_of(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
             self._reference = self._last[0].copy()
             return x
         rate = np.zeros(4)
@@ -335,9 +333,6 @@ class Commander:
         self._stream, self._stream_time, self._released, self._plan = (kind, values), self.now, math.inf, None
         self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
 
-    def _start(self, plan: Plan) -> None:
-        self._plan = plan
-
     def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
         self._require(Control.state)
         (height,) = _numbers("height", [height], 1)
@@ -347,7 +342,7 @@ class Commander:
         if yaw is not None:
             goal[3] = nearest_yaw(here[3], _numbers("yaw", [yaw], 1)[0])
         begin = np.array([here, np.zeros(4), np.zeros(4)])
-        self._start(Plan(move(begin, goal, _duration(duration)), self.now, lands=lands))
+        self._plan = Plan(move(begin, goal, _duration(duration)), self.now, lands=lands)
 
     def _require(self, level: Control) -> None:
         if self.locked or not self.armed:
@@ -361,7 +356,7 @@ class Commander:
             )
 
 
-def _numbers(name: str, values: Any, n: int, limit: float = FARTHEST) -> NDArray:
+def _numbers(name: str, values: ArrayLike, n: int, limit: float = FARTHEST) -> NDArray:
     """Return finite numbers within a limit. (n,)"""
     try:
         x = np.array(values, float)
@@ -383,8 +378,3 @@ def _state_command(point: NDArray, rate: NDArray, second: NDArray) -> NDArray:
     """Return the state command of position and yaw, their rates and second derivatives. (16,)"""
     half = point[3] / 2
     return np.array([*point[:3], *rate[:3], *second[:3], 0.0, 0.0, math.sin(half), math.cos(half), 0.0, 0.0, rate[3]])
-
-
-def _yaw(quat: NDArray) -> float:
-    x, y, z, w = quat
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

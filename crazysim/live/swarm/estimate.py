@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.control import Control
-from crazysim.live.mocap.frames import from_rpy, multiply, rotate
-
-if TYPE_CHECKING:
-    from crazysim.live.swarm.swarm import DroneState
+from crazysim.live.attitude import from_yaw, multiply, rotate
+from crazysim.live.swarm.state import DroneState
 
 
 class EstimateFrame(NamedTuple):
@@ -30,18 +28,18 @@ class EstimateFrame(NamedTuple):
     def from_pose(pos: NDArray, yaw: float, pose: NDArray) -> EstimateFrame:
         """Return the frame in which a drone at a position, m, and yaw, rad, of the world has a pose (4,)."""
         turn = float(pose[3]) - yaw
-        return EstimateFrame(turn, pose[:3] - rotate(_about_vertical(turn), pos))
+        return EstimateFrame(turn, pose[:3] - rotate(from_yaw(turn), pos))
 
     def state(self, state: DroneState) -> DroneState:
         """Return the state of a drone in this frame."""
-        quat = _about_vertical(self.turn)
+        quat = from_yaw(self.turn)
         return state._replace(
             pos=rotate(quat, state.pos) + self.shift, quat=multiply(quat, state.quat), vel=rotate(quat, state.vel)
         )
 
     def motion(self, pos: NDArray, vel: NDArray, yaw: float) -> tuple[NDArray, NDArray, float]:
         """Return position, m, velocity, m/s, and yaw, rad, in this frame."""
-        quat = _about_vertical(self.turn)
+        quat = from_yaw(self.turn)
         return rotate(quat, pos) + self.shift, rotate(quat, vel), yaw + self.turn
 
     def command(self, level: Control, command: NDArray) -> NDArray:
@@ -50,10 +48,6 @@ class EstimateFrame(NamedTuple):
             return command - [0.0, 0.0, self.turn, 0.0]
         if level != Control.state:
             return command
-        back = _about_vertical(-self.turn)
+        back = from_yaw(-self.turn)
         pos, vel, acc = (rotate(back, x) for x in (command[:3] - self.shift, command[3:6], command[6:9]))
         return np.concatenate([pos, vel, acc, multiply(back, command[9:13]), command[13:]])
-
-
-def _about_vertical(angle: float) -> NDArray:
-    return from_rpy([0.0, 0.0, angle])

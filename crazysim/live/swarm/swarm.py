@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,41 +14,18 @@ from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.live.mocap.frames import rotate, to_rpy
+from crazysim.live.attitude import from_yaw, rotate, to_rpy
+from crazysim.live.loop import Live
 from crazysim.live.mocap.source_events import Reports
 from crazysim.live.swarm.commander import Commander
 from crazysim.live.swarm.parameters import LIGHTS, Parameters, parameters_of
 from crazysim.live.swarm.sensors import ranges_of
+from crazysim.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
 from crazysim.sim.sim import Sim
 
-if TYPE_CHECKING:
-    from crazysim.live.loop import Live
-
 GRAVITY = 9.81
 """Standard acceleration of accelerometers' readings, m/s^2."""
-
-
-class DroneState(NamedTuple):
-    """State of one drone, simulated or real."""
-
-    time: float
-    """Time, s."""
-    pos: NDArray
-    """Position, world frame, m. (3,)"""
-    quat: NDArray
-    """Attitude, body to world, xyzw. (4,)"""
-    vel: NDArray
-    """Velocity, world frame, m/s. (3,)"""
-    ang_vel: NDArray
-    """Angular velocity, body frame, rad/s. (3,)"""
-    acc: NDArray
-    """Reading of the accelerometer, body frame, m/s^2: at rest it points up. (3,)"""
-
-    @property
-    def rpy(self) -> NDArray:
-        """Roll, pitch and yaw, rad. (3,)"""
-        return to_rpy(self.quat)
 
 
 class Swarm(Closing):
@@ -92,7 +68,7 @@ class Swarm(Closing):
         ranged = "front" in ranges_of(sim, 0)
         self.parameters = [Parameters(parameters_of(airframe, ranged)) for airframe in sim.airframes]
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
-        self.listeners: list[Callable[[], Any]] = []
+        self.listeners: list[Callable[[], object]] = []
         self._period = sim.freq // sim.control_freq
         self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
         self._motors = self._add_motors()
@@ -167,18 +143,15 @@ class Swarm(Closing):
 
     # Time -----------------------------------------------------------------------------------------------------------
 
-    def __call__(self, live: Any) -> None:
-        """Stage the commands in force, for a loop such as ``Live``, which has the simulation as ``live.sim``.
-
-        Viewers show the colours where the loop has ``lights``, as ``Live`` has.
+    def __call__(self, live: Live) -> None:
+        """Stage the commands in force, and let viewers show the colours.
 
         Raises:
             ConfigError: If it is another simulation.
         """
         self._check_loop(live)
         self.update()
-        if hasattr(live, "lights"):
-            live.lights[0] = self.colors
+        live.lights[0] = self.colors
 
     def run_in(self, live: Live) -> None:
         """Let ``advance`` and ``sleep`` run a live loop, with its speed and its viewers.
@@ -192,7 +165,7 @@ class Swarm(Closing):
         live.add(self, name="swarm")
         self._live = live
 
-    def _check_loop(self, live: Any) -> None:
+    def _check_loop(self, live: Live) -> None:
         if live.sim is not self.sim:
             raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
 
@@ -304,7 +277,7 @@ class Swarm(Closing):
             if found is not None:
                 command[0, k] = found
             elif sim.control == Control.state:
-                command[0, k, :3], command[0, k, 11:13] = state.pos, (np.sin(yaw / 2), np.cos(yaw / 2))
+                command[0, k, :3], command[0, k, 9:13] = state.pos, from_yaw(yaw)
         getattr(sim, f"{sim.control.value}_control")(command)
         if self._motors is not None and (on != self._on).any():
             self._on = on

@@ -7,6 +7,7 @@ import pytest
 
 from crazysim import ContactResponse, RangeFinder, Sim
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.live.attitude import from_rpy, rotate
 from crazysim.live.mocap import (
     Frame,
     FunctionSource,
@@ -20,7 +21,6 @@ from crazysim.live.mocap import (
     discover,
     twin_of,
 )
-from crazysim.live.mocap.frames import from_rpy, rotate
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 BOX = Twin("box", {"size": (0.2, 0.2, 0.2)})

@@ -1,0 +1,69 @@
+"""Attitudes on the host, in float64; quaternions are xyzw."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def rotate(quat: NDArray, vec: NDArray) -> NDArray:
+    """Return vectors turned by unit quaternions, xyzw. (..., 3)"""
+    axis, w = quat[..., :3], quat[..., 3:]
+    twice = 2 * _cross(axis, vec)
+    return vec + w * twice + _cross(axis, twice)
+
+
+def _cross(a: NDArray, b: NDArray) -> NDArray:
+    """Return cross products; ``np.cross`` takes five times as long for a few vectors. (..., 3)"""
+    return a.take(_NEXT, -1) * b.take(_AFTER, -1) - a.take(_AFTER, -1) * b.take(_NEXT, -1)
+
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+def multiply(p: NDArray, q: NDArray) -> NDArray:
+    """Return products of quaternions, xyzw: turn by ``q``, then by ``p``. (..., 4)"""
+    pv, pw, qv, qw = p[..., :3], p[..., 3:], q[..., :3], q[..., 3:]
+    vector = pw * qv + qw * pv + _cross(pv, qv)
+    return np.concatenate([vector, pw * qw - (pv * qv).sum(-1, keepdims=True)], axis=-1)
+
+
+def from_rpy(rpy: ArrayLike) -> NDArray:
+    """Return quaternions, xyzw, of roll, pitch and yaw, rad. (..., 4)"""
+    half = np.asarray(rpy, float) / 2
+    (sr, sp, sy), (cr, cp, cy) = (np.moveaxis(f(half), -1, 0) for f in (np.sin, np.cos))
+    return np.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ],
+        axis=-1,
+    )
+
+
+def to_rpy(quat: NDArray) -> NDArray:
+    """Return roll, pitch and yaw, rad, of unit quaternions, xyzw. (..., 3)
+
+    As :func:`crazysim.rotation.to_rpy`, which explains the formula.
+    """
+    x, y, z, w = np.moveaxis(np.asarray(quat, float), -1, 0)
+    half_sum, half_difference = np.arctan2(z + x, w - y), np.arctan2(z - x, w + y)
+    cos_pitch = np.hypot(1 - 2 * (y * y + z * z), 2 * (x * y + w * z))
+    pitch = np.arctan2(2 * (w * y - x * z), cos_pitch)
+    roll, yaw = (np.angle(np.exp(1j * angle)) for angle in (half_sum - half_difference, half_sum + half_difference))
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+def from_yaw(yaw: float) -> NDArray:
+    """Return the quaternion, xyzw, of a level body with a yaw, rad. (4,)"""
+    return np.array([0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)])
+
+
+def yaw_of(quat: NDArray) -> float:
+    """Return the yaw of a unit quaternion, xyzw, rad."""
+    x, y, z, w = quat
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
