@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,9 +19,7 @@ from crazysim.engine.passes.schedule import fuse
 from crazysim.engine.tools import symbolic
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.jaxcompat import is_key
-
-if TYPE_CHECKING:
-    from crazysim.sim.sim import Sim
+from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
 """First fields of every state vector: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""

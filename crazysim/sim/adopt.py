@@ -5,21 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jax.typing import DTypeLike
 
 from crazysim.core.airframes import AirframeSource
 from crazysim.core.population import Population
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.build import read_spec
-
-if TYPE_CHECKING:
-    from crazysim.sim.sim import Sim
 
 Kind = AirframeSource | type[Population]
 """An airframe, or a subclass of ``Population``."""
@@ -49,36 +45,44 @@ class Vehicle(NamedTuple):
     """Attitude, body to world, xyzw. (4,)"""
 
 
-def adopt(
-    kind_of_sim: type[Sim],
-    xml_path: str | Path,
-    n_worlds: int,
-    kinds: Mapping[str, Kind] | None,
-    settings: dict[str, Any],
-) -> Sim:
-    """Return a simulation with the vehicles of an MJCF; see ``Sim.from_mjcf``."""
+def read_vehicles(
+    xml_path: str | Path, kinds: Mapping[str, Kind]
+) -> tuple[mujoco.MjSpec, list[Vehicle], dict[type[Population], list[Vehicle]]]:
+    """Return the spec of an MJCF without its vehicles, its drones, and the members of each population.
+
+    Args:
+        xml_path: MJCF file.
+        kinds: Airframe or population by prefixes besides those of ``known_kinds``.
+
+    Raises:
+        UnknownNameError: If a prefix is unknown, with those that are known.
+        ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
+    """
     spec = read_spec(xml_path)
-    vehicles = take_vehicles(spec, known_kinds() | dict(kinds or {}))
-    drones = [v for v in vehicles if not _is_population(v.kind)]
+    vehicles = take_vehicles(spec, known_kinds() | dict(kinds))
+    populations: dict[type[Population], list[Vehicle]] = {}
+    for vehicle in vehicles:
+        if _is_population(vehicle.kind):
+            populations.setdefault(vehicle.kind, []).append(vehicle)
+    drones = [vehicle for vehicle in vehicles if not _is_population(vehicle.kind)]
     if not drones:
         raise ConfigError(
             f"expected at least one drone in {str(xml_path)!r}, such as a body 'Crazyflie_0' with a free joint, got "
             f"{[v.name for v in vehicles]}"
         )
-    sim = kind_of_sim(n_worlds, len(drones), [v.kind for v in drones], xml_path=spec, **settings)  # type: ignore[arg-type]
-    sim.drone_names = tuple([v.name for v in drones])
-    states = sim.data.states
-    pos, quat = (_in_worlds([getattr(v, name) for v in drones], n_worlds, states.pos.dtype) for name in ("pos", "quat"))
-    sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat))
-    for kind in dict.fromkeys(v.kind for v in vehicles if _is_population(v.kind)):
-        members = [v for v in vehicles if v.kind is kind]
-        plugin = sim.add(kind([v.name for v in members]))
-        poses = [
-            _in_worlds([getattr(v, name) for v in members], n_worlds, states.pos.dtype) for name in ("pos", "quat")
-        ]
-        sim.data = plugin.write(sim.data, plugin.with_poses(plugin.read(sim.data), *poses))
-    sim.build_default_data()
-    return sim
+    return spec, drones, populations
+
+
+def poses_of(vehicles: list[Vehicle], like: Array) -> tuple[Array, Array]:
+    """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4), of vehicles in all worlds.
+
+    Args:
+        vehicles: The vehicles.
+        like: An array of worlds, in whose type they are.
+    """
+    rows = [v.pos for v in vehicles], [v.quat for v in vehicles]
+    pos, quat = (jnp.asarray(np.broadcast_to(x, (like.shape[0], *np.shape(x))), like.dtype) for x in rows)
+    return pos, quat
 
 
 def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, Kind]) -> list[Vehicle]:
@@ -117,7 +121,3 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, Kind]) -> list[Vehicl
 
 def _is_population(kind: Kind) -> TypeGuard[type[Population]]:
     return isinstance(kind, type) and issubclass(kind, Population)
-
-
-def _in_worlds(rows: list[np.ndarray], n_worlds: int, dtype: DTypeLike) -> Array:
-    return jnp.asarray(np.broadcast_to(rows, (n_worlds, *np.shape(rows))), dtype)

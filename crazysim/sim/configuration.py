@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+from jax import Array
 from jax.sharding import Mesh
+from numpy.typing import ArrayLike
 
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
@@ -99,20 +101,20 @@ class Configuration:
 
     @staticmethod
     def create(
-        n_worlds: Any,
-        n_drones: Any,
+        n_worlds: int,
+        n_drones: int,
         drone: AirframeSource | Sequence[AirframeSource],
-        dynamics: Any,
-        control: Any,
-        integrator: Any,
-        freq: Any,
+        dynamics: Dynamics | str,
+        control: Control | str,
+        integrator: Integrator | str,
+        freq: int,
         rates: Mapping[Control, int | None],
         device: str | jax.Device,
         mesh: Mesh | None,
         engine: str,
         strict: bool,
-        controller: Any,
-        switch: Any = None,
+        controllers: str | Controller | Sequence[str | Controller],
+        switch: Callable[..., Array] | ArrayLike | None = None,
     ) -> Configuration:
         """Return the configuration for the arguments of ``Sim``, as users pass them.
 
@@ -127,7 +129,7 @@ class Configuration:
         airframes = load_airframes(drone, n_drones)
         for airframe in dict.fromkeys(airframes):
             require_support(airframe, dynamics)
-        controller = find_controller(controller, switch)
+        controller = find_controller(controllers, switch)
         if controller is not None:
             for each in controller.members:
                 check_flags(each)
@@ -142,20 +144,9 @@ class Configuration:
         for airframe in dict.fromkeys(airframes):
             require_freq(airframe, dynamics, freq)  # after the rates, which need a higher freq
         return Configuration(
-            n_worlds,
-            n_drones,
-            airframes,
-            dynamics,
-            control,
-            integrator,
-            freq,
-            freqs,
-            controller,
-            find_device(device),
-            mesh,
-            engine,
-            flag("strict", strict),
-        )
+            n_worlds, n_drones, airframes, dynamics, control, integrator, freq, freqs, controller, find_device(device),
+            mesh, engine, flag("strict", strict),
+        )  # fmt: skip
 
 
 def _described(n_worlds: int, n_drones: int, freq: int, control: Control, cascade: bool, fitted: bool) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,16 +13,19 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim import jaxcompat
+from crazysim.control import Control
 from crazysim.core import functional as F
-from crazysim.core.data import SimData, command_shape
+from crazysim.core.data import command_shape
 from crazysim.core.locking import locked
+from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
 from crazysim.eager import compiled, on_host
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.plugins.registry import PluginRegistry
 from crazysim.pytree import PyTree
 
-if TYPE_CHECKING:
-    from crazysim.sim.sim import Sim
+Stage = Callable[[Array | NDArray, Array | None], None]
+"""Stages a command of all drones, and its feedforward."""
 
 DRONE = "drone"
 """Population of the drones."""
@@ -34,10 +37,16 @@ class Member:
     Fields of the record, such as ``pos``, ``quat`` and ``vel``, are attributes. (n_worlds, ...) each
     """
 
-    def __init__(self, sim: Sim, name: str, population: str, index: int):
-        """Take the simulation, the name, the population and the index in it."""
-        self._sim, self.name, self.population, self.index = sim, name, population, index
-        self.lock = sim.lock
+    population: str
+    """Name of its population; ``"drone"`` for a drone."""
+
+    def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage: Stage):
+        """Take the simulation, the name, the index in the population, the population and the function that stages.
+
+        A ``plugin`` of None is for drones.
+        """
+        self._sim, self.name, self.index, self._plugin, self._stage = sim, name, index, plugin, stage
+        self.population, self.lock = DRONE if plugin is None else plugin.name, sim.lock
 
     def __getattr__(self, field: str) -> Array:
         """Return a field of the record. (n_worlds, ...)
@@ -65,7 +74,9 @@ class Member:
                     f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}."
                 )
             new[field] = self._with_checked_row(f"{field} of {self.name}", getattr(record, field), value)
-        self._sim.data = self._written(self._sim.data, record.replace(**new))
+        data, record = self._sim.data, record.replace(**new)
+        plugin = self._plugin
+        self._sim.data = data.replace(states=record) if plugin is None else plugin.write(data, record)
 
     @locked
     def command(self, command: ArrayLike) -> None:
@@ -77,24 +88,23 @@ class Member:
             ConfigError: If the population takes no commands.
             ValueError: If the command has another shape, or is NaN or infinite.
         """
-        sim, data = self._sim, self._sim.data
-        if self.population != DRONE:
-            plugin: Any = sim.plugins[self.population]
+        data, plugin = self._sim.data, self._plugin
+        if plugin is not None:
             if plugin.command_field is None:
                 raise ConfigError(f"expected a population that takes commands, got {self.population!r}, which does not")
             record = plugin.read(data)
             staged = self._with_checked_row(f"command of {self.name}", getattr(record, plugin.command_field), command)
-            sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
+            self._sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
             return
-        level: Any = data.controls
-        staged = level.rotor_vel if sim.control == "rotor_vel" else getattr(level, sim.control.value).staged_cmd
-        if sim.control == "rotor_vel":
-            command = self._for_rotors(command, command_shape(data, sim.control)[-1])
-        staged = self._with_checked_row(f"{sim.control.value} command of {self.name}", staged, command)
-        before, feedforward = getattr(level.state, "staged_feedforward", None), None
+        controls, level = data.controls, data.controls.mode
+        staged: Any = controls.rotor_vel if level == Control.rotor_vel else getattr(controls, level.value).staged_cmd
+        if level == Control.rotor_vel:
+            command = self._for_rotors(command, command_shape(data, level)[-1])
+        staged = self._with_checked_row(f"{level.value} command of {self.name}", staged, command)
+        before, feedforward = getattr(controls.state, "staged_feedforward", None), None
         if before is not None:  # that of the other drones stays
             feedforward = _with_row(before, self.index, _row(F.feedforward_of(staged), self.index))
-        sim._stepper.stage(staged, feedforward)
+        self._stage(staged, feedforward)
 
     def _for_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
         """Return rotor speeds with zeros for rotors that other drones of the simulation have."""
@@ -116,13 +126,7 @@ class Member:
         return _with_row(x, self.index, value)
 
     def _record(self) -> PyTree:
-        data = self._sim.data
-        return data.states if self.population == DRONE else self._sim.plugins[self.population].read(data)
-
-    def _written(self, data: SimData, record: PyTree) -> SimData:
-        if self.population == DRONE:
-            return data.replace(states=record)
-        return self._sim.plugins[self.population].write(data, record)
+        return self._sim.data.states if self._plugin is None else self._plugin.read(self._sim.data)
 
     def _fields(self) -> list[str]:
         record = self._record()
@@ -163,17 +167,17 @@ def _with_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Array
     return x.at[:, index].set(value)
 
 
-def find_member(sim: Sim, name: str) -> Member:
-    """Return the view of a drone or member.
+def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage: Stage) -> Member:
+    """Return the view of a drone or member of a population among the plugins.
 
     Raises:
         UnknownNameError: If there is none of that name, with those that are probably meant.
     """
-    if name in sim.drone_names:
-        return Member(sim, name, DRONE, sim.drone_names.index(name))
-    for plugin in sim.plugins.values():
+    if name in (drones := sim.names[: sim.n_drones]):
+        return Member(sim, name, drones.index(name), None, stage)
+    for plugin in plugins.values():
         if isinstance(plugin, Population) and name in plugin.names:
-            return Member(sim, name, plugin.name, plugin.names.index(name))
+            return Member(sim, name, plugin.names.index(name), plugin, stage)
     raise UnknownNameError(f"expected the name of a drone or member, got {name!r}. {_suggestion(str(name), sim.names)}")
 
 

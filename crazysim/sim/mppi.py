@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.control import Control, Setpoint
@@ -109,7 +109,7 @@ class MPPI:
         *,
         knots: int = 10,
         freq: int | None = None,
-        noise: Any = None,
+        noise: ArrayLike | None = None,
         temperature: float = 0.05,
         cost: Cost = tracking_cost,
         seed: int = 0,
@@ -251,7 +251,7 @@ class MPPI:
                 f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
             )
 
-        def of_rollouts(scope: str, own: Any, x: Any) -> Any:
+        def of_rollouts(scope: str, own: Array, x: Array) -> Array:
             return self._repeat(x) if n_batch_axes(scope) == 2 else own if scope != "shared" else x
 
         leaves = [
@@ -274,7 +274,7 @@ class MPPI:
     def _command_stage(self, data: SimData) -> SimData:
         """Stage the command of the plan at this time."""
         command = self._planned(data, data.core.steps)
-        controls: Any = data.controls
+        controls = data.controls
         if controls.mode == Control.rotor_vel:
             return data.replace(controls=controls.replace(rotor_vel=command))
         level = controls.mode.value

@@ -45,7 +45,7 @@ from crazysim.scene.queries import SceneQueries
 from crazysim.scene.render import Viewer
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
-from crazysim.sim.adopt import Kind, adopt
+from crazysim.sim.adopt import Kind, poses_of, read_vehicles
 from crazysim.sim.built_pipeline import BuiltPipeline
 from crazysim.sim.configuration import Configuration
 from crazysim.sim.members import Member, find_member
@@ -140,21 +140,9 @@ class Sim:
         }
         self.lock = threading.RLock()
         self.configuration = c = Configuration.create(
-            n_worlds,
-            n_drones,
-            drone,
-            dynamics,
-            control,
-            integrator,
-            freq,
-            rates,
-            device,
-            mesh,
-            engine,
-            strict,
-            controller,
-            switch,
-        )
+            n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict,
+            controller, switch,
+        )  # fmt: skip
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
         self.airframes = c.airframes
@@ -195,7 +183,18 @@ class Sim:
             UnknownNameError: If a prefix is unknown, with those that are known.
             ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
         """
-        return adopt(cls, xml_path, n_worlds, kinds, settings)
+        spec, drones, populations = read_vehicles(xml_path, kinds or {})
+        sim = cls(n_worlds, len(drones), [v.kind for v in drones], xml_path=spec, **settings)  # type: ignore[arg-type]
+        sim.drone_names = tuple([v.name for v in drones])
+        states = sim.data.states
+        pos, quat = poses_of(drones, states.pos)
+        sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat))
+        for kind, members in populations.items():
+            plugin = sim.add(kind([v.name for v in members]))
+            record = plugin.with_poses(plugin.read(sim.data), *poses_of(members, states.pos))
+            sim.data = plugin.write(sim.data, record)
+        sim.build_default_data()
+        return sim
 
     @property
     def airframe(self) -> Airframe:
@@ -228,7 +227,7 @@ class Sim:
         Raises:
             UnknownNameError: If there is none of that name.
         """
-        return find_member(self, name)
+        return find_member(self, self.plugins, name, self._stepper.stage)  # type: ignore[arg-type]  # as in __init__
 
     # Data -------------------------------------------------------------------------------------------------------------
 
@@ -285,18 +284,11 @@ class Sim:
     @locked
     def build_data(self) -> SimData:
         """Return new data at rest, as at construction, with a new record of every plugin; make it the simulation's."""
+        c, freqs = self.configuration, dict(self.configuration.control_freqs)
         data = SimData.create(
-            self.n_worlds,
-            self.n_drones,
-            self.dynamics,
-            self.control,
-            self.airframes,
-            self.freq,
-            dict(self.configuration.control_freqs),
-            self._scene.drone_mocap_ids,
-            self._seed,
-            self.configuration.controller,
-        )
+            c.n_worlds, c.n_drones, c.dynamics, c.control, c.airframes, c.freq, freqs, self._scene.drone_mocap_ids,
+            self._seed, c.controller,
+        )  # fmt: skip
         self._stepper.assign(data.replace(objects=self._scene.objects(None)))
         self._scene.invalidate()
         self.plugins.build_records()
@@ -698,7 +690,7 @@ class Sim:
         mode: str = "human",
         world: int = 0,
         camera: int | str = -1,
-        cam_config: dict[str, Any] | None = None,
+        cam_config: Mapping[str, ArrayLike] | None = None,
         width: int = 1920,
         height: int = 1080,
     ) -> NDArray | tuple[NDArray, NDArray] | None:

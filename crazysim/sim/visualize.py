@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,9 +9,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.settings import as_rgba, flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.overlays import RED
-
-if TYPE_CHECKING:
-    from crazysim.sim.sim import Sim
+from crazysim.sim.sim import Sim
 
 
 def draw_line(
