@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +167,7 @@ def build(
             return of_worlds(data)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
 
-        def of_one(poses: Any) -> Hits:
+        def of_one(poses: MocapPoses) -> Hits:
             pos, quat, objects = jax.tree.map(lambda x: x[None], poses)
             states = data.states.replace(pos=pos, quat=quat)
             return jax.tree.map(lambda x: x[0], of_worlds(data.replace(states=states, objects=objects)))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError
@@ -43,7 +44,7 @@ def gate(width: float = 0.45, height: float = 0.45, bar: float = 0.05, stand: fl
     return geoms
 
 
-def box(size: Any = (0.2, 0.2, 0.2)) -> Geoms:
+def box(size: ArrayLike = (0.2, 0.2, 0.2)) -> Geoms:
     """Return a box around its origin; ``size`` gives its full lengths along x, y and z, m."""
     return [_box((0, 0, 0), np.asarray(size, float) / 2)]
 
@@ -71,8 +72,8 @@ def landing_pad(radius: float = 0.3, thickness: float = 0.02) -> Geoms:
     return [{"type": "cylinder", "size": (radius, thickness / 2), "pos": (0, 0, -thickness / 2)}]
 
 
-def _box(pos: Any, half: Any) -> dict[str, Any]:
-    return {"type": "box", "pos": tuple(pos), "size": tuple(half)}
+def _box(pos: Sequence[float], half: ArrayLike) -> dict[str, Any]:
+    return {"type": "box", "pos": tuple(pos), "size": tuple(np.asarray(half).tolist())}
 
 
 PRIMITIVES: dict[str, tuple[Callable[..., Geoms], tuple[float, ...]]] = {

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
@@ -187,7 +188,7 @@ class _Alike:
     numbers: list[int]
     """Number of each body in ``Hits.number``."""
 
-    def table(self, data: SimData, dtype: Any) -> Array:
+    def table(self, data: SimData, dtype: DTypeLike) -> Array:
         """Return position, rotation by rows if they are turned, and size of each. (n_worlds or 1, n_geoms, k)"""
         pos = np.array([geom.pos for geom in self.geoms])
         rot = np.array([np.eye(3) if geom.rot is None else geom.rot for geom in self.geoms])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from typing import Any
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -37,7 +37,7 @@ class Viewer:
         self,
         mode: str,
         camera: int | str,
-        cam_config: dict[str, Any] | None,
+        cam_config: Mapping[str, ArrayLike] | None,
         width: int,
         height: int,
         overlays: Overlays,
@@ -84,7 +84,7 @@ class Viewer:
         """Close the window and free the contexts."""
         _free(self._renderers, self._windows)
 
-    def _camera(self, camera: int | str, cam_config: dict[str, Any] | None) -> mujoco.MjvCamera:
+    def _camera(self, camera: int | str, cam_config: Mapping[str, ArrayLike] | None) -> mujoco.MjvCamera:
         cam = mujoco.MjvCamera()
         number = camera_id(self._model, camera)
         if number >= 0:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import jax
 import mujoco
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import positive
 from crazysim.scene.batch_render import BatchRenderer
@@ -36,7 +36,7 @@ class SceneRenderer:
         data: mujoco.MjData,
         mode: str,
         camera: int | str,
-        cam_config: dict[str, Any] | None,
+        cam_config: Mapping[str, ArrayLike] | None,
         width: int,
         height: int,
     ) -> NDArray | tuple[NDArray, NDArray] | None:

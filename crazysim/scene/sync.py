@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -54,7 +52,7 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
 
 
-def _poses(data: SimData) -> list[tuple[Any, Any, Any]]:
+def _poses(data: SimData) -> list[tuple[Array, Array, Array]]:
     """Return mocap ids, positions and attitudes of drones and of objects with handles."""
     owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
