@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 
 LONGEST = 60
 """Most characters of a value in a message."""
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Return a value for a message, at most ``LONGEST`` characters of it."""
     try:
         text = repr(value) if not isinstance(value, (list, dict)) or len(value) < LONGEST else _kind(value)
@@ -19,7 +17,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
-def _kind(value: Any) -> str:
+def _kind(value: object) -> str:
     return f"a {type(value).__name__}"
 
 

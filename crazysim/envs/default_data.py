@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.population import populations
@@ -19,15 +18,15 @@ _AXES = {"drone": (0, 1), "world": (0,)}
 def compact(data: SimData) -> SimData:
     """Return the data with one world and drone in place of all where they are alike, as arrays of the host."""
 
-    def one(scope: str, x: Any) -> Any:
+    def one(scope: str, x: Array) -> Array | np.ndarray:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             return x
-        x = np.asarray(x)
+        host = np.asarray(x)
         for axis in _AXES.get(scope, (0,) if has_members(scope) else ()):
-            first = x.take([0], axis)
-            if np.array_equal(x, np.broadcast_to(first, x.shape)):
-                x = first
-        return x
+            first = host.take([0], axis)
+            if np.array_equal(host, np.broadcast_to(first, host.shape)):
+                host = first
+        return host
 
     return jax.tree.map(one, scopes(data), data)
 
@@ -36,7 +35,7 @@ def spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
     """Return compacted data with all worlds and drones."""
     shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
 
-    def all_of(scope: str, x: Any) -> Any:
+    def all_of(scope: str, x: Array) -> Array:
         shape = shapes.get(scope, (n_worlds,) if has_members(scope) else ())
         return jnp.broadcast_to(x, (*shape, *x.shape[len(shape) :])) if shape else x
 

@@ -311,7 +311,7 @@ class DroneEnv(Env):
     def default_of_world(self, data: SimData) -> SimData:
         """Return the data of one world that an episode begins from, where worlds do not differ in that."""
 
-        def one(scope: str, x: Any) -> Any:
+        def one(scope: str, x: Array) -> Array:
             return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
 
         return with_own(jax.tree.map(one, scopes(self._default), self._default), data)

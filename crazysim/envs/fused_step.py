@@ -30,6 +30,8 @@ ACTION, OVER = "action of this step", "over"
 """Names of arrays that no state has."""
 OUTPUTS = (".obs", ".reward", ".terminated", ".truncated", ".info")
 """Prefixes of the names of what a step returns, and of which it reads the ends of episodes only."""
+Action = Array | jax.ShapeDtypeStruct
+"""An action, or its shape and type."""
 ENDS = (".terminated", ".truncated")
 """Names of outputs that the next step reads."""
 
@@ -57,7 +59,14 @@ class PackedState(NamedTuple):
 class FusedEnvStep:
     """``step(state, action) -> state`` of an environment as one kernel, for states of one structure."""
 
-    def __init__(self, env: Env, policy: ResetPolicy | None, state: EnvState, action: Any, packed: bool = False):
+    def __init__(
+        self,
+        env: Env,
+        policy: ResetPolicy | None,
+        state: EnvState,
+        action: Action,
+        packed: bool = False,
+    ):
         """Trace and lower the step.
 
         Args:
@@ -192,7 +201,7 @@ class FusedEnvStep:
         core = state.data.core.replace(mjx_synced=jnp.asarray(False))
         return state.replace(data=state.data.replace(core=core))
 
-    def _rest(self, arrays: dict[str, Any], worlds: tuple[int, ...]) -> Rest:
+    def _rest(self, arrays: dict[str, Array], worlds: tuple[int, ...]) -> Rest:
         """Return arrays of all worlds, or of one, as rows; those that are not declared for drones are of worlds."""
         of_drones, of_worlds = {}, {}
         for name, x in arrays.items():
@@ -261,7 +270,7 @@ class _Layout:
         return self._treedef.unflatten([arrays[name] for name in self._names]).replace(data=data)
 
 
-def _kind(name: str, x: Any, declared: str) -> str:
+def _kind(name: str, x: jax.ShapeDtypeStruct, declared: str) -> str:
     """Return the scope of an array: as declared, but for entries of ``info``, which are of drones unless scalar."""
     return "drone" if declared == "batched" and name.startswith(".info") and x.ndim else declared
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from crazysim.envs.env import Env
 from crazysim.envs.registry import make
@@ -196,5 +197,5 @@ def make_parallel(task: str, render_mode: str | None = None, **options: Any) -> 
     return DroneParallelEnv(make(task, 1, **options), render_mode)
 
 
-def _box(shape: tuple[int, ...], limit: float, dtype: Any) -> gymnasium.spaces.Box:
+def _box(shape: tuple[int, ...], limit: float, dtype: DTypeLike) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-limit, limit, shape, jnp.dtype(dtype))

@@ -21,7 +21,7 @@ from crazysim.core.stage import over_worlds
 from crazysim.envs.actions import Actions
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
-from crazysim.envs.state import EnvState
+from crazysim.envs.state import EnvState, Obs
 from crazysim.envs.task import Task, total
 from crazysim.errors import ConfigError
 
@@ -123,7 +123,7 @@ class Phases:
             data = apply(wrapper.after_spawn, wrapper.batched)(data)
         data = _like(task, before, data)
 
-        def start(state: EnvState, obs: Any, info: Any) -> EnvState:
+        def start(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
             dtype = state.data.states.pos.dtype
             over = jnp.zeros((), bool)
             return state.replace(
@@ -141,7 +141,7 @@ class Phases:
             state = apply(wrapper.after_reset, wrapper.batched)(state)
         return state
 
-    def _observed(self, data: SimData) -> Any:
+    def _observed(self, data: SimData) -> Obs:
         """Return the observations of the task, of measured states if it is to get these."""
         return self.task.observe(data if self.measured is None else self.measured(data))
 

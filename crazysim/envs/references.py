@@ -16,7 +16,6 @@ import sys
 from collections.abc import Container
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError
@@ -126,7 +125,7 @@ def code_digest(reference: str) -> str:
     return ""
 
 
-def _is_task(x: Any) -> bool:
+def _is_task(x: object) -> bool:
     return inspect.isclass(x) and issubclass(x, Task) and x is not Task
 
 

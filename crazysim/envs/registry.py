@@ -186,7 +186,7 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
     )
 
 
-def _checked(task: Any) -> type[Task]:
+def _checked(task: object) -> type[Task]:
     """Return a class of tasks.
 
     Raises:

@@ -103,7 +103,7 @@ class _LeafSteps:
 
     def __init__(self, env: AutoReset, output: Output):
         self._env, self._output = env, output
-        self._leaves: list[Any] = []
+        self._leaves: list[Array] = []
         self.compiled: Any = None
 
     def hold(self, state: EnvState) -> None:
@@ -125,7 +125,7 @@ class _LeafSteps:
         """Return the function to compile, after finding out which leaves it writes."""
         treedef = self._treedef
 
-        def flat(leaves: list[Any], actions: ArrayLike) -> list[Any]:
+        def flat(leaves: list[Array], actions: ArrayLike) -> list[Array]:
             before = treedef.unflatten(leaves)
             state = self._env.step(before, jnp.asarray(actions).reshape(before.action.shape))
             after, same = jax.tree.flatten(bare(state).replace(obs={}))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.settings import check_flags
@@ -20,7 +20,7 @@ REQUIRED = ("spawn", "observe", "rewards", "terminated", "error")
 """Methods that every task defines."""
 
 
-def require_installed(sim: Sim, task: Any) -> None:
+def require_installed(sim: Sim, task: object) -> None:
     """Check that a task was installed in a simulation.
 
     Raises:
@@ -102,12 +102,12 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         )
 
 
-def _of_world(scope: str, x: Any) -> jax.ShapeDtypeStruct:
+def _of_world(scope: str, x: Array) -> jax.ShapeDtypeStruct:
     """Return shape and type of a leaf as functions of one world receive it."""
     return jax.ShapeDtypeStruct(x.shape[n_world_axes(scope) :], x.dtype)
 
 
-def _described(x: Any) -> str:
+def _described(x: object) -> str:
     if not hasattr(x, "shape"):
         return f"a {type(x).__name__}" if not isinstance(x, Mapping) else "an empty dict"
     return f"shape {x.shape} and type {x.dtype}"

@@ -24,7 +24,7 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.registry import PluginRegistry
 from crazysim.pytree import PyTree
 
-Stage = Callable[[Array | NDArray, Array | None], None]
+Stage = Callable[[Array | NDArray, Array | NDArray | None], None]
 """Stages a command of all drones, and its feedforward."""
 
 DRONE = "drone"

@@ -49,7 +49,7 @@ class Learner(PyTree):
 
     policy: Layers
     """Network from normalised observations to the action before tanh."""
-    optimizer: Any
+    optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
     """Mean and variance with which observations are normalised."""

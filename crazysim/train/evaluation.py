@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.env import Env
+from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
 from crazysim.train.networks import QUICK
@@ -26,15 +27,15 @@ TERM = "reward "
 class _FunctionPolicy(PyTree):
     """Policy given as a plain function, which is static for JAX."""
 
-    fn: Callable[[Any], Array] = static()
+    fn: Callable[[Obs], Array] = static()
     """Function from observations to actions."""
 
-    def __call__(self, obs: Any) -> Array:
+    def __call__(self, obs: Obs) -> Array:
         """Return the actions for observations."""
         return self.fn(obs)
 
 
-def as_tree(policy: Callable[[Any], Array]) -> Any:
+def as_tree(policy: Callable[[Obs], Array]) -> Any:
     """Return a policy as an argument of compiled functions."""
     return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
 
@@ -75,7 +76,7 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     return flight if env.succeeded(state) is None else flight | {"succeeded": done}
 
 
-def evaluate(env: Env, policy: Callable[[Any], Array], key: Array | None = None) -> dict[str, float]:
+def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None) -> dict[str, float]:
     """Return the success rate of a policy, its crash rate, its mean error and its mean return.
 
     A drone succeeds if its error stays below ``task.tolerance`` for the last ``task.hold`` seconds of the episode. A

@@ -38,6 +38,8 @@ COMMANDS: dict[Control, Sequence[str]] = {
     Control.force_torque: ("collective thrust, N", "torque about x, N m", "about y, N m", "about z, N m"),
 }
 """Components of a command with their units; a rotor command is one speed per rotor, rpm."""
+HostLayers = list[tuple[np.ndarray, np.ndarray]]
+"""Weights and biases of a network."""
 OPSET, IR_VERSION = 17, 8
 """Versions of ONNX operators and of the file format, of 2022, so that older runtimes can read the files."""
 
@@ -169,7 +171,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     return path
 
 
-def _numbers(policy: Policy, meta: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, list[tuple[Any, Any]]]:
+def _numbers(policy: Policy, meta: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, HostLayers]:
     """Return mean and standard deviation of the inputs, and the layers, as float32.
 
     Raises:
@@ -209,7 +211,7 @@ def _description(meta: Mapping[str, Any]) -> Iterator[str]:
         yield f"  [{i}] {unit} = {centre:.9g} + {scale:.9g} * action[{i}]"
 
 
-def _body(name: str, layers: Sequence[tuple[Any, Any]]) -> Iterator[str]:
+def _body(name: str, layers: HostLayers) -> Iterator[str]:
     """Yield the lines of the function's body."""
     n_obs = layers[0][0].shape[0]
     limit = _number(CLIP)
@@ -230,7 +232,7 @@ def _body(name: str, layers: Sequence[tuple[Any, Any]]) -> Iterator[str]:
         yield "}"
 
 
-def _number(x: Any) -> str:
+def _number(x: float) -> str:
     """Return a number as a C literal that is read back bit for bit: nine digits identify any float32."""
     text = f"{float(x):.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"

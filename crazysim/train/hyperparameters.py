@@ -36,7 +36,7 @@ def check_hyperparameters(config: Any) -> None:
         object.__setattr__(config, field.name, value)
 
 
-def _sizes(name: str, value: Any) -> tuple[int, ...]:
+def _sizes(name: str, value: object) -> tuple[int, ...]:
     if not isinstance(value, (list, tuple)):
         raise ConfigError(
             f"expected {name} as the sizes of the hidden layers, got {value!r}. Use for example [64, 64]."

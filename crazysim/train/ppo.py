@@ -66,7 +66,7 @@ class Learner(PyTree):
     """Logarithm of the standard deviation of the actions. (n_actions,)"""
     value: Layers
     """Network from normalised observations to the expected return."""
-    optimizer: Any
+    optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
     """Mean and variance with which observations are normalised."""

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.env import DroneEnv, Env
+from crazysim.envs.state import Obs
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
@@ -25,7 +26,7 @@ TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
 """Colour of the target of a drone, RGBA, and its least radius, m."""
 
 
-def plot_curve(curves: dict[str, Any], path: Path) -> None:
+def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     """Plot success, error and the terms of the reward over a training, as the evaluations found them.
 
     Args:
@@ -59,7 +60,7 @@ def plot_curve(curves: dict[str, Any], path: Path) -> None:
 
 
 def plot_episode(
-    env: Env, policy: Callable[[Any], Array], path: str | Path, key: Array | None = None
+    env: Env, policy: Callable[[Obs], Array], path: str | Path, key: Array | None = None
 ) -> dict[str, np.ndarray]:
     """Plot the terms of the reward and the error over an episode, means over all worlds, and return the terms.
 
@@ -125,7 +126,7 @@ def _save(figure: Any, path: Path) -> None:
     plt.close(figure)
 
 
-def read_curve(folder: Path) -> Any:
+def read_curve(folder: Path) -> list[dict[str, float]]:
     """Return the learning curve of a run, one point per evaluation.
 
     Raises:

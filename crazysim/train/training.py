@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 import crazysim
 from crazysim.cache import announced
@@ -26,7 +27,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.storage import replacing
-from crazysim.train import apg, checkpoint
+from crazysim.train import apg, checkpoint, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE, RECIPES, Recipe, TrainConfig
 from crazysim.train.evaluation import evaluate, outcome
 from crazysim.train.export import describe
@@ -34,6 +35,9 @@ from crazysim.train.networks import Policy
 
 CHECKPOINT, POLICY, CURVE = "checkpoint.npz", "policy.npz", "curve.json"
 """Names of the files of a run."""
+
+Learner = ppo.Learner | apg.Learner
+"""State of a training run."""
 
 
 @dataclass
@@ -100,7 +104,7 @@ def train(
     shapes = init.eval_shape(env, hyperparameters, key)
     _make_folder(folder)
 
-    def start() -> tuple[Any, dict[str, float]]:
+    def start() -> tuple[Learner, dict[str, float]]:
         if resume:
             learner = jax.device_put(checkpoint.restore(path, stored, shapes), base.sim.device)
         else:
@@ -128,7 +132,7 @@ def train(
     if done >= hyperparameters.iterations:
         log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
 
-    def record(learner: Any, metrics: dict[str, float] | None = None) -> dict[str, float]:
+    def record(learner: Learner, metrics: dict[str, float] | None = None) -> dict[str, float]:
         """Evaluate the policy, and write policy, learning curve and checkpoint."""
         iteration = int(learner.iteration)
         require_finite(finite, iteration)
@@ -143,7 +147,7 @@ def train(
             file.write(json.dumps(curve, indent=1).encode())
         return point
 
-    def require_finite(finite: Any, iteration: int) -> None:
+    def require_finite(finite: Array | bool, iteration: int) -> None:
         if not finite:
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
@@ -151,7 +155,7 @@ def train(
                 f"smaller learning_rate or max_grad_norm, with another --out."
             )
 
-    finite: Any = True
+    finite: Array | bool = True
     if not resume:
         record(learner, metrics)
     every = RECIPES.get(config.task, Recipe()).evaluate_every
@@ -179,7 +183,7 @@ def train(
     return TrainResult(folder, point, learner.as_policy(), eval_env)
 
 
-def _on_device(shapes: Any, device: jax.Device) -> Any:
+def _on_device(shapes: Learner, device: jax.Device) -> Learner:
     """Return the shapes with a device attached."""
     place = jax.sharding.SingleDeviceSharding(device)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)

@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import DTypeLike
 
 from crazysim import rotation
-from crazysim.core.data import SimData
+from crazysim.core.data import SimData, SimParams
 from crazysim.core.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
@@ -145,7 +145,7 @@ class Race(Task):
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight at the start, and gates and obstacles in their places."""
         course, n_drones, dtype = self.track, data.core.n_drones, data.states.pos.dtype
-        sizes: dict[str, Any] = {"start": (n_drones, 6)}
+        sizes: dict[str, int | tuple[int, ...]] = {"start": (n_drones, 6)}
         if self.level >= 1:
             sizes["inertia"] = (n_drones, 4)
         if self.level >= 2:
@@ -222,7 +222,7 @@ class Race(Task):
         with jax.ensure_compile_time_eval():  # an array, also while a step is traced
             return np.asarray(jax.jit(rotation.from_rpy)(host_array(self.track.gates_rpy, self.track.n_gates, 3)))
 
-    def _place(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Any]:
+    def _place(self, data: SimData, x: dict[str, Array]) -> tuple[SimData, Array]:
         """Return the data with gates and obstacles displaced from their nominal poses, and the start, m."""
         course, record, dtype = self.track, race_of(data), data.states.pos.dtype
         start, pos, quat, poles = course.start, course.gates_pos, self._gates_quat(), course.obstacles_pos
@@ -249,7 +249,7 @@ def _one_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
     sim.build_default_data()
 
 
-def _drawn(params: Any, shares: Array) -> Any:
+def _drawn(params: SimParams, shares: Array) -> SimParams:
     """Return parameters with other masses and inertias, from numbers in [-1, 1]. (n_drones, 4)"""
     mass = params.mass * (1 + MASS * shares[..., :1])
     root = jnp.sqrt(1 + INERTIA * shares[..., 1:])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,7 +100,7 @@ class TrackTrajectory(Task):
 
     def _derivatives(self, t: Array, order: int) -> list[Array]:
         """Return position, m, and its derivatives up to an order. (...) to (..., 3) each"""
-        evaluate: Any = functools.partial(self.trajectory.derivatives, order=order)
+        evaluate: Callable[[Array], list[Array]] = functools.partial(self.trajectory.derivatives, order=order)
         for _ in range(t.ndim):
             evaluate = jax.vmap(evaluate)
         return [x[..., :3] for x in evaluate(t)]

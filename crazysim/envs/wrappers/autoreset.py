@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from crazysim.core.settings import member
 from crazysim.core.sharding import beside
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.envs.env import Env, select_states
-from crazysim.envs.fused_step import FusedEnvStep
+from crazysim.envs.fused_step import Action, FusedEnvStep
 from crazysim.envs.reset_policy import POLICIES, AutoresetMode
 from crazysim.envs.state import EnvState, validate_action
 from crazysim.envs.wrappers.base import Wrapper
@@ -65,7 +65,7 @@ class AutoReset(Wrapper):
         fused, reason = self._fused_or_reason(state, state.action, packed=False)
         return f"not one kernel: {reason}" if fused is None else "one kernel"
 
-    def fused_step(self, state: EnvState, action: Any, packed: bool = False) -> FusedEnvStep | None:
+    def fused_step(self, state: EnvState, action: Action, packed: bool = False) -> FusedEnvStep | None:
         """Return the step as one kernel, or None; warn if the reason, which ``explain`` gives, is no documented limit.
 
         Args:
@@ -78,7 +78,7 @@ class AutoReset(Wrapper):
         """
         return self._fused_or_reason(state, action, packed)[0]
 
-    def _fused_or_reason(self, state: EnvState, action: Any, packed: bool) -> tuple[FusedEnvStep | None, str]:
+    def _fused_or_reason(self, state: EnvState, action: Action, packed: bool) -> tuple[FusedEnvStep | None, str]:
         """Return the step as one kernel, or None and the reason why there is none."""
         if (why := self.base.unfused) is not None:
             return None, why
