@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.contacts.drone_collisions import DroneCollisions
     from crazysim.plugins.contacts.response import ContactResponse
     from crazysim.plugins.contacts.terrain import Terrain
+    from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
     from crazysim.plugins.sensors.imu import IMU
@@ -61,6 +62,7 @@ __all__ = [
     "GroundEffect",
     "Hook",
     "Integrator",
+    "Kalman",
     "Latency",
     "Members",
     "MotionCapture",
@@ -103,6 +105,7 @@ __getattr__ = lazy(
         "FreeBodies": "crazysim.plugins.bodies",
         "Hook": "crazysim.plugins.payloads",
         "IMU": "crazysim.plugins.sensors.imu",
+        "Kalman": "crazysim.plugins.estimators.kalman",
         "MotionCapture": "crazysim.plugins.sensors.motion_capture",
         "MPPI": "crazysim.sim.mppi",
         "RotorJet": "crazysim.plugins.payloads",

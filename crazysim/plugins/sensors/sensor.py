@@ -140,7 +140,7 @@ class Sensor(Plugin):
             placements.append(Placement(begins, before=end, name=f"{self.name}_begin"))
         when = None if steps_between(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
         placements.append(Placement(Stage(self._take, "drone", when), before=end))
-        if self._longest:
+        if self.is_late:
             placements.append(Placement(Stage(self._deliver, "drone"), before=end, name=f"{self.name}_arrival"))
         return placements
 
@@ -174,6 +174,11 @@ class Sensor(Plugin):
     def interval(self, data: SimData) -> float:
         """Return the time between measurements, s."""
         return 1 / (self.freq or data.core.freq)
+
+    @property
+    def is_late(self) -> bool:
+        """True where measurements arrive after a delay."""
+        return bool(self._longest)
 
     @property
     def _longest(self) -> float:

@@ -1,0 +1,328 @@
+"""Extended Kalman filter with nine error states, as functions of one drone.
+
+The equations, constants and guards are those of the Crazyflie's firmware (kalman_core.c and the mm_*.c of
+bitcraze/crazyflie-firmware, commit 2a18fc29), whose sources are M. W. Mueller, M. Hamer and R. D'Andrea, Fusing
+ultra-wideband range measurements with accelerometers and rate gyroscopes for quadrocopter state estimation, ICRA 2015,
+and M. W. Mueller, M. Hehn and R. D'Andrea, Covariance correction step for Kalman filtering with an attitude, Journal of
+Guidance, Control, and Dynamics 40 (2017). The drag that the firmware can model is zero on Crazyflies, and left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.pytree import PyTree, leaf
+
+POS, VEL, ATT = (0, 1, 2), (3, 4, 5), (6, 7, 8)
+"""Rows of the errors of position, velocity and attitude."""
+N = 9
+"""Number of error states."""
+N_COV = N * (N + 1) // 2
+"""Number of different entries of a covariance."""
+MAX_COVARIANCE, MIN_VARIANCE = 100.0, 1e-6
+"""Bounds of a covariance and a variance (kalman_core.c)."""
+EPS = 1e-6
+"""Added to a norm that something is divided by (kalman_core.c)."""
+MAX_POS, MAX_VEL = 100.0, 10.0
+"""Bounds of coordinates, m, and of velocities, body frame, m/s, beyond which the filter has failed
+(kalman_supervisor.c)."""
+SMALL_ANGLE, LARGE_ANGLE = 1e-4, 10.0
+"""Smallest attitude error that is moved into the attitude, and the largest, rad (kalman_core.c)."""
+REVERSION = 0.001
+"""Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
+
+_UPPER = np.triu_indices(N)
+_PLACE = np.zeros((N, N), int)
+_PLACE[_UPPER] = np.arange(N_COV)
+_PLACE = np.maximum(_PLACE, _PLACE.T)
+
+
+class Estimate(PyTree):
+    """Estimate of one drone with its uncertainty."""
+
+    pos: Array = leaf("drone", 1)
+    """Position, world frame, m. (..., 3)"""
+    vel: Array = leaf("drone", 1)
+    """Velocity, body frame, m/s. (..., 3)"""
+    quat: Array = leaf("drone", 1)
+    """Attitude, body to world, xyzw. (..., 4)"""
+    att_error: Array = leaf("drone", 1)
+    """Attitude error that ``finalize`` moves into the attitude, body frame, rad. (..., 3)"""
+    cov: Array = leaf("drone", 1)
+    """Covariance of the errors of position, velocity and attitude: its upper triangle, row by row. (..., 45)"""
+
+
+def covariance(upper: Array) -> Array:
+    """Return a covariance from its upper triangle. (..., 9, 9)"""
+    return upper[..., _PLACE]
+
+
+def start(pos: Array, vel: Array, quat: Array, deviations: Sequence[Array | float]) -> Estimate:
+    """Return an estimate with independent errors.
+
+    Args:
+        pos: Position, world frame, m. (3,)
+        vel: Velocity, body frame, m/s. (3,)
+        quat: Attitude, body to world, unit, xyzw. (4,)
+        deviations: Standard deviations of the nine errors, m, m/s, rad. (9,)
+    """
+    variance = jnp.stack([jnp.asarray(d, pos.dtype) ** 2 for d in deviations])
+    return Estimate(pos, vel, quat, jnp.zeros_like(vel), jnp.diag(variance)[_UPPER])
+
+
+def predict(estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: Array | None = None) -> Estimate:
+    """Return the estimate after an interval, without process noise.
+
+    Args:
+        estimate: The estimate.
+        accel: Specific force, body frame, m/s^2. (3,)
+        gyro: Angular velocity, body frame, rad/s. (3,)
+        dt: Length of the interval, s.
+        resting: Attitude to which that of a drone on the ground is drawn, (4,); None in flight, where only the force
+            along the z axis of the body is used, as rotors can make no other.
+    """
+    pos, vel, quat = estimate.pos, estimate.vel, estimate.quat
+    rot, identity, angle = rotation.matrix(quat), jnp.eye(3, dtype=pos.dtype), dt * gyro
+    gravity = GRAVITY * rot[2]  # in the body frame
+
+    # The linearised step: rows of the errors of position, velocity and attitude.
+    to_pos = dt * rot
+    att_to_pos = -to_pos @ rotation.cross_matrix(vel)
+    keep_vel = identity - rotation.cross_matrix(angle)
+    att_to_vel = -dt * rotation.cross_matrix(gravity)
+    turn = _turn(0.5 * angle)
+    p = covariance(estimate.cov)
+    pos_rows = p[:3] + to_pos @ p[3:6] + att_to_pos @ p[6:]
+    vel_rows = keep_vel @ p[3:6] + att_to_vel @ p[6:]
+    rows = jnp.concatenate([pos_rows, vel_rows, turn @ p[6:]])
+    pos_columns = rows[:, :3] + rows[:, 3:6] @ to_pos.T + rows[:, 6:] @ att_to_pos.T
+    vel_columns = rows[:, 3:6] @ keep_vel.T + rows[:, 6:] @ att_to_vel.T
+    p = jnp.concatenate([pos_columns, vel_columns, rows[:, 6:] @ turn.T], axis=1)
+
+    force = rotation.along_z(accel[2]) if resting is None else accel
+    shift = dt * vel + 0.5 * dt**2 * force
+    pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY * dt**2], pos.dtype)
+    new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
+    return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=p[_UPPER])
+
+
+GRAVITY = 9.81
+"""Acceleration of gravity, m/s^2 (physicalConstants.h)."""
+
+
+def add_noise(estimate: Estimate, variances: Array) -> Estimate:
+    """Return the estimate with process noise: variances of the nine errors. (9,)"""
+    return estimate.replace(cov=_bounded(covariance(estimate.cov) + jnp.diag(variances)))
+
+
+def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after the measurement of one number.
+
+    Args:
+        estimate: The estimate.
+        rows: Errors that the measurement depends on.
+        h: Its derivatives with respect to them. (len(rows),)
+        error: The measurement minus what the estimate predicts. ()
+        deviation: Standard deviation of the measurement.
+    """
+    p, rows = covariance(estimate.cov), list(rows)
+    ph = p[:, rows] @ h
+    r = deviation * deviation
+    gain = ph / (jnp.dot(h, ph[jnp.asarray(rows)]) + r)
+    # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns of I - K H that belong to rows are not trivial.
+    left = jnp.eye(N, dtype=p.dtype)[:, rows] - gain[:, None] * h
+    others = np.setdiff1d(np.arange(N), rows)
+    keep = np.zeros((N, 1), bool)
+    keep[others] = True
+    p = jnp.where(keep, p, 0.0) + left @ p[jnp.asarray(rows)]
+    p = jnp.where(keep.T, p, 0.0) + p[:, rows] @ left.T
+    p = p + r * gain[:, None] * gain
+    step = error * gain
+    return estimate.replace(
+        pos=estimate.pos + step[:3],
+        vel=estimate.vel + step[3:6],
+        att_error=estimate.att_error + step[6:],
+        cov=_bounded(p),
+    )
+
+
+def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured position, world frame, m. (3,)"""
+    for k in POS:
+        estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], deviation)
+    return estimate
+
+
+def update_quat(estimate: Estimate, quat: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured attitude, body to world, unit, xyzw. (4,)"""
+    residual = rotation.multiply(rotation.conjugate(estimate.quat), quat)
+    error = 2 * residual[:3] / residual[3]
+    for k in range(3):
+        estimate = update(estimate, [ATT[k]], jnp.ones_like(quat[:1]), error[k], deviation)
+    return estimate
+
+
+def update_flow(
+    estimate: Estimate, rot: Array, flow: Array, gyro: Array, scale: Array, deviation: Array | float
+) -> Estimate:
+    """Return the estimate after a measured motion of the image of the ground.
+
+    Args:
+        estimate: The estimate.
+        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        flow: Motion of the image along x and y of the body, pixels. (2,)
+        gyro: Angular velocity, body frame, rad/s. (3,)
+        scale: Pixels by which the image moves at 1 rad/s. ()
+        deviation: Standard deviation of a motion, pixels.
+    """
+    for k, turn in ((0, -gyro[1]), (1, gyro[0])):
+        height = jnp.maximum(estimate.pos[2], LOWEST)
+        rate = rot[2, 2] / height
+        h = scale * jnp.stack([-estimate.vel[k] * rate / height, rate])
+        predicted = scale * (estimate.vel[k] * rate + turn)
+        estimate = update(estimate, [POS[2], VEL[k]], h, flow[k] - predicted, deviation)
+    return estimate
+
+
+LOWEST = 0.1
+"""Least height that the flow is predicted for, m (mm_flow.c)."""
+
+
+def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured distance to the floor, m; a drone tilted by 84 degrees measures none.
+
+    Args:
+        estimate: The estimate.
+        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        distance: Shortest distance within the cone of the sensor. ()
+        deviation: Standard deviation of the distance, m.
+    """
+    upright = rot[2, 2] > 0.1
+    cosine = jnp.where(upright, rot[2, 2], 1.0)
+    tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum(1 - cosine**2, 0.0)), cosine)
+    gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE, 0.0))
+    after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
+    return select(upright, after, estimate)
+
+
+HALF_CONE = 0.5 * 15 * math.pi / 180
+"""Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
+
+
+def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured distance, m, () to an anchor, world frame, m. (3,)"""
+    apart = estimate.pos - anchor
+    predicted = rotation.safe_norm(apart)
+    away = predicted > 0
+    direction = jnp.where(away, apart / jnp.where(away, predicted, 1.0), jnp.asarray([1.0, 0.0, 0.0], apart.dtype))
+    return update(estimate, POS, direction, distance - predicted[0], deviation)
+
+
+def update_difference(
+    estimate: Estimate, first: Array, second: Array, difference: Array, deviation: Array | float
+) -> Estimate:
+    """Return the estimate after a measured difference of distances to two anchors, m.
+
+    Args:
+        estimate: The estimate.
+        first: Position of the first anchor, world frame, m. (3,)
+        second: Position of the second anchor. (3,)
+        difference: Distance to the second minus distance to the first. ()
+        deviation: Standard deviation of the difference, m.
+    """
+    to_first, to_second = estimate.pos - first, estimate.pos - second
+    d_first, d_second = rotation.safe_norm(to_first), rotation.safe_norm(to_second)
+    away = (d_first > 0) & (d_second > 0)
+    h = to_second / jnp.where(away, d_second, 1.0) - to_first / jnp.where(away, d_first, 1.0)
+    after = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
+    return select(away[0], after, estimate)
+
+
+def update_sweep(
+    estimate: Estimate,
+    rot: Array,
+    sensor: Array,
+    station: tuple[Array, Array],
+    tilt: float,
+    angle: Array,
+    deviation: Array | float,
+) -> Estimate:
+    """Return the estimate after a measured angle of a light plane that sweeps over the drone.
+
+    Args:
+        estimate: The estimate.
+        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        sensor: Position of the sensor, body frame, m. (3,)
+        station: Position of the station, world frame, m, (3,) and its attitude, station to world, as a matrix. (3, 3)
+        tilt: Tilt of the plane, rad.
+        angle: The angle of the sweep, rad. ()
+        deviation: Standard deviation of the angle, rad.
+    """
+    place, frame = station
+    x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - place)
+    tangent, squared = math.tan(tilt), x * x + y * y
+    rest = squared - (z * tangent) ** 2
+    sees = rest > 1e-4
+    squared, rest = jnp.where(sees, squared, 1.0), jnp.where(sees, rest, 1.0)
+    ratio = jnp.where(sees, z * tangent, 0.0) / jnp.sqrt(squared)
+    predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt(1 - ratio**2))
+    q = tangent / jnp.sqrt(rest)
+    h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
+    return select(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
+
+
+def finalize(estimate: Estimate) -> Estimate:
+    """Return the estimate with its attitude error moved into the attitude."""
+    error, p = estimate.att_error, covariance(estimate.cov)
+    size = jnp.abs(error)
+    moves = jnp.any(size > SMALL_ANGLE) & jnp.all(size < LARGE_ANGLE)
+    turn = _turn(0.5 * jnp.where(moves, error, 0.0))
+    p = jnp.concatenate([p[:6], turn @ p[6:]])
+    p = jnp.concatenate([p[:, :6], p[:, 6:] @ turn.T], axis=1)
+    quat = jnp.where(moves, _turned(estimate.quat, error), estimate.quat)
+    return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=_bounded(p))
+
+
+def within_bounds(estimate: Estimate) -> Array:
+    """Return whether position and velocity are ones that the firmware takes for possible. ()"""
+    return jnp.all(jnp.abs(estimate.pos) <= MAX_POS) & jnp.all(jnp.abs(estimate.vel) <= MAX_VEL)
+
+
+def select(which: Array, one: Estimate, other: Estimate) -> Estimate:
+    """Return one estimate where a flag is set, and the other elsewhere."""
+    return Estimate(
+        *(jnp.where(which, getattr(one, f), getattr(other, f)) for f in ("pos", "vel", "quat", "att_error", "cov"))
+    )
+
+
+def _bounded(p: Array) -> Array:
+    """Return the upper triangle of a covariance made symmetric and bounded; NaN becomes the upper bound."""
+    upper = 0.5 * p[_UPPER] + 0.5 * p.T[_UPPER]
+    least = np.where(_UPPER[0] == _UPPER[1], MIN_VARIANCE, -np.inf)
+    return jnp.where(upper <= MAX_COVARIANCE, jnp.maximum(upper, least.astype(p.dtype)), MAX_COVARIANCE)
+
+
+def _turn(half: Array) -> Array:
+    """Return the rotation of the error of an attitude that turns by twice ``half``, to second order. (3, 3)"""
+    cross = rotation.cross_matrix(half)
+    return jnp.eye(3, dtype=half.dtype) - cross + 0.5 * (cross @ cross)
+
+
+def _turned(quat: Array, angle: Array, resting: Array | None = None) -> Array:
+    """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
+
+    A part of an attitude at rest is mixed in where one is given.
+    """
+    size = rotation.safe_norm(angle) + EPS
+    half = 0.5 * size
+    step = jnp.concatenate([jnp.sin(half) / size * angle, jnp.cos(half)])
+    quat = rotation.multiply(quat, step)
+    if resting is not None:
+        quat = (1 - REVERSION) * quat + REVERSION * resting
+    return quat / (rotation.safe_norm(quat) + EPS)

@@ -1,0 +1,293 @@
+"""The extended Kalman filter of the Crazyflie's firmware on the measurements of sensors, and flight on its estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, with_measured_states
+from crazysim.core.settings import dividing_rate
+from crazysim.core.stage import Stage, as_stages, tick
+from crazysim.errors import ConfigError
+from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators.error_state import Estimate
+from crazysim.plugins.sensors.beacons import SWEEP_TILTS, UWB, Lighthouse
+from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFlight, range_deviation
+from crazysim.plugins.sensors.imu import IMU
+from crazysim.plugins.sensors.motion_capture import MotionCapture
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.pytree import PyTree, leaf, on_device
+
+FIRMWARE_RATE = 1000
+"""Loops of the firmware's filter in a second, each of which adds process noise, Hz (estimator_kalman.c)."""
+START = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
+"""Standard deviations at the start: position, m, velocity, m/s, attitude, rad (kalman_core_params_defaults.h)."""
+DEVIATIONS = {
+    "pos": 0.01,
+    "quat": 4.5e-3,
+    "flow": 0.2,
+    "range": FAR_NOISE[2],
+    "distance": 0.25,
+    "difference": 0.15,
+    "sweep": 0.0004,
+}
+"""Standard deviations that the firmware assumes: position, m, and attitude, rad, of motion capture
+(crtp_localization_service.c), flow, pixels (flowdeck_v1v2.c), scale of that of the time of flight, m (zranger2.c),
+distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), angle of a light plane, rad
+(lighthouse_position_est.c)."""
+CONTROLLERS = ("state_controller", "attitude_controller", "body_rate_controller")
+"""Names of the stages that read the state of a drone to control it."""
+
+
+class KalmanData(PyTree):
+    """The filter of every drone."""
+
+    estimate: Estimate
+    """The estimate."""
+    previous: Array = leaf("drone", 1)
+    """Attitude at the end of the step before, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
+    accel: Array = leaf("drone", 1)
+    """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
+    gyro: Array = leaf("drone", 1)
+    """Sum of the angular velocities since the last prediction, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    used: Array = leaf("drone", 1)
+    """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
+    failures: Array = leaf("drone", 1)
+    """Number of times that the estimate left its bounds and the filter began again. (n_worlds, n_drones, 1)"""
+    accel_noise: Array = leaf("parameter", 1, (3,))
+    """Standard deviation of accelerations in a loop, body frame, m/s^2. (3,)"""
+    gyro_noise: Array = leaf("parameter", 1, (3,))
+    """Standard deviation of angular velocities in a loop, body frame, rad/s. (3,)"""
+    deviations: Array = leaf("parameter", 1)
+    """Standard deviations that the filter assumes for the measurements, in the order of the sensors. (n,)"""
+
+
+class Kalman(Plugin):
+    """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
+
+    It begins at the true state of a world's first step, uncertain as the firmware is after switching on. Predictions
+    run at ``freq`` on the mean of the inertial measurements between them; a measurement of another sensor is used in
+    the step in which it arrives. With ``control`` controllers see the estimate in place of the state.
+    """
+
+    sensors: Sequence[Sensor]
+    """Sensors, added before: an ``IMU``, and any of ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and
+    ``Lighthouse``."""
+    control: bool = True
+    """True where the controllers of the simulation fly on the estimate."""
+    _: dataclasses.KW_ONLY
+    freq: int = 100
+    """Predictions per second, Hz, a divisor of ``sim.freq``."""
+    accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0))
+    """Standard deviation of accelerations, body frame, m/s^2. (3,) or (n_worlds, n_drones, 3)"""
+    gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1))
+    """Standard deviation of angular velocities, body frame, rad/s. (3,) or (n_worlds, n_drones, 3)"""
+    deviations: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Standard deviations that differ from ``DEVIATIONS``, by its names."""
+    name: str = "kalman"
+
+    def record(self, sim: Simulation) -> KalmanData:
+        """Return the filter before its first step."""
+        self._check(sim)
+        deviations = DEVIATIONS | dict(self.deviations)
+        n, shape, dtype = len(self._aids), sim.data.states.pos.shape[:2], sim.data.states.pos.dtype
+        zero = on_device(np.zeros((*shape, 3)), dtype)
+        level = on_device(np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*shape, 4)), dtype)
+        cov = np.broadcast_to(np.diag(np.square(START))[np.triu_indices(error_state.N)], (*shape, error_state.N_COV))
+        return KalmanData(
+            estimate=Estimate(zero, zero, level, zero, on_device(cov, dtype)),
+            previous=level,
+            accel=zero,
+            gyro=zero,
+            used=on_device(np.full((*shape, n), -1), np.int32),
+            failures=on_device(np.zeros((*shape, 1)), np.int32),
+            accel_noise=check_parameter(sim, "accel_noise", self.accel_noise, (3,), 0.0),
+            gyro_noise=check_parameter(sim, "gyro_noise", self.gyro_noise, (3,), 0.0),
+            deviations=on_device(np.array([deviations[name] for name in DEVIATIONS]), dtype),
+        )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of the filter, and the controllers that see its estimate."""
+        end, period = "increment_steps", sim.data.core.freq // dividing_rate("freq", self.freq, sim.data.core.freq)
+
+        def place(name: str, fn: Callable[[SimData], SimData], when: Any = None) -> Placement:
+            return Placement(Stage(fn, "drone", when), before=end, name=f"{self.name}_{name}")
+
+        placements = [
+            place("begin", self._begin, lambda data: data.core.steps == 0),
+            place("sample", self._sample),
+            place("predict", self._predict(period), lambda data: (data.core.steps + 1) % period == 0),
+            place("noise", self._add_noise),
+            *(place(sensor.name, self._fuse(k, sensor), _arrivals(sensor)) for k, sensor in enumerate(self._aids)),
+            Placement(Stage(self._finish, "drone"), before=end),
+        ]
+        if self.control:
+            stages = as_stages({name: s for name, s in sim.step_pipeline.items() if name in CONTROLLERS})
+            placements += [Placement(self._blind(s), replaces=s.__name__, name=s.__name__) for s in stages]
+        return placements
+
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated state of one drone, the true one in a world's first step."""
+        estimate, s = self.read(data).estimate, data.states
+        quat = rotation.safe_normalize(estimate.quat, s.quat)
+        found = {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel)}
+        first = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
+        states = {name: jnp.where(first, getattr(s, name), value) for name, value in found.items()}
+        return states | self._imu.measured_states(data)
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated state."""
+        return self.measured_states(data)
+
+    @property
+    def _imu(self) -> IMU:
+        return next(sensor for sensor in self.sensors if isinstance(sensor, IMU))
+
+    @property
+    def _aids(self) -> list[Sensor]:
+        """Sensors besides the inertial measurement unit."""
+        return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
+
+    def _check(self, sim: Simulation) -> None:
+        names = ", ".join(kind.__name__ for kind in UPDATES)
+        if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
+            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}")
+        for sensor in self._aids:
+            if type(sensor) not in UPDATES:
+                raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
+        for sensor in self.sensors:
+            if sensor.name not in sim.data.plugins:
+                raise ConfigError(f"expected sensor {sensor.name!r} in the simulation; add it before {self.name!r}")
+        if unknown := self.deviations.keys() - DEVIATIONS.keys():
+            raise ConfigError(f"expected deviations of {', '.join(DEVIATIONS)}, got {', '.join(map(repr, unknown))}")
+
+    def _begin(self, data: SimData) -> SimData:
+        """Begin at the true state of one drone."""
+        s, record = data.states, self.read(data)
+        estimate = error_state.start(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)
+        return self.write(data, record.replace(estimate=estimate, previous=s.quat))
+
+    def _sample(self, data: SimData) -> SimData:
+        """Add the latest inertial measurement of one drone to the sums."""
+        record, imu = self.read(data), self._imu
+        gyro, accel = jnp.split(imu.latest(data), 2)
+        mounting = imu.read(data).quat
+        accel, gyro = rotation.rotate(mounting, accel, record.accel), rotation.rotate(mounting, gyro, record.gyro)
+        return self.write(data, record.replace(accel=accel, gyro=gyro))
+
+    def _predict(self, period: int) -> Callable[[SimData], SimData]:
+        def predict(data: SimData) -> SimData:
+            """Predict the state of one drone from the mean of its inertial measurements."""
+            record = self.read(data)
+            accel, gyro = record.accel / period, record.gyro / period
+            estimate = error_state.predict(record.estimate, accel, gyro, period / data.core.freq)
+            zero = jnp.zeros_like(accel)
+            return self.write(data, record.replace(estimate=estimate, accel=zero, gyro=zero))
+
+        return predict
+
+    def _add_noise(self, data: SimData) -> SimData:
+        """Add the process noise of as many loops of the firmware as a step lasts."""
+        record, dt = self.read(data), 1 / FIRMWARE_RATE
+        accel, loops = record.accel_noise, FIRMWARE_RATE / data.core.freq
+        deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * record.gyro_noise])
+        return self.write(data, record.replace(estimate=error_state.add_noise(record.estimate, loops * deviations**2)))
+
+    def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
+        def fuse(data: SimData) -> SimData:
+            """Use a measurement of one sensor, if it is new."""
+            record, taken = self.read(data), sensor.read(data).samples.taken
+            new = taken[0] != record.used[k]
+            rot = rotation.matrix(record.previous)
+            after = UPDATES[type(sensor)](sensor, self._imu, data, record, rot)
+            estimate = error_state.select(new, after, record.estimate)
+            return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
+
+        return fuse
+
+    def _finish(self, data: SimData) -> SimData:
+        """Move the attitude error of one drone into its attitude; begin again where the estimate left its bounds."""
+        record = self.read(data)
+        estimate = error_state.finalize(record.estimate)
+        valid, zero = error_state.within_bounds(estimate), jnp.zeros_like(estimate.pos)
+        level = jnp.zeros_like(estimate.quat).at[3].set(1.0)
+        estimate = error_state.select(valid, estimate, error_state.start(zero, zero, level, START))
+        failures = record.failures + jnp.where(valid, 0, 1)
+        return self.write(data, record.replace(estimate=estimate, previous=estimate.quat, failures=failures))
+
+    def _blind(self, controller: Stage) -> Stage:
+        """Return a controller that reads the estimate in place of the state."""
+
+        def blind(data: SimData) -> SimData:
+            return controller.fn(with_measured_states([self], data)).replace(states=data.states)
+
+        return Stage(blind, controller.scope, controller.when, controller.batched, controller.__name__)
+
+
+def _arrivals(sensor: Sensor) -> Any:
+    """Return when measurements of a sensor can arrive; None for every step."""
+    freq = sensor.freq
+    return None if freq is None or sensor.is_late else lambda data: tick(data, freq)
+
+
+def _pose(sensor: MotionCapture, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+    estimate = error_state.update_pos(record.estimate, sensor.part(data, "pos"), record.deviations[0])
+    return error_state.update_quat(estimate, sensor.part(data, "quat"), record.deviations[1])
+
+
+def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+    scale = sensor.interval(data) * sensor.read(data).scale[0]
+    gyro = imu.measured_states(data)["ang_vel"]
+    return error_state.update_flow(record.estimate, rot, sensor.part(data, "flow"), gyro, scale, record.deviations[2])
+
+
+def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+    distance = sensor.latest(data)
+    deviation = range_deviation(distance, record.deviations[3])[0]
+    after = error_state.update_range(record.estimate, rot, distance[0], deviation)
+    return error_state.select(distance[0] < sensor.read(data).max_range[0], after, record.estimate)
+
+
+def _beacons(sensor: UWB, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+    estimate, anchors, measured = record.estimate, sensor.read(data).anchors, sensor.latest(data)
+    for k in range(measured.shape[0]):
+        if sensor.tdoa:
+            estimate = error_state.update_difference(
+                estimate, anchors[0], anchors[k + 1], measured[k], record.deviations[5]
+            )
+        else:
+            estimate = error_state.update_distance(estimate, anchors[k], measured[k], record.deviations[4])
+    return estimate
+
+
+def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+    estimate, system = record.estimate, sensor.read(data)
+    angle, visible, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
+    for pos, quat in zip(system.stations, system.quat, strict=True):
+        for diode in system.diodes:
+            for plane, tilt in enumerate(SWEEP_TILTS):
+                station = pos, rotation.matrix(quat)
+                after = error_state.update_sweep(
+                    estimate, rot, diode, station, tilt, angle[2 * k + plane], record.deviations[6]
+                )
+                estimate = error_state.select(visible[k] > 0, after, estimate)
+            k += 1
+    return estimate
+
+
+UPDATES: dict[type, Callable[..., Estimate]] = {
+    MotionCapture: _pose,
+    OpticalFlow: _flow,
+    TimeOfFlight: _range,
+    UWB: _beacons,
+    Lighthouse: _sweeps,
+}
+"""Functions that use the measurements of each kind of sensor."""
