@@ -19,11 +19,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from crazysim.live.program import Circles
 from measure import digits, report
 
 from crazysim import Sim
 from crazysim.live import Browser, Live
+from crazysim.live.circles import Circles
 
 CASES = ("max", "recorded", "pictures", "jitter")
 

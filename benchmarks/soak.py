@@ -18,13 +18,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-from crazysim.live.program import Circles
 from live import show_to_client
 from measure import digits, report
 from mocap import circling_bodies
 
 from crazysim import Sim
 from crazysim.live import FunctionSource, Live, RealTimeSource, Twin, Twins
+from crazysim.live.circles import Circles
 
 FREQ = 240.0
 """Frames per second of motion capture, Hz."""

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from crazysim import rotation as rot
-from crazysim.live.mocap import frames
+from crazysim.live import attitude
 
 # Everything below runs in float64, so what is left is its rounding (1.1e-16) times a few operations.
 ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
@@ -105,7 +105,7 @@ def test_to_rpy_gives_the_same_rotation_back(q):
     rpy = rot.to_rpy(jnp.asarray(q))
     assert np.all(np.abs(rpy) <= np.array([1, 0.5, 1]) * np.pi)
     same_rotation(rot.from_rpy(rpy), q)
-    same_rotation(rot.from_rpy(jnp.asarray(frames.to_rpy(q))), q)
+    same_rotation(rot.from_rpy(jnp.asarray(attitude.to_rpy(q))), q)
 
 
 @given(q=unit_quats, scale=st.floats(0.1, 10))

@@ -280,7 +280,7 @@ def test_text_changes_its_corner_and_nothing_else(sim):
         ({"border": -1}, "pixels, got -1"),
         ({"columns": 0}, "columns is 0"),
         ({"camera": "up"}, "got 'up'"),
-        ({"follow": 0}, "to follow a drone, got 'down'"),
+        ({"follow": 0}, "to follow a drone or hold points in view, got 'down'"),
         ({"camera": -1, "follow": 1}, "expected a drone from 0 to 0 to follow, got 1"),
         ({"camera": -1, "follow": 0, "lag": -1.0}, "expected a lag of 0 s or more, got -1.0"),
         ({"trail": -1.0}, "expected a positive duration of a trail, s, got -1.0"),
