@@ -34,6 +34,12 @@ MAX_POS, MAX_VEL = 100.0, 10.0
 (kalman_supervisor.c)."""
 SMALL_ANGLE, LARGE_ANGLE = 1e-4, 10.0
 """Smallest attitude error that is moved into the attitude, and the largest, rad (kalman_core.c)."""
+GRAVITY = 9.81
+"""Acceleration of gravity, m/s^2 (physicalConstants.h)."""
+LOWEST = 0.1
+"""Least height that the flow is predicted for, m (mm_flow.c)."""
+HALF_CONE = 0.5 * 15 * math.pi / 180
+"""Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
 REVERSION = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
@@ -112,10 +118,6 @@ def predict(estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: A
     return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=p[_UPPER])
 
 
-GRAVITY = 9.81
-"""Acceleration of gravity, m/s^2 (physicalConstants.h)."""
-
-
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
     """Return the estimate with process noise: variances of the nine errors. (9,)"""
     return estimate.replace(cov=_bounded(covariance(estimate.cov) + jnp.diag(variances)))
@@ -190,10 +192,6 @@ def update_flow(
     return estimate
 
 
-LOWEST = 0.1
-"""Least height that the flow is predicted for, m (mm_flow.c)."""
-
-
 def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Array | float) -> Estimate:
     """Return the estimate after a measured distance to the floor, m; a drone tilted by 84 degrees measures none.
 
@@ -209,10 +207,6 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
     gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE, 0.0))
     after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
     return select(upright, after, estimate)
-
-
-HALF_CONE = 0.5 * 15 * math.pi / 180
-"""Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
 
 
 def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:

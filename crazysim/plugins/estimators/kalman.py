@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, with_measured_states
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone, with_measured_states
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage, as_stages, tick
 from crazysim.errors import ConfigError
@@ -43,6 +43,8 @@ DEVIATIONS = {
 (crtp_localization_service.c), flow, pixels (flowdeck_v1v2.c), scale of that of the time of flight, m (zranger2.c),
 distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), angle of a light plane, rad
 (lighthouse_position_est.c)."""
+Std = Mapping[str, Array]
+"""Standard deviations by the names of ``DEVIATIONS``."""
 CONTROLLERS = ("state_controller", "attitude_controller", "body_rate_controller")
 """Names of the stages that read the state of a drone to control it."""
 
@@ -54,9 +56,9 @@ class KalmanData(PyTree):
     """The estimate."""
     previous: Array = leaf("drone", 1)
     """Attitude at the end of the step before, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
-    accel: Array = leaf("drone", 1)
+    accel: Array = leaf("drone", 1, (3,))
     """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
-    gyro: Array = leaf("drone", 1)
+    gyro: Array = leaf("drone", 1, (3,))
     """Sum of the angular velocities since the last prediction, body frame, rad/s. (n_worlds, n_drones, 3)"""
     used: Array = leaf("drone", 1)
     """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
@@ -86,9 +88,9 @@ class Kalman(Plugin):
     _: dataclasses.KW_ONLY
     freq: int = 100
     """Predictions per second, Hz, a divisor of ``sim.freq``."""
-    accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0))
+    accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0), low=0.0)
     """Standard deviation of accelerations, body frame, m/s^2. (3,) or (n_worlds, n_drones, 3)"""
-    gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1))
+    gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
     """Standard deviation of angular velocities, body frame, rad/s. (3,) or (n_worlds, n_drones, 3)"""
     deviations: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Standard deviations that differ from ``DEVIATIONS``, by its names."""
@@ -97,21 +99,18 @@ class Kalman(Plugin):
     def record(self, sim: Simulation) -> KalmanData:
         """Return the filter before its first step."""
         self._check(sim)
-        deviations = DEVIATIONS | dict(self.deviations)
-        n, shape, dtype = len(self._aids), sim.data.states.pos.shape[:2], sim.data.states.pos.dtype
-        zero = on_device(np.zeros((*shape, 3)), dtype)
-        level = on_device(np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*shape, 4)), dtype)
-        cov = np.broadcast_to(np.diag(np.square(START))[np.triu_indices(error_state.N)], (*shape, error_state.N_COV))
-        return KalmanData(
-            estimate=Estimate(zero, zero, level, zero, on_device(cov, dtype)),
+        deviations, shape = DEVIATIONS | dict(self.deviations), sim.data.states.pos.shape[:2]
+        level = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4)
+        still = per_drone(sim, 0.0, 3)
+        cov = per_drone(sim, np.diag(np.square(START))[np.triu_indices(error_state.N)], error_state.N_COV)
+        return self.filled(
+            sim,
+            KalmanData,
+            estimate=Estimate(still, still, level, still, cov),
             previous=level,
-            accel=zero,
-            gyro=zero,
-            used=on_device(np.full((*shape, n), -1), np.int32),
+            used=on_device(np.full((*shape, len(self._aids)), -1), np.int32),
             failures=on_device(np.zeros((*shape, 1)), np.int32),
-            accel_noise=check_parameter(sim, "accel_noise", self.accel_noise, (3,), 0.0),
-            gyro_noise=check_parameter(sim, "gyro_noise", self.gyro_noise, (3,), 0.0),
-            deviations=on_device(np.array([deviations[name] for name in DEVIATIONS]), dtype),
+            deviations=on_device(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
@@ -207,7 +206,8 @@ class Kalman(Plugin):
             record, taken = self.read(data), sensor.read(data).samples.taken
             new = taken[0] != record.used[k]
             rot = rotation.matrix(record.previous)
-            after = UPDATES[type(sensor)](sensor, self._imu, data, record, rot)
+            std = dict(zip(DEVIATIONS, record.deviations, strict=True))
+            after = UPDATES[type(sensor)](sensor, self._imu, data, record.estimate, rot, std)
             estimate = error_state.select(new, after, record.estimate)
             return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
 
@@ -238,45 +238,45 @@ def _arrivals(sensor: Sensor) -> Any:
     return None if freq is None or sensor.is_late else lambda data: tick(data, freq)
 
 
-def _pose(sensor: MotionCapture, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
-    estimate = error_state.update_pos(record.estimate, sensor.part(data, "pos"), record.deviations[0])
-    return error_state.update_quat(estimate, sensor.part(data, "quat"), record.deviations[1])
+def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+    estimate = error_state.update_pos(estimate, sensor.part(data, "pos"), std["pos"])
+    return error_state.update_quat(estimate, sensor.part(data, "quat"), std["quat"])
 
 
-def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     scale = sensor.interval(data) * sensor.read(data).scale[0]
     gyro = imu.measured_states(data)["ang_vel"]
-    return error_state.update_flow(record.estimate, rot, sensor.part(data, "flow"), gyro, scale, record.deviations[2])
+    return error_state.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, std["flow"])
 
 
-def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
+def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     distance = sensor.latest(data)
-    deviation = range_deviation(distance, record.deviations[3])[0]
-    after = error_state.update_range(record.estimate, rot, distance[0], deviation)
-    return error_state.select(distance[0] < sensor.read(data).max_range[0], after, record.estimate)
+    deviation = range_deviation(distance, std["range"])[0]
+    after = error_state.update_range(estimate, rot, distance[0], deviation)
+    return error_state.select(distance[0] < sensor.read(data).max_range[0], after, estimate)
 
 
-def _beacons(sensor: UWB, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
-    estimate, anchors, measured = record.estimate, sensor.read(data).anchors, sensor.latest(data)
+def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+    anchors, measured = sensor.read(data).anchors, sensor.latest(data)
     for k in range(measured.shape[0]):
         if sensor.tdoa:
             estimate = error_state.update_difference(
-                estimate, anchors[0], anchors[k + 1], measured[k], record.deviations[5]
+                estimate, anchors[0], anchors[k + 1], measured[k], std["difference"]
             )
         else:
-            estimate = error_state.update_distance(estimate, anchors[k], measured[k], record.deviations[4])
+            estimate = error_state.update_distance(estimate, anchors[k], measured[k], std["distance"])
     return estimate
 
 
-def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, record: KalmanData, rot: Array) -> Estimate:
-    estimate, system = record.estimate, sensor.read(data)
+def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+    system = sensor.read(data)
     angle, visible, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
     for pos, quat in zip(system.stations, system.quat, strict=True):
         for diode in system.diodes:
             for plane, tilt in enumerate(SWEEP_TILTS):
                 station = pos, rotation.matrix(quat)
                 after = error_state.update_sweep(
-                    estimate, rot, diode, station, tilt, angle[2 * k + plane], record.deviations[6]
+                    estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"]
                 )
                 estimate = error_state.select(visible[k] > 0, after, estimate)
             k += 1

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
+from crazysim.envs import make
 from crazysim.plugins.estimators import Kalman, error_state
 from crazysim.plugins.sensors import IMU, UWB, Barometer, Lighthouse, MotionCapture, OpticalFlow, TimeOfFlight, Triad
 
@@ -183,3 +184,18 @@ def test_wrong_sensors_are_refused():
             sim.add(Kalman(sensors))
     with pytest.raises(ConfigError, match="got 'speed'"):
         sim.add(Kalman([imu], deviations={"speed": 1.0}))
+
+
+def test_a_task_observes_the_estimate():
+    """An estimate that is moved, with no sensor to tell, moves the observed position, and not the reward."""
+    imu = IMU()
+    env = make("hover", n_worlds=4, sensors=[imu, Kalman([imu])])
+    state = jax.jit(env.reset)(jax.random.key(0))
+    action = jnp.zeros_like(state.action)
+    state = env.step(state, action)
+    record = state.data.plugins["kalman"]
+    moved = record.replace(estimate=record.estimate.replace(pos=record.estimate.pos + 1.0))
+    other = state.replace(data=state.data.replace(plugins=state.data.plugins | {"kalman": moved}))
+    one, two = env.step(state, action), env.step(other, action)
+    np.testing.assert_allclose(two.obs["pos"] - one.obs["pos"], 1.0, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(one.reward, two.reward)
