@@ -94,6 +94,8 @@ class Sensor(Plugin):
 
     def record(self, sim: Simulation) -> PyTree:
         """Return the sensor before its first measurement."""
+        if not hasattr(self, "kind"):
+            raise NotImplementedError(f"{type(self).__name__} needs kind, the class of its record, or a method record")
         return self.filled(sim, self.kind)
 
     def filled(self, sim: Simulation, kind: type[R], **given: Any) -> R:

@@ -115,3 +115,11 @@ def test_another_delay_compiles_nothing_with_room_for_it():
 def test_law_09_wrong_settings(settings, message):
     with pytest.raises(ConfigError, match=message):
         watch(0, **settings)
+
+
+def test_a_sensor_without_a_record_says_what_it_lacks():
+    class Bare(Sensor):
+        """Defines nothing."""
+
+    with pytest.raises(NotImplementedError, match="Bare needs kind, the class of its record"):
+        Sim().add(Bare())
