@@ -87,23 +87,17 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     yield "thrust over weight", f"{ratio:.2f}"
     yield "hover", f"{1 / ratio:.0%} of the largest thrust"
     yield "tilt at full thrust", f"holds height up to {np.degrees(np.arccos(1 / ratio)):.0f} degrees"
-    arms = np.array([airframe.arm, airframe.arm, _yaw_arm(airframe)])
-    torques = min(hover - least, most - hover) * arms * np.sum(np.abs(airframe.mixing_matrix), axis=1)
-    accs = torques / np.diag(airframe.inertia)
-    for name, acc in zip(("roll", "pitch", "yaw"), accs, strict=True):
+    arms = {"roll": airframe.arm, "pitch": airframe.arm}
+    if Dynamics.first_principles in supported_dynamics(airframe):
+        arms["yaw"] = yaw_arm(airframe)
+    for axis, (name, arm) in enumerate(arms.items()):
+        torque = min(hover - least, most - hover) * arm * np.sum(np.abs(airframe.mixing_matrix[axis]))
+        acc = torque / airframe.inertia[axis, axis]
         rate, seconds = np.sqrt(acc * QUARTER_TURN), 2 * np.sqrt(QUARTER_TURN / max(acc, 1e-9))
         yield (
             name,
             f"up to {acc:.3g} rad/s^2 at hover; a turn by 90 degrees takes {seconds:.2g} s, at up to {rate:.3g} rad/s",
         )
-
-
-def _yaw_arm(airframe: Airframe) -> float:
-    """Return torque over thrust of a rotor, m; 0 where it is unknown."""
-    known = airframe.values.get("controller.thrust2torque")
-    if {"rotors.thrust_curve", "rotors.torque_curve"} <= set(airframe.values):
-        return yaw_arm(airframe)
-    return 0.0 if known is None else float(known)
 
 
 def _rotors(airframe: Airframe) -> Iterator[tuple[str, str]]:
