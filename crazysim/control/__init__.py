@@ -16,6 +16,7 @@ from crazysim.lazy import lazy
 
 if TYPE_CHECKING:
     from crazysim.control.auto import Auto
+    from crazysim.control.firmware import CFirmware
     from crazysim.control.geometric import Geometric, geometric_control
     from crazysim.control.indi import INDI, indi_control
     from crazysim.control.load_lqr import LoadLQR, load_lqr_control
@@ -30,6 +31,7 @@ __all__ = [
     "AllocationParams",
     "AttitudeParams",
     "Auto",
+    "CFirmware",
     "Control",
     "Controller",
     "Geometric",
@@ -57,6 +59,7 @@ __getattr__ = lazy(
     __name__,
     {
         "Auto": "crazysim.control.auto",
+        "CFirmware": "crazysim.control.firmware",
         "Geometric": "crazysim.control.geometric",
         "INDI": "crazysim.control.indi",
         "LQR": "crazysim.control.lqr",

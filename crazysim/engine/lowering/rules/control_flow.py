@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Element, constant, is_constant
 from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
@@ -25,6 +26,12 @@ from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, closed, expan
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
 def _call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     return ctx.lower(closed(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
+
+
+@rule("pure_callback", "io_callback")
+def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    """Refuse a call of a function on the host, around which a step is split."""
+    raise LimitError("it calls a function on the host")
 
 
 @rule("custom_jvp_call")

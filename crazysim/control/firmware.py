@@ -1,0 +1,153 @@
+"""Controllers in C: a compiled library commands the motors of every drone (``firmware.h`` has its interface)."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control.allocation import AllocationParams
+from crazysim.control.levels import Control
+from crazysim.control.protocol import Controller, DroneData
+from crazysim.drones import Airframe
+from crazysim.dynamics.rotor import rotor_vel_of_thrust
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, leaf
+
+VERSION = 1
+"""Version of the interface in ``firmware.h``."""
+LEVELS = (Control.state, Control.attitude, Control.body_rate)
+"""Command levels by their number in ``firmware.h``."""
+UNITS = ("throttle", "thrust", "rpm")
+"""Units of motor commands."""
+FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
+"""Functions of a library that are called from here."""
+N_COMMAND, N_FEEDFORWARD = 16, 8
+"""Numbers of a state command and of its feedforward."""
+
+
+class CFirmwareMemory(PyTree):
+    """Memory of a controller in C."""
+
+    words: Array = leaf("drone", 1)
+    """Memory of the library, as 32-bit integers. (n_worlds, n_drones, n_words)"""
+
+
+class CFirmware(Controller):
+    """Controller that a compiled library computes, for all drones of all worlds in one call.
+
+    The library runs on the host, between the kernels of the step, so a simulation on a GPU waits for it. Its steps have
+    no derivatives.
+    """
+
+    name: ClassVar[str] = "c_firmware"
+    levels: ClassVar[tuple[Control, ...]] = LEVELS
+    output: ClassVar[Control] = Control.rotor_vel
+    include: ClassVar[Path] = Path(__file__).parent
+    """Folder of ``firmware.h``, for the compiler's option ``-I``."""
+    library: str | Path
+    """Path of the shared library."""
+    motors: Literal["throttle", "thrust", "rpm"] = "throttle"
+    """Unit of the motor commands: ``"throttle"``, the thrust of a rotor as a part of its maximum, as a Crazyflie's PWM
+    over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to what the rotor can give, and 0 is off."""
+    freq: int = 500
+    """Rate, Hz."""
+
+    def __post_init__(self) -> None:
+        """Load the library.
+
+        Raises:
+            ConfigError: If it cannot be loaded or lacks a function, or the unit does not exist.
+        """
+        if self.motors not in UNITS:
+            raise ConfigError(f"expected motors as one of {', '.join(UNITS)}, got {self.motors!r}")
+        load(str(self.library))
+
+    def params(self, airframe: Airframe) -> AllocationParams:
+        """Return the limits and curves of the rotors."""
+        return AllocationParams.create(airframe)
+
+    def memory(self, airframe: Airframe) -> CFirmwareMemory:
+        """Return the memory of a drone at rest, as the library sets it."""
+        library = load(str(self.library))
+        words: Any = np.zeros(-(-library.crazysim_memory_size() // 4) or 1, np.uint32)
+        library.crazysim_init(words.ctypes.data)
+        return CFirmwareMemory(words)
+
+    def update(
+        self, data: DroneData, command: Any, memory: CFirmwareMemory, params: AllocationParams
+    ) -> tuple[Array, CFirmwareMemory]:
+        """Return the rotor speeds that the library commands."""
+        s, controls = data.states, data.controls
+        level, n_motors = LEVELS.index(controls.mode), params.allocation_matrix.shape[0]
+        if controls.mode == Control.state:
+            given, feedforward = controls.state.cmd, controls.state.feedforward
+        else:
+            given, feedforward = jnp.zeros(N_COMMAND).at[:4].set(command), jnp.zeros(N_FEEDFORWARD)
+        clock = jnp.stack([data.core.steps / data.core.freq, jnp.asarray(1 / self.freq)])
+        row = jnp.concatenate([clock, s.pos, s.quat, s.vel, s.ang_vel, given, feedforward]).astype(jnp.float32)
+        words, motors = jax.pure_callback(
+            functools.partial(_call, str(self.library), level, n_motors),
+            (jax.ShapeDtypeStruct(memory.words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32)),
+            memory.words,
+            row,
+            vmap_method="broadcast_all",
+        )
+        return self._rotor_vel(motors.astype(s.pos.dtype), params), CFirmwareMemory(words)
+
+    def _rotor_vel(self, motors: Array, params: AllocationParams) -> Array:
+        """Return rotor speeds, rpm, from motor commands. (n_rotors,)"""
+        if self.motors == "rpm":
+            return motors
+        thrust = motors * params.thrust_max if self.motors == "throttle" else motors
+        limited = jnp.clip(thrust, params.thrust_min, params.thrust_max)
+        return jnp.where(thrust <= 0, 0.0, rotor_vel_of_thrust(limited, params.rpm2thrust))
+
+
+def _call(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return memories and motor commands after one call of a library for all drones.
+
+    Args:
+        library: Path of the library.
+        level: Number of the command level in ``LEVELS``.
+        n_motors: Number of motors of a drone.
+        words: Memories; the library writes into a copy. (..., n_words)
+        inputs: ``struct crazysim_input`` of each drone. (..., n_inputs)
+    """
+    words, inputs = np.array(words, np.uint32, order="C"), np.ascontiguousarray(inputs, np.float32)
+    motors = np.zeros((*inputs.shape[:-1], n_motors), np.float32)
+    pointers = words.ctypes.data, level, inputs.ctypes.data, motors.ctypes.data
+    load(library).crazysim_update_all(motors.size // n_motors, n_motors, words.strides[-2], *pointers)
+    return words, motors
+
+
+@functools.cache
+def load(path: str) -> ctypes.CDLL:
+    """Return a library, with the types of its functions.
+
+    Raises:
+        ConfigError: If it cannot be loaded, lacks a function, or was compiled with another version of ``firmware.h``.
+    """
+    remedy = f"Compile it as {CFirmware.include / 'firmware.h'} says."
+    try:
+        library = ctypes.CDLL(str(Path(path).resolve()))
+    except OSError as error:
+        raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
+    missing = [name for name in FUNCTIONS if not hasattr(library, name)]
+    if missing:
+        raise ConfigError(f"expected the functions {', '.join(FUNCTIONS)} in {path}, got none of {missing}. {remedy}")
+    if (version := library.crazysim_version()) != VERSION:
+        raise ConfigError(f"expected version {VERSION} of firmware.h in {path}, got {version}. {remedy}")
+    pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
+    library.crazysim_memory_size.restype = size
+    library.crazysim_init.argtypes = [pointer]
+    library.crazysim_init.restype = None
+    library.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
+    library.crazysim_update_all.restype = None
+    return library

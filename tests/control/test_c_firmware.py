@@ -1,0 +1,178 @@
+"""Controllers in C: what they receive, what they command, and what they remember of each drone."""
+
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, Sim
+from crazysim.control import AllocationParams, CFirmware, Control, Controller
+from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.engine.backends import native
+from crazysim.pytree import PyTree, leaf
+
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
+WORLDS, DRONES = 3, 2
+HOVER = """
+#include "firmware.h"
+struct memory { float throttle; int ticks; };
+size_t crazysim_memory_size(void) { return sizeof(struct memory); }
+void crazysim_init(void *memory) { ((struct memory *)memory)->throttle = 0.5f; }
+void crazysim_update(void *memory, enum crazysim_level level, const struct crazysim_input *in, float *motors) {
+  struct memory *own = (struct memory *)memory;
+  float error = in->command[2] - in->pos[2];
+  own->throttle += 0.2f * error * in->dt;
+  own->ticks += 1;
+  for (int i = 0; i < 4; ++i) motors[i] = own->throttle + 0.3f * error - 0.25f * in->vel[2];
+}
+"""
+ECHO = """
+#include <string.h>
+#include "firmware.h"
+struct memory { struct crazysim_input input; int level; };
+size_t crazysim_memory_size(void) { return sizeof(struct memory); }
+void crazysim_init(void *memory) { (void)memory; }
+void crazysim_update(void *memory, enum crazysim_level level, const struct crazysim_input *in, float *motors) {
+  memcpy(memory, in, sizeof *in);
+  ((struct memory *)memory)->level = level;
+  for (int i = 0; i < 4; ++i) motors[i] = 0.1f * i;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """Return the path of a compiled library for its source."""
+    folder = tmp_path_factory.mktemp("c")
+
+    def compiled(name, source):
+        path = folder / f"{name}.so"
+        if not path.exists():
+            (folder / f"{name}.c").write_text(source)
+            words = ["g++", "-O2", "-shared", "-fPIC", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror"]
+            subprocess.run([*words, f"-I{CFirmware.include}", folder / f"{name}.c", "-o", path], check=True)
+        return path
+
+    return compiled
+
+
+class HeightMemory(PyTree):
+    throttle: jax.Array = leaf("drone", 1)
+
+
+class Height(Controller):
+    """The law of ``HOVER`` in JAX."""
+
+    name = "height"
+    levels = (Control.state,)
+    output = Control.rotor_vel
+    freq: int = 500
+
+    def params(self, airframe):
+        return AllocationParams.create(airframe)
+
+    def memory(self, airframe):
+        return HeightMemory(np.full(1, 0.5))
+
+    def update(self, data, command, memory, params):
+        error = (command.pos - data.states.pos)[2:]
+        throttle = memory.throttle + 0.2 * error / self.freq
+        thrust = params.thrust_max * (throttle + 0.3 * error - 0.25 * data.states.vel[2:])
+        speed = rotor_vel_of_thrust(jnp.clip(thrust, params.thrust_min, params.thrust_max), params.rpm2thrust)
+        return jnp.broadcast_to(jnp.where(thrust > 0, speed, 0.0), (4,)), HeightMemory(throttle)
+
+
+def flown(controller, n_steps=1000, engine="auto"):
+    """Return a simulation whose drones rise to heights of their own."""
+    sim = Sim(WORLDS, DRONES, control="state", controller=controller, engine=engine)
+    pos = np.array(sim.data.states.pos)
+    pos[..., 2] = np.linspace(0.5, 2.0, WORLDS * DRONES).reshape(WORLDS, DRONES)
+    sim.state_control(pos=pos)
+    sim.step(n_steps)
+    return sim
+
+
+@pytest.mark.parametrize("engine", ["fused", "plain"])
+def test_a_law_in_c_flies_as_the_same_law_in_jax(library, engine):
+    found = flown(CFirmware(library("hover", HOVER)), engine=engine)
+    expected = flown(Height(), engine=engine)
+    assert np.ptp(expected.data.states.pos[..., 2]) > 1.0
+    # The two round differently at each of 1,000 steps, by parts of 1e-7.
+    np.testing.assert_allclose(found.data.states.pos, expected.data.states.pos, atol=1e-5)
+
+
+def test_it_remembers_each_drone_until_its_world_is_reset(library):
+    sim = flown(CFirmware(library("hover", HOVER)), n_steps=20)
+    sim.reset(np.arange(WORLDS) == 1)
+    sim.step(5)
+    memory = np.asarray(sim.data.controls.controller.memory.words)
+    assert memory[..., 1].tolist() == [[25, 25], [5, 5], [25, 25]]
+    assert len(np.unique(memory[..., 0])) > DRONES
+
+
+@pytest.mark.parametrize("level", ["state", "attitude", "body_rate"])
+def test_it_receives_state_command_and_time(library, level):
+    sim = Sim(2, 1, control=level, controller=CFirmware(library("echo", ECHO), motors="thrust", freq=250))
+    rng = np.random.default_rng(1)
+    quat = rng.normal(size=(2, 1, 4))
+    sim.data = with_states(
+        sim.data,
+        pos=rng.normal(size=(2, 1, 3)) + 9,
+        quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        vel=rng.normal(size=(2, 1, 3)),
+        ang_vel=rng.normal(size=(2, 1, 3)),
+    )
+    sim.step(2)
+    states = sim.data.states
+    command = rng.normal(size=(2, 1, 16 if level == "state" else 4)).astype(np.float32)
+    getattr(sim, f"{level}_control")(command)
+    sim.step(1)
+    memory = np.asarray(sim.data.controls.controller.memory.words)
+    received, clock = memory[..., :-1].view(np.float32), np.float32([2 / 500, 1 / 250])
+    given = np.zeros((2, 1, 24), np.float32)
+    given[..., : command.shape[-1]] = command
+    if level == "state":
+        given[..., 16:] = sim.data.controls.state.feedforward
+        assert given[0, 0, 22] == command[0, 0, 15]  # the yaw rate
+    rows = [states.pos, states.quat, states.vel, states.ang_vel, given]
+    expected = np.concatenate([np.broadcast_to(clock, (2, 1, 2)), *map(np.asarray, rows)], axis=-1)
+    np.testing.assert_array_equal(received, expected)
+    assert np.all(memory[..., -1] == ["state", "attitude", "body_rate"].index(level))
+
+
+@pytest.mark.parametrize("motors", ["throttle", "thrust", "rpm"])
+def test_motor_commands_have_the_unit_that_was_named(library, motors):
+    sim = Sim(1, 1, drone="bumblebee", control="attitude", controller=CFirmware(library("echo", ECHO), motors=motors))
+    sim.step(1)
+    commanded, params = np.asarray(sim.data.controls.rotor_vel[0, 0]), sim.data.controls.controller.params
+    given = np.array([0.0, 0.1, 0.2, 0.3])
+    if motors == "rpm":
+        idle = float(sim.data.params.rotor_vel_min[0])  # what turns, turns at least so fast
+        np.testing.assert_allclose(commanded, np.where(given > 0, np.maximum(given, idle), 0), rtol=1e-6)
+        return
+    least, most = float(params.thrust_min[0]), float(params.thrust_max[0])
+    thrust = np.clip(given * (most if motors == "throttle" else 1.0), least, most)
+    assert commanded[0] == 0
+    # The inverse of the curve is a square root in float32.
+    np.testing.assert_allclose(curve(commanded, params.rpm2thrust)[1:], thrust[1:], rtol=1e-4)
+
+
+def test_the_step_is_split_without_a_warning_and_explained(library):
+    sim = flown(CFirmware(library("hover", HOVER)), n_steps=1)
+    assert "'state_controller' is not fused" in sim.explain()
+    assert "it calls a function on the host" in sim.explain()
+
+
+def test_wrong_libraries_and_units_are_refused(library, tmp_path):
+    with pytest.raises(ConfigError, match=r"expected a shared library at .*nothing\.so.*firmware\.h"):
+        CFirmware(tmp_path / "nothing.so")
+    with pytest.raises(ConfigError, match=r"expected the functions .*, got none of \['crazysim_memory_size'"):
+        CFirmware(library("empty", 'extern "C" int nothing(void) { return 0; }'))
+    (tmp_path / "firmware.h").write_text((CFirmware.include / "firmware.h").read_text().replace("VERSION 1", "VERSION 2"))
+    with pytest.raises(ConfigError, match=r"expected version 1 of firmware\.h in .*, got 2"):
+        CFirmware(library("newer", HOVER.replace("firmware.h", f"{tmp_path}/firmware.h")))
+    with pytest.raises(ConfigError, match=r"expected motors as one of throttle, thrust, rpm, got 'volt'"):
+        CFirmware(library("hover", HOVER), motors="volt")
