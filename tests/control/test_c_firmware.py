@@ -171,7 +171,9 @@ def test_wrong_libraries_and_units_are_refused(library, tmp_path):
         CFirmware(tmp_path / "nothing.so")
     with pytest.raises(ConfigError, match=r"expected the functions .*, got none of \['crazysim_memory_size'"):
         CFirmware(library("empty", 'extern "C" int nothing(void) { return 0; }'))
-    (tmp_path / "firmware.h").write_text((CFirmware.include / "firmware.h").read_text().replace("VERSION 1", "VERSION 2"))
+    (tmp_path / "firmware.h").write_text(
+        (CFirmware.include / "firmware.h").read_text().replace("VERSION 1", "VERSION 2")
+    )
     with pytest.raises(ConfigError, match=r"expected version 1 of firmware\.h in .*, got 2"):
         CFirmware(library("newer", HOVER.replace("firmware.h", f"{tmp_path}/firmware.h")))
     with pytest.raises(ConfigError, match=r"expected motors as one of throttle, thrust, rpm, got 'volt'"):
