@@ -95,7 +95,7 @@ def make(
         freq: Environment steps per second, Hz.
         actions: Meaning of an action; None for the usual one of the command level.
         sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Empty for the
-            true states.
+            true states, or for those that ``estimator``, a setting of ``Sim``, estimates.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
 
@@ -121,7 +121,7 @@ def make(
     task.install(sim)
     for sensor in sensors:
         sim.add(sensor)
-    return DroneEnv(sim, task, freq, actions, bool(sensors))
+    return DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

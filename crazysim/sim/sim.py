@@ -33,6 +33,7 @@ from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
+from crazysim.plugins.estimators import Estimator, find_estimator
 from crazysim.plugins.registry import P, PluginRegistry
 from crazysim.pytree import on_device
 from crazysim.scene import mjx
@@ -99,6 +100,7 @@ class Sim:
         strict: bool = False,
         controller: str | Controller | Sequence[str | Controller] = DEFAULT,
         switch: Callable[..., Array] | ArrayLike | None = None,
+        estimator: str | Estimator | None = None,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -128,6 +130,10 @@ class Sim:
                 The rates above replace its own.
             switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
                 indices, () or (n_worlds, n_drones).
+            estimator: Filter on whose estimate the controllers fly: ``"kalman"``, with an ``IMU`` and a
+                ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with
+                sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``. It is added with its
+                sensors as plugins. None for the true state.
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -162,6 +168,10 @@ class Sim:
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self._steps = BuiltPipeline("step_pipeline", stages, self._stepper.build)
         self._resets = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
+        if estimator is not None:
+            estimator = find_estimator(estimator)
+            for plugin in (*estimator.sensors, estimator):
+                self.add(plugin)
 
     @classmethod
     def from_mjcf(

@@ -1,5 +1,26 @@
 """Estimators: filters that fuse the measurements of sensors, each a plugin that ``sim.add`` adds."""
 
+from crazysim.errors import ConfigError
+from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.estimators.kalman import Kalman
 
-__all__ = ["Kalman"]
+__all__ = ["Estimator", "Kalman", "find_estimator"]
+
+ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman}
+"""Estimators by the names that ``Sim(estimator=...)`` takes."""
+
+
+def find_estimator(estimator: str | Estimator) -> Estimator:
+    """Return an estimator, or that of a name on its default sensors.
+
+    Raises:
+        ConfigError: If there is none of that name.
+    """
+    if isinstance(estimator, Estimator):
+        return estimator
+    if not isinstance(estimator, str) or estimator not in ESTIMATORS:
+        raise ConfigError(
+            f"expected an estimator as one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}. Use a name, or an "
+            f"estimator with sensors of its own, such as Kalman([IMU(), MotionCapture()])."
+        )
+    return ESTIMATORS[estimator].default()

@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone, with_measured_states
+from crazysim.core.plugin import Simulation, parameter, per_drone
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import Stage, as_stages, tick
+from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
+from crazysim.plugins.estimators.estimator import Estimator, arrivals, at_the_start
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFlight, range_deviation
 from crazysim.plugins.sensors.imu import IMU
@@ -45,8 +46,6 @@ distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), ang
 (lighthouse_position_est.c)."""
 Std = Mapping[str, Array]
 """Standard deviations by the names of ``DEVIATIONS``."""
-CONTROLLERS = ("state_controller", "attitude_controller", "body_rate_controller")
-"""Names of the stages that read the state of a drone to control it."""
 
 
 class KalmanData(PyTree):
@@ -72,19 +71,15 @@ class KalmanData(PyTree):
     """Standard deviations that the filter assumes for the measurements, in the order of the sensors. (n,)"""
 
 
-class Kalman(Plugin):
+class Kalman(Estimator):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
     It begins at the true state of a world's first step, uncertain as the firmware is after switching on. Predictions
     run at ``freq`` on the mean of the inertial measurements between them; a measurement of another sensor is used in
-    the step in which it arrives. With ``control`` controllers see the estimate in place of the state.
+    the step in which it arrives. Besides an ``IMU`` it takes any of ``MotionCapture``, ``OpticalFlow``,
+    ``TimeOfFlight``, ``UWB`` and ``Lighthouse``.
     """
 
-    sensors: Sequence[Sensor]
-    """Sensors, added before: an ``IMU``, and any of ``MotionCapture``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and
-    ``Lighthouse``."""
-    control: bool = True
-    """True where the controllers of the simulation fly on the estimate."""
     _: dataclasses.KW_ONLY
     freq: int = 100
     """Predictions per second, Hz, a divisor of ``sim.freq``."""
@@ -96,9 +91,21 @@ class Kalman(Plugin):
     """Standard deviations that differ from ``DEVIATIONS``, by its names."""
     name: str = "kalman"
 
+    @classmethod
+    def default(cls) -> Kalman:
+        """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
+        return cls([IMU.crazyflie(), MotionCapture()])
+
+    @property
+    def kinds(self) -> tuple[type[Sensor], ...]:
+        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
+        return tuple(UPDATES)
+
     def record(self, sim: Simulation) -> KalmanData:
         """Return the filter before its first step."""
-        self._check(sim)
+        self.check_sensors(sim)
+        if unknown := self.deviations.keys() - DEVIATIONS.keys():
+            raise ConfigError(f"expected deviations of {', '.join(DEVIATIONS)}, got {', '.join(map(repr, unknown))}")
         deviations, shape = DEVIATIONS | dict(self.deviations), sim.data.states.pos.shape[:2]
         level = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4)
         still = per_drone(sim, 0.0, 3)
@@ -108,65 +115,32 @@ class Kalman(Plugin):
             KalmanData,
             estimate=Estimate(still, still, level, still, cov),
             previous=level,
-            used=on_device(np.full((*shape, len(self._aids)), -1), np.int32),
+            used=on_device(np.full((*shape, len(self.aids)), -1), np.int32),
             failures=on_device(np.zeros((*shape, 1)), np.int32),
             deviations=on_device(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages of the filter, and the controllers that see its estimate."""
-        end, period = "increment_steps", sim.data.core.freq // dividing_rate("freq", self.freq, sim.data.core.freq)
+    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
+        """Return the stages of the filter by name, in their order."""
+        period = freq // dividing_rate("freq", self.freq, freq)
 
-        def place(name: str, fn: Callable[[SimData], SimData], when: Any = None) -> Placement:
-            return Placement(Stage(fn, "drone", when), before=end, name=f"{self.name}_{name}")
+        def every(data: SimData) -> Any:
+            return (data.core.steps + 1) % period == 0
 
-        placements = [
-            place("begin", self._begin, lambda data: data.core.steps == 0),
-            place("sample", self._sample),
-            place("predict", self._predict(period), lambda data: (data.core.steps + 1) % period == 0),
-            place("noise", self._add_noise),
-            *(place(sensor.name, self._fuse(k, sensor), _arrivals(sensor)) for k, sensor in enumerate(self._aids)),
-            Placement(Stage(self._finish, "drone"), before=end),
+        return [
+            ("begin", Stage(self._begin, "drone", at_the_start)),
+            ("sample", Stage(self._sample, "drone")),
+            ("predict", Stage(self._predict(period), "drone", every)),
+            ("noise", Stage(self._add_noise, "drone")),
+            *((s.name, Stage(self._fuse(k, s), "drone", arrivals(s))) for k, s in enumerate(self.aids)),
+            ("", Stage(self._finish, "drone")),
         ]
-        if self.control:
-            stages = as_stages({name: s for name, s in sim.step_pipeline.items() if name in CONTROLLERS})
-            placements += [Placement(self._blind(s), replaces=s.__name__, name=s.__name__) for s in stages]
-        return placements
 
-    def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated state of one drone, the true one in a world's first step."""
-        estimate, s = self.read(data).estimate, data.states
-        quat = rotation.safe_normalize(estimate.quat, s.quat)
-        found = {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel)}
-        first = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
-        states = {name: jnp.where(first, getattr(s, name), value) for name, value in found.items()}
-        return states | self._imu.measured_states(data)
-
-    def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated state."""
-        return self.measured_states(data)
-
-    @property
-    def _imu(self) -> IMU:
-        return next(sensor for sensor in self.sensors if isinstance(sensor, IMU))
-
-    @property
-    def _aids(self) -> list[Sensor]:
-        """Sensors besides the inertial measurement unit."""
-        return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
-
-    def _check(self, sim: Simulation) -> None:
-        names = ", ".join(kind.__name__ for kind in UPDATES)
-        if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
-            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}")
-        for sensor in self._aids:
-            if type(sensor) not in UPDATES:
-                raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
-        for sensor in self.sensors:
-            if sensor.name not in sim.data.plugins:
-                raise ConfigError(f"expected sensor {sensor.name!r} in the simulation; add it before {self.name!r}")
-        if unknown := self.deviations.keys() - DEVIATIONS.keys():
-            raise ConfigError(f"expected deviations of {', '.join(DEVIATIONS)}, got {', '.join(map(repr, unknown))}")
+    def estimated_states(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated position, attitude and velocity of one drone."""
+        estimate = self.read(data).estimate
+        quat = rotation.safe_normalize(estimate.quat, data.states.quat)
+        return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel)}
 
     def _begin(self, data: SimData) -> SimData:
         """Begin at the true state of one drone."""
@@ -176,11 +150,9 @@ class Kalman(Plugin):
 
     def _sample(self, data: SimData) -> SimData:
         """Add the latest inertial measurement of one drone to the sums."""
-        record, imu = self.read(data), self._imu
-        gyro, accel = jnp.split(imu.latest(data), 2)
-        mounting = imu.read(data).quat
-        accel, gyro = rotation.rotate(mounting, accel, record.accel), rotation.rotate(mounting, gyro, record.gyro)
-        return self.write(data, record.replace(accel=accel, gyro=gyro))
+        record = self.read(data)
+        gyro, accel = self.inertial(data)
+        return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
 
     def _predict(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
@@ -207,7 +179,7 @@ class Kalman(Plugin):
             new = taken[0] != record.used[k]
             rot = rotation.matrix(record.previous)
             std = dict(zip(DEVIATIONS, record.deviations, strict=True))
-            after = UPDATES[type(sensor)](sensor, self._imu, data, record.estimate, rot, std)
+            after = UPDATES[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
             estimate = error_state.select(new, after, record.estimate)
             return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
 
@@ -222,20 +194,6 @@ class Kalman(Plugin):
         estimate = error_state.select(valid, estimate, error_state.start(zero, zero, level, START))
         failures = record.failures + jnp.where(valid, 0, 1)
         return self.write(data, record.replace(estimate=estimate, previous=estimate.quat, failures=failures))
-
-    def _blind(self, controller: Stage) -> Stage:
-        """Return a controller that reads the estimate in place of the state."""
-
-        def blind(data: SimData) -> SimData:
-            return controller.fn(with_measured_states([self], data)).replace(states=data.states)
-
-        return Stage(blind, controller.scope, controller.when, controller.batched, controller.__name__)
-
-
-def _arrivals(sensor: Sensor) -> Any:
-    """Return when measurements of a sensor can arrive; None for every step."""
-    freq = sensor.freq
-    return None if freq is None or sensor.is_late else lambda data: tick(data, freq)
 
 
 def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:

@@ -49,6 +49,16 @@ BMI088: dict[str, Any] = {
 as the firmware sets them (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz). The data sheet
 states no instability or random walk of the bias: they are zero."""
 
+_FIRMWARE_GYRO_BIAS = 0.014 * DEGREE / math.sqrt(2 * 0.512)
+CRAZYFLIE: dict[str, Any] = {
+    "gyro": dataclasses.replace(BMI088["gyro"], bias_spread=_FIRMWARE_GYRO_BIAS, bandwidth=38.0),
+    "accel": dataclasses.replace(BMI088["accel"], bias_spread=np.array([20e-3, 20e-3, 0.0]) * G, bandwidth=18.5),
+}
+"""BMI088 as the Crazyflie's firmware passes it on (sensors_bmi088_bmp3xx.c): before take-off the mean of 512 samples of
+the gyroscope is subtracted, so that the mean of their noise is the bias that is left, and the accelerometer is scaled to
+1 g, which leaves no bias along gravity. Behind the filters of the chip are Butterworth filters of second order with
+corners of 80 and 30 Hz; the corners here are those of a filter of first order that delays as much as both together."""
+
 MPU9250: dict[str, Any] = {
     "gyro": Triad(
         noise=0.01 * DEGREE,
@@ -129,6 +139,11 @@ class IMU(Sensor):
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     _: dataclasses.KW_ONLY
     name: str = "imu"
+
+    @classmethod
+    def crazyflie(cls, **settings: Any) -> IMU:
+        """Return the unit of the Crazyflie 2.1 behind its firmware; see ``CRAZYFLIE``. Other settings are passed on."""
+        return cls(**(CRAZYFLIE | settings))
 
     @classmethod
     def bmi088(cls, **settings: Any) -> IMU:

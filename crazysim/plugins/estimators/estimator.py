@@ -1,0 +1,131 @@
+"""Base class of estimators: sensors to fuse, and controllers that fly on the estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
+from crazysim.core.stage import Stage, as_stages, tick
+from crazysim.errors import ConfigError
+from crazysim.plugins.sensors.imu import IMU
+from crazysim.plugins.sensors.sensor import Sensor
+
+CONTROLLERS = ("state_controller", "attitude_controller", "body_rate_controller")
+"""Names of the stages that read the state of a drone to control it."""
+
+
+class Estimator(Plugin):
+    """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
+
+    A subclass defines ``kinds``, ``record``, ``filter_stages`` and ``estimated_states``. With ``control`` controllers
+    see the estimate in place of the state, and policies of tasks that are told to observe measurements do so too.
+    """
+
+    sensors: Sequence[Sensor]
+    """Sensors: an ``IMU``, and others. ``sim.add`` needs them added before; ``Sim(estimator=...)`` adds them."""
+    control: bool = True
+    """True where the controllers of the simulation fly on the estimate."""
+    _: dataclasses.KW_ONLY
+    name: str = "estimator"
+
+    @classmethod
+    def default(cls) -> Estimator:
+        """Return the filter on the sensors that its name alone stands for."""
+        raise NotImplementedError
+
+    @property
+    def kinds(self) -> tuple[type[Sensor], ...]:
+        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
+        raise NotImplementedError
+
+    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
+        """Return the stages of the filter by name, in their order, the last without a name.
+
+        Args:
+            freq: Steps of the simulation per second, Hz.
+        """
+        raise NotImplementedError
+
+    def estimated_states(self, data: SimData) -> dict[str, Array]:
+        """Return the estimate of fields of ``data.states`` of one drone, but for the angular velocity."""
+        raise NotImplementedError
+
+    @property
+    def imu(self) -> IMU:
+        """The inertial measurement unit."""
+        return next(sensor for sensor in self.sensors if isinstance(sensor, IMU))
+
+    @property
+    def aids(self) -> list[Sensor]:
+        """Sensors besides the inertial measurement unit."""
+        return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stages of the filter, and the controllers that see its estimate."""
+        placements = [
+            Placement(stage, before="increment_steps", name=f"{self.name}_{name}" if name else self.name)
+            for name, stage in self.filter_stages(sim.data.core.freq)
+        ]
+        if self.control:
+            stages = as_stages({name: s for name, s in sim.step_pipeline.items() if name in CONTROLLERS})
+            placements += [Placement(self._blind(s), replaces=s.__name__, name=s.__name__) for s in stages]
+        return placements
+
+    def measured_states(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated state of one drone, the true one in a world's first step."""
+        s, found = data.states, self.estimated_states(data)
+        first = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
+        states = {name: jnp.where(first, getattr(s, name), value) for name, value in found.items()}
+        return states | self.imu.measured_states(data)
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated state."""
+        return self.measured_states(data)
+
+    def inertial(self, data: SimData) -> tuple[Array, Array]:
+        """Return the measured angular velocity, rad/s, and specific force, m/s^2, of one drone, body frame. (3,) each"""
+        gyro, accel = jnp.split(self.imu.latest(data), 2)
+        mounting = self.imu.read(data).quat
+        return rotation.rotate(mounting, gyro), rotation.rotate(mounting, accel)
+
+    def check_sensors(self, sim: Simulation) -> None:
+        """Check the sensors.
+
+        Raises:
+            ConfigError: If there is not one ``IMU``, or another is not of ``kinds``, or has not been added.
+        """
+        names = ", ".join(kind.__name__ for kind in self.kinds)
+        if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
+            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}")
+        for sensor in self.aids:
+            if type(sensor) not in self.kinds:
+                raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
+        for sensor in self.sensors:
+            if sensor.name not in sim.data.plugins:
+                raise ConfigError(f"expected sensor {sensor.name!r} in the simulation; add it before {self.name!r}")
+
+    def _blind(self, controller: Stage) -> Stage:
+        """Return a controller that reads the estimate in place of the state."""
+
+        def blind(data: SimData) -> SimData:
+            return controller.fn(with_measured_states([self], data)).replace(states=data.states)
+
+        return Stage(blind, controller.scope, controller.when, controller.batched, controller.__name__)
+
+
+def at_the_start(data: SimData) -> Any:
+    """Return true in the first step of a world."""
+    return data.core.steps == 0
+
+
+def arrivals(sensor: Sensor) -> Callable[[SimData], Any] | None:
+    """Return when measurements of a sensor can arrive; None for every step."""
+    freq = sensor.freq
+    return None if freq is None or sensor.is_late else lambda data: tick(data, freq)
