@@ -1,0 +1,1 @@
+"""Comparisons of the simulation with logs of real flights."""
