@@ -26,7 +26,9 @@ def main() -> None:
     args = parser.parse_args()
     paths = [path for path in sorted(args.folder.glob("*.npz")) if any(name in path.name for name in args.names)]
     if not paths:
-        raise SystemExit(f"expected .npz files with {' or '.join(args.names)} in their names in {args.folder}, got none")
+        raise SystemExit(
+            f"expected .npz files with {' or '.join(args.names)} in their names in {args.folder}, got none"
+        )
     estimator = None if args.truth else laboratory(args.quat_deviation)
     for row in compare([read_flight(path) for path in paths], args.drone, estimator):
         numbers = {

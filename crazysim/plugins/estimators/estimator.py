@@ -25,7 +25,7 @@ class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
     A subclass defines ``kinds``, ``record``, ``filter_stages`` and ``estimated_states``. With ``control`` controllers
-    see the estimate in place of the state, and policies of tasks that are told to observe measurements do so too.
+    see the estimate in place of the state, as do policies of tasks that observe measurements.
     """
 
     sensors: Sequence[Sensor]

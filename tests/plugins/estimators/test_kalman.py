@@ -213,7 +213,10 @@ def test_removal_gives_the_controllers_back():
 
 def test_one_argument_adds_filter_and_sensors():
     """It is the same as adding them, bit for bit, and controllers fly on the estimate."""
-    sims = [Sim(n_worlds=2, control="state", rng_key=3, estimator="kalman"), Sim(n_worlds=2, control="state", rng_key=3)]
+    sims = [
+        Sim(n_worlds=2, control="state", rng_key=3, estimator="kalman"),
+        Sim(n_worlds=2, control="state", rng_key=3),
+    ]
     added = [sims[1].add(sensor) for sensor in (IMU.crazyflie(), MotionCapture())]
     sims[1].add(Kalman(added))
     for sim in sims:
