@@ -1,4 +1,4 @@
-"""Closed loop against logs: the firmware's controller on the firmware's filter follows the setpoints of real flights."""
+"""Closed loop against logs: controller and filter of the firmware follow the setpoints of real flights."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ class Estimator(Plugin):
         return self.measured_states(data)
 
     def inertial(self, data: SimData) -> tuple[Array, Array]:
-        """Return the measured angular velocity, rad/s, and specific force, m/s^2, of one drone, body frame. (3,) each"""
+        """Return measured angular velocity, rad/s, and specific force, m/s^2, of one drone, body frame. (3,) each"""
         gyro, accel = jnp.split(self.imu.latest(data), 2)
         mounting = self.imu.read(data).quat
         return rotation.rotate(mounting, gyro), rotation.rotate(mounting, accel)
