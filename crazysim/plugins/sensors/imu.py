@@ -54,7 +54,7 @@ CRAZYFLIE: dict[str, Any] = {
     "gyro": dataclasses.replace(BMI088["gyro"], bias_spread=_FIRMWARE_GYRO_BIAS, bandwidth=38.0),
     "accel": dataclasses.replace(BMI088["accel"], bias_spread=np.array([20e-3, 20e-3, 0.0]) * G, bandwidth=18.5),
 }
-"""BMI088 as passed on by the firmware of the Crazyflie (sensors_bmi088_bmp3xx.c). Before take-off the mean of 512 samples
+"""BMI088 behind the firmware of the Crazyflie (sensors_bmi088_bmp3xx.c). Before take-off the mean of 512 samples
 of the gyroscope is subtracted, so the mean of their noise is the bias that is left; the accelerometer is scaled to 1 g,
 which leaves no bias along gravity. Behind the filters of the chip are Butterworth filters of second order with corners
 of 80 and 30 Hz; the corners here are those of a filter of first order that delays as much as both together."""
