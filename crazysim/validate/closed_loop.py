@@ -94,14 +94,15 @@ def read_flight(path: str | Path) -> Flight:
     with np.load(path, allow_pickle=False) as file:
         if missing := [name for name in COLUMNS if name not in file.files]:
             raise ConfigError(f"{path.name}: expected columns {', '.join(COLUMNS)}, got none of {', '.join(missing)}")
-        t, *columns = [np.asarray(file[name], np.float64) for name in COLUMNS]
-    rest, commanded = columns[2][0], np.flatnonzero(columns[5] > 0)
+        t = np.asarray(file["t"], np.float64)
+        logged, given = (np.stack([file[k] for k in names]).astype(np.float64) for names in (COLUMNS[1:4], COLUMNS[4:]))
+    rest, commanded = logged[2, 0], np.flatnonzero(given[2] > 0)
     if not len(commanded):
         raise ConfigError(f"{path.name}: expected a setpoint above the floor, got none")
-    grid = np.arange(t[commanded[0]], t[commanded[-1]], 1 / FREQ)
-    pos = np.stack([np.interp(grid, t, x) for x in columns[:3]], axis=-1)
+    grid = np.arange(float(t[commanded[0]]), float(t[commanded[-1]]), 1 / FREQ)
+    pos = np.stack([np.interp(grid, t, x) for x in logged], axis=-1)
     nearest = np.searchsorted((t[1:] + t[:-1]) / 2, grid)
-    setpoint = np.stack([x[nearest] for x in columns[3:]], axis=-1) * [1, 1, 1, np.pi / 180]
+    setpoint = given[:, nearest].T * [1, 1, 1, np.pi / 180]
     pos[:, 2], setpoint[:, 2] = pos[:, 2] - rest, setpoint[:, 2] - rest
     return Flight(path.stem, setpoint, pos)
 

@@ -38,12 +38,12 @@ DEVIATIONS = {
     "range": FAR_NOISE[2],
     "distance": 0.25,
     "difference": 0.15,
-    "sweep": 0.0004,
+    "sweep": 0.001,
 }
 """Standard deviations that the firmware assumes: position, m, and attitude, rad, of motion capture
 (crtp_localization_service.c), flow, pixels (flowdeck_v1v2.c), scale of that of the time of flight, m (zranger2.c),
-distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), angle of a light plane, rad
-(lighthouse_position_est.c)."""
+distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), angle of a light plane of a station of the
+second generation, rad (lighthouse_position_est.c, sweepStdLh2)."""
 Std = Mapping[str, Array]
 """Standard deviations by the names of ``DEVIATIONS``."""
 

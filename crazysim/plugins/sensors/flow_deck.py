@@ -125,8 +125,9 @@ class TimeOfFlight(Sensor):
     resolution: ArrayLike | None = parameter(default=0.001, positive=True)
     """Smallest difference of two measurements, m; None for none. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
-    freq: int | None = 10
-    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
+    freq: int | None = 25
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step. The firmware takes one in at least
+    25 ms (zranger2.c), and 25 Hz is the largest divisor of 500 below; 40 divides 1000."""
     name: str = "time_of_flight"
 
     @property

@@ -30,8 +30,8 @@ class RadarData(PyTree):
 
     pos: Array = leaf("shared", 2)
     """Positions of the radars, world frame, m. (n_radars, 3)"""
-    size: Array = leaf("shared", 1)
-    """Half the range of each radar, m. (n_radars,)"""
+    max_range: Array = leaf("shared", 1)
+    """Length of each lobe, m. (n_radars,)"""
     exponent: Array = leaf("shared", 1)
     """Exponents of the lobes, 1: larger ones are thinner near the radar. (n_radars,)"""
     height_scale: Array = leaf("shared", 1)
@@ -45,20 +45,20 @@ class RadarData(PyTree):
     def margin_at(self, pos: Array) -> Array:
         """Return the depth of a place within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
         offset = pos[..., None, :] - self.pos
-        return lobe_margin(offset, self.size, self.exponent, self.height_scale, self.tilt)
+        return lobe_margin(offset, self.max_range, self.exponent, self.height_scale, self.tilt)
 
 
 class Radar(Plugin):
     """Radars, each of which detects the drones within its lobe; nothing hides a drone.
 
-    The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: in all directions the
-    range is twice ``size``. Settings are one for all radars, or one for each.
+    The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: the range is the same in
+    all directions. Settings are one for all radars, or one for each.
     """
 
     pos: ArrayLike = parameter()
     """Positions of the radars, world frame, m. (3,) or (n_radars, 3)"""
-    size: ArrayLike = parameter(default=5.0)
-    """Half the range, m. () or (n_radars,)"""
+    max_range: ArrayLike = parameter(default=10.0)
+    """Length of the lobe, m. () or (n_radars,)"""
     exponent: ArrayLike = parameter(default=1.3)
     """Exponent of the lobe, 1: larger ones are thinner near the radar. () or (n_radars,)"""
     height_scale: ArrayLike = parameter(default=1.0)
@@ -78,7 +78,7 @@ class Radar(Plugin):
         dtype = sim.data.states.pos.dtype
         found = {}
         for name, low, high in (
-            ("size", 1e-6, np.inf),
+            ("max_range", 1e-6, np.inf),
             ("exponent", 0.0, np.inf),
             ("height_scale", 1e-6, np.inf),
             ("tilt", -math.pi / 2, math.pi / 2),
@@ -118,13 +118,13 @@ class Radar(Plugin):
         detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
         record = self.read(sim.data)
         for k, pos in enumerate(np.asarray(record.pos, np.float64)):
-            shape = (float(x[k]) for x in (record.size, record.exponent, record.height_scale, record.tilt))
+            shape = (float(x[k]) for x in (record.max_range, record.exponent, record.height_scale, record.tilt))
             for curve in lobe_curves(*shape):
                 sim.scene.renderer.overlays.line(pos + curve, ALARM if detected[k] else CLEAR, 2.0, 2.0)
 
 
 @compiled()
-def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
+def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
     """Return the depth of a place within a radar's lobe along the normal to its axis, m, negative outside. (...)
 
     With a half the range, the lobe is the teardrop ``x = a (1 - cos t)``, ``|z| <= h a sin(t) sin(t / 2)^e``, t from 0
@@ -133,13 +133,13 @@ def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array
 
     Args:
         offset: Position relative to the radar, world frame, m. (..., 3)
-        size: Half the range a, m. (...)
+        max_range: Length of the lobe, 2 a, m. (...)
         exponent: Exponent e, 1. (...)
         height_scale: Factor h of the thickness, 1. (...)
         tilt: Elevation of the lobe, rad. (...)
     """
     away, up = safe_norm(offset[..., :2])[..., 0], offset[..., 2]
-    c, s = jnp.cos(tilt), jnp.sin(tilt)
+    size, c, s = 0.5 * max_range, jnp.cos(tilt), jnp.sin(tilt)
 
     def margin(away: Array) -> Array:
         along, across = c * away + s * up, c * up - s * away
@@ -154,9 +154,9 @@ def lobe_margin(offset: Array, size: Array, exponent: Array, height_scale: Array
     return jnp.maximum(margin(away), margin(-away))
 
 
-def lobe_curves(size: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
+def lobe_curves(max_range: float, exponent: float, height_scale: float, tilt: float) -> list[np.ndarray]:
     """Return outlines of a lobe relative to its radar, m: teardrops in vertical planes, and circles. (n, 3) each"""
-    t = np.linspace(0.0, math.pi, N_POINTS)
+    size, t = 0.5 * max_range, np.linspace(0.0, math.pi, N_POINTS)
     along, across = size * (1 - np.cos(t)), height_scale * size * np.sin(t) * np.sin(t / 2) ** exponent
     along, across = np.concatenate([along, along[::-1]]), np.concatenate([across, -across[::-1]])
     away = along * math.cos(tilt) - across * math.sin(tilt)

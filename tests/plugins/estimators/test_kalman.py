@@ -190,7 +190,7 @@ def test_all_sensors_on_all_engines():
         aids = [
             MotionCapture(noise=0.01, freq=20, delay=0.01),
             OpticalFlow(noise=0.2),
-            TimeOfFlight(freq=25),
+            TimeOfFlight(),
             UWB(np.asarray(ANCHORS)[:2], noise=0.1),
             UWB(np.asarray(ANCHORS)[:2], noise=0.1, tdoa=True, name="tdoa"),
             Lighthouse([[-2, -2, 2.5]], [[0, 0.5, 0.8]], noise=4e-4),

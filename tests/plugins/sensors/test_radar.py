@@ -8,13 +8,13 @@ from cases import with_states
 from crazysim import ConfigError, Radar, Sim
 from crazysim.plugins.sensors.radar import lobe_curves, lobe_margin
 
-LOBES = [(5.0, 1.3, 1.0, 0.0), (3.0, 2.5, 0.6, 0.3), (4.0, 0.0, 1.0, 0.0), (4.0, 2.0, 0.7, -0.2)]
+LOBES = [(10.0, 1.3, 1.0, 0.0), (6.0, 2.5, 0.6, 0.3), (8.0, 0.0, 1.0, 0.0), (8.0, 2.0, 0.7, -0.2)]
 
 
 @pytest.mark.parametrize("lobe", LOBES)
 def test_the_outline_is_where_the_margin_changes_sign(lobe, x64):
     """The parametric curve of the drawing bounds the closed form of the test."""
-    size, _, _height, tilt = lobe
+    size, tilt = lobe[0] / 2, lobe[3]
     outline = lobe_curves(*lobe)[0]
     middle = np.array([size * np.cos(tilt), 0.0, size * np.sin(tilt)])  # on the axis of the lobe
     for share, inside in ((0.98, True), (1.02, False)):
@@ -25,16 +25,16 @@ def test_the_outline_is_where_the_margin_changes_sign(lobe, x64):
 
 def test_the_lobe_by_hand_and_its_symmetry(rng):
     """At half the range, u = 1: |z| <= h a 2^(-e / 2)."""
-    margin = lobe_margin(np.float32([[3.0, 4.0, 1.0], [-4.0, 3.0, -1.0]]), 5.0, 1.3, 0.8, 0.0)
+    margin = lobe_margin(np.float32([[3.0, 4.0, 1.0], [-4.0, 3.0, -1.0]]), 10.0, 1.3, 0.8, 0.0)
     np.testing.assert_allclose(margin, 0.8 * 5 * 2**-0.65 - 1, rtol=1e-6)
-    up = lobe_margin(np.float32([[5.0, 0.0, 1.5], [5.0, 0.0, -1.5]]), 5.0, 1.3, 0.5, 0.3)
+    up = lobe_margin(np.float32([[5.0, 0.0, 1.5], [5.0, 0.0, -1.5]]), 10.0, 1.3, 0.5, 0.3)
     np.testing.assert_array_equal(np.asarray(up) > 0, [True, False])  # positive tilt raises the lobe
-    assert float(lobe_margin(np.float32([10.1, 0, 0]), 5.0, 1.3, 1.0, 0.0)) < 0
+    assert float(lobe_margin(np.float32([10.1, 0, 0]), 10.0, 1.3, 1.0, 0.0)) < 0
 
 
 def test_law_07_margin_and_gradient_are_finite_everywhere():
     points = np.float32([[0, 0, 0], [10, 0, 0], [0, 0, 3.0], [1e6, 0, 1e6], [1e-9, 0, 0], [5, 0, 0]])
-    margin = jax.value_and_grad(lambda p, e: lobe_margin(p, 5.0, e, 1.0, 0.2))
+    margin = jax.value_and_grad(lambda p, e: lobe_margin(p, 10.0, e, 1.0, 0.2))
     each = jax.jit(jax.vmap(margin, in_axes=(0, None)))
     for e in (0.0, 1.3):
         value, slope = each(points, e)
@@ -48,7 +48,7 @@ def test_detection_counts_time_and_is_reset():
         sim.data, pos=np.array([[[5, 0, 4.0], [6, 0, 9.3]], [[9, 0, 4.0], [11, 0, 4]], [[0, 2, 4], [0, 2, 9]]])
     )
     sim.build_default_data()
-    radar = sim.add(Radar([[0, 0, 4.0], [5.0, 0.0, 9.0]], size=[5.0, 2.0], exponent=1.3))
+    radar = sim.add(Radar([[0, 0, 4.0], [5.0, 0.0, 9.0]], max_range=[10.0, 4.0], exponent=1.3))
     expected = [[[1, 0], [0, 1]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]]
     np.testing.assert_array_equal(radar.detects(sim.data), expected)
     sim.step(5)
@@ -78,8 +78,8 @@ def test_the_lobe_is_drawn_in_red_where_it_detects():
     ({"pos": (0, 0)}, "expected pos"),
     ({"pos": np.zeros((0, 3))}, "expected pos"),
     ({"pos": (0, 0, np.nan)}, "expected pos"),
-    ({"pos": (0, 0, 0), "size": -1.0}, "size to be finite and positive"),
-    ({"pos": (0, 0, 0), "size": (1.0, 2.0)}, "size of shape"),
+    ({"pos": (0, 0, 0), "max_range": -1.0}, "max_range to be finite and positive"),
+    ({"pos": (0, 0, 0), "max_range": (1.0, 2.0)}, "max_range of shape"),
     ({"pos": (0, 0, 0), "exponent": -1.0}, "exponent"),
     ({"pos": (0, 0, 0), "tilt": 30.0}, "tilt to be finite and from -1.571 to 1.571"),
 ])  # fmt: skip
