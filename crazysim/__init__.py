@@ -17,7 +17,16 @@ from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 from crazysim.lazy import lazy
-from crazysim.plugins.effects import Battery, Downwash, GroundEffect, Latency, MotorFailure, Wind, WindField
+from crazysim.plugins.effects import (
+    Battery,
+    Downwash,
+    GroundEffect,
+    Latency,
+    MotorFailure,
+    RotorAerodynamics,
+    Wind,
+    WindField,
+)
 from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.version import __version__
@@ -73,6 +82,7 @@ __all__ = [
     "PyTree",
     "Radar",
     "RangeFinder",
+    "RotorAerodynamics",
     "RotorJet",
     "Sensor",
     "SharedLoad",

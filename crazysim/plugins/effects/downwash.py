@@ -16,19 +16,18 @@ from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
 from crazysim.core.plugin import Placement, Plugin, Simulation, of_airframes, parameter
 from crazysim.core.stage import stage
+from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
-from crazysim.plugins.effects.moving_air import Exposed, checked_propeller_radius, require_drag, with_moving_air
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.plugins.effects.moving_air import Air, Exposed, checked_propeller_radius, require_drag, with_moving_air
+from crazysim.pytree import leaf, on_device
 
 DECAY, SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,
 Turbulent Flows, 2000, table 5.1)."""
-AIR_DENSITY = 1.225
-"""Density of air at sea level, kg/m^3 (ISO 2533)."""
 
 
-class DownwashData(PyTree):
+class DownwashData(Air):
     """Velocity of the air from the other drones of its world at every drone."""
 
     diameter: Array = leaf("parameter", 1, (1,))
@@ -37,6 +36,10 @@ class DownwashData(PyTree):
     """Density of air, kg/m^3. (1,)"""
     air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air from other drones, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+    def at_drone(self, data: SimData) -> Array:
+        """Return the velocity of the air from other drones."""
+        return self.air_vel
 
 
 class Downwash(Plugin):
@@ -61,7 +64,7 @@ class Downwash(Plugin):
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force that the air from other drones adds to the drag."""
-        return with_moving_air(data, self.read(data).air_vel)
+        return with_moving_air(data, self.read(data).at_drone(data))
 
     def sum_jets(self, data: SimData) -> SimData:
         """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.

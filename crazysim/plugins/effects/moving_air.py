@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
@@ -25,6 +26,20 @@ class Exposed(PyTree):
     wind_vel: Array | None = leaf("drone", 1, (3,))
     """Velocity of the air at the body from all wind fields, world frame, m/s; None without drag.
     (n_worlds, n_drones, 3)"""
+
+
+class Air(PyTree):
+    """Record of an effect that moves the air at the drones."""
+
+    def at_drone(self, data: SimData) -> Array:
+        """Return the velocity of the air at one drone, world frame, m/s. (3,)"""
+        raise NotImplementedError
+
+
+def air_velocity(data: SimData) -> Array:
+    """Return the velocity of the air at one drone, the sum of all effects that move it, world frame, m/s. (3,)"""
+    moved = [record.at_drone(data) for record in data.plugins.values() if isinstance(record, Air)]
+    return sum(moved, jnp.zeros_like(data.states.vel))
 
 
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:

@@ -16,8 +16,8 @@ from crazysim.core.random import drone_key
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.effects.moving_air import require_drag, with_moving_air
-from crazysim.pytree import PyTree, leaf
+from crazysim.plugins.effects.moving_air import Air, require_drag, with_moving_air
+from crazysim.pytree import leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
 
 FOOT = 0.3048
@@ -31,7 +31,7 @@ MIN_AIRSPEED = 1.0
 the gust at such a drone would never change."""
 
 
-class WindData(PyTree):
+class WindData(Air):
     """Velocity of the air at every drone."""
 
     velocity: Array = leaf("parameter", 1, (3,))
@@ -48,6 +48,10 @@ class WindData(PyTree):
     """States of the shaping filters at unit variance, 1; None without gusts. (n_worlds, n_drones, 5)"""
     gust: Array | None = leaf("drone", 1, (3,))
     """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
+
+    def at_drone(self, data: SimData) -> Array:
+        """Return the wind at the drone."""
+        return self.velocity_at(data.states.pos, ground_below(data))
 
     def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
         """Return the mean wind at a place, above ground of some height, m (..., 1), world frame, m/s. (..., 3)"""
@@ -114,7 +118,7 @@ class Wind(Plugin):
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force that the wind adds to the drag."""
-        return with_moving_air(data, self.read(data).velocity_at(data.states.pos, ground_below(data)))
+        return with_moving_air(data, self.read(data).at_drone(data))
 
     def advance_gust(self, data: SimData) -> SimData:
         """Advance the gust at one drone by a step."""

@@ -15,11 +15,11 @@ from crazysim.core.random import world_key
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import LARGEST_FUSED, Grid, interpolate
-from crazysim.plugins.effects.moving_air import Exposed, require_drag, with_moving_air
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.plugins.effects.moving_air import Air, Exposed, require_drag, with_moving_air
+from crazysim.pytree import leaf, on_device
 
 
-class WindFieldData(PyTree):
+class WindFieldData(Air):
     """Velocities of the air on a grid, and at every drone."""
 
     field: Array = leaf("shared", 4)
@@ -39,6 +39,10 @@ class WindFieldData(PyTree):
     (n_worlds, n_drones, 3)"""
     air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
+
+    def at_drone(self, data: SimData) -> Array:
+        """Return the velocity of the air that was looked up at the drone."""
+        return self.air_vel
 
     def velocity_at(self, pos: Array) -> Array:
         """Return the velocity of the air at a place, world frame, m/s. (..., 3)"""
@@ -95,7 +99,7 @@ class WindField(Plugin):
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force that the wind adds to the drag."""
-        return with_moving_air(data, self.read(data).air_vel)
+        return with_moving_air(data, self.read(data).at_drone(data))
 
     def displace(self, data: SimData) -> SimData:
         """Draw the displacement of the grid for an episode; of one drone."""

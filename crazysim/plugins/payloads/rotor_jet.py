@@ -14,9 +14,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
+from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.downwash import AIR_DENSITY, collective_thrust, jet, mean_rotor_vel, stream_diameter
+from crazysim.plugins.effects.downwash import collective_thrust, jet, mean_rotor_vel, stream_diameter
 from crazysim.plugins.effects.grid import LARGEST_FUSED, interpolate, is_inside
 from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
 from crazysim.plugins.payloads.body import Colliding

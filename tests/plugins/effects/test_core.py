@@ -14,6 +14,7 @@ from crazysim import (
     Latency,
     MotorFailure,
     Plugin,
+    RotorAerodynamics,
     Sim,
     Wind,
     WindField,
@@ -31,6 +32,7 @@ ON = {
     Downwash: {},
     GroundEffect: {},
     Latency: {"delay": 2},
+    RotorAerodynamics: {"flapping": 1e-8, "ceiling": 4.0},
     MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
     Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
     WindField: {

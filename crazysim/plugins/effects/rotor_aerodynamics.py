@@ -1,0 +1,163 @@
+"""Rotors in moving air: rotor drag, thrust that depends on the flow, flapping, and a ceiling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.drones import Airframe
+from crazysim.drones.estimate import AIR_DENSITY
+from crazysim.dynamics.inflow import blade_coefficient, ceiling_factor, disc_factor, thrust_in_flight
+from crazysim.dynamics.models import GRAVITY
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.ground_effect import rotor_positions
+from crazysim.plugins.effects.moving_air import air_velocity, checked_propeller_radius, require_rotors
+from crazysim.pytree import PyTree, leaf, on_device
+
+
+class RotorAerodynamicsData(PyTree):
+    """Parameters of rotors in moving air; none changes with time."""
+
+    drag: Array = leaf("parameter", 1, (1,))
+    """Drag of a rotor across its axis per velocity and rotor speed, N s^2/(m rad). (1,)"""
+    blade: Array = leaf("parameter", 1, (1,))
+    """Loss of thrust per inflow velocity and rotor speed, N s^2/(m rad). (1,)"""
+    flapping: Array = leaf("parameter", 1, (1,))
+    """Moment at a hub per velocity across its axis and rotor speed, N s^2/rad. (1,)"""
+    propeller_radius: Array = leaf("parameter", 1, (1,))
+    """Radius of a propeller, m. (1,)"""
+    air_density: Array = leaf("parameter", 1, (1,))
+    """Density of air, kg/m^3. (1,)"""
+    hub_pos: Array = leaf("parameter", 2)
+    """Positions of the hubs, body frame, m. (n_rotors, 3)"""
+    ceiling: Array | None = leaf("parameter", 1, (1,))
+    """Height of the ceiling, world frame, m; None for none. (1,)"""
+
+
+class RotorAerodynamics(Plugin):
+    """Forces of the air on every rotor, which replace the airframe's linear drag; needs rotors.
+
+    Each rotor has the velocity of its own hub relative to the air, with all winds and downwash. Across its axis it has
+    a drag ``-k_d omega v`` at the hub, which tips the drone back; along its axis it has the thrust of blade element and
+    momentum theory: less in climbs, more in forward flight. The defaults of ``drag`` and ``inflow`` give
+    the airframe's linear drag for small velocities around hover.
+    """
+
+    drag: ArrayLike | None = parameter(default=None)
+    """Drag of a rotor per velocity across its axis and rotor speed (k_d of RotorPy), N s^2/(m rad) = kg/rad; None for
+    that of the airframe's linear drag in hover, the mean of x and y. () or (n_worlds, n_drones)"""
+    inflow: ArrayLike | None = parameter(default=None)
+    """Loss of thrust of a hovering rotor per axial velocity and rotor speed (k_z of RotorPy), N s^2/(m rad) = kg/rad;
+    None for that of the airframe's linear drag along z in hover. () or (n_worlds, n_drones)"""
+    flapping: ArrayLike = parameter(default=0.0, low=0.0)
+    """Moment of flapping blades at a hub per velocity across its axis and rotor speed, which tips the drone back,
+    N s^2/rad = kg m/rad. Stiffness of blades and hubs is not part of airframes, so that there is no default but zero.
+    () or (n_worlds, n_drones)"""
+    hub_height: ArrayLike | None = parameter(default=None)
+    """Height of the hubs above the centre of mass, m, the lever arm of the drag; None for the airframe's
+    ``shape.propeller_height`` above ``rotors.position``. () or (n_worlds, n_drones)"""
+    ceiling: ArrayLike | None = parameter(default=None)
+    """Height of a flat ceiling, below which rotors give more thrust, world frame, m; None for none.
+    () or (n_worlds, n_drones)"""
+    propeller_radius: ArrayLike | None = parameter(default=None)
+    """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
+    air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
+    """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
+    name: str = "rotor_aerodynamics"
+    order: ClassVar[int] = 1  # after winds, whose drag it replaces, and after effects that change the thrust curves
+
+    def record(self, sim: Simulation) -> RotorAerodynamicsData:
+        """Return the parameters."""
+        require_rotors(sim, "rotor aerodynamics")
+        radius = checked_propeller_radius(sim, self.propeller_radius)
+        density = check_parameter(sim, "air_density", self.air_density, positive=True)
+        inflow = np.asarray(self._own(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
+        thrust, speed = of_airframes(sim, hover_thrust)[..., None], of_airframes(sim, hover_speed)[..., None]
+        disc = np.asarray(disc_factor(radius, density), np.float64)
+        blade = blade_coefficient(inflow * speed, thrust, speed, disc)
+        if not np.all((blade > 0) & np.isfinite(blade)):
+            most = np.min(np.sqrt(thrust * disc) / speed)
+            raise ConfigError(
+                f"expected inflow below {most:.3g} N s^2/(m rad), the slope of blades without limit at this propeller "
+                f"radius and air density, got {np.max(inflow):.3g}. Use RotorAerodynamics(inflow=...) with a "
+                f"smaller number."
+            )
+        return self.filled(
+            sim,
+            RotorAerodynamicsData,
+            drag=self._own(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),
+            blade=check_parameter(sim, "blade", blade),
+            propeller_radius=radius,
+            hub_pos=self._hub_positions(sim),
+        )
+
+    def _own(self, sim: Simulation, name: str, of_drag: Callable[[np.ndarray], float]) -> Array:
+        """Return a coefficient as it is set, or else from the airframes' linear drag in hover."""
+        given = getattr(self, name)
+        if given is None:
+            drag = of_airframes(sim, lambda a: of_drag(a.matrix("drag.coefficients")) / (a.n_rotors * hover_speed(a)))
+            given = drag[..., None] if drag.ndim else drag
+            if not np.all(given > 0):
+                raise ConfigError(
+                    f"expected {name} of the rotors, as drone {sim.airframes[0].name!r} has no linear drag that it "
+                    f"follows from. Use RotorAerodynamics({name}=...); RotorPy has drag 1.0e-6 and inflow 7.6e-7 "
+                    f"N s^2/(m rad) for the Crazyflie 2.0."
+                )
+        return check_parameter(sim, name, given, positive=True)
+
+    def _hub_positions(self, sim: Simulation) -> Array:
+        """Return the positions of the hubs, body frame, m. (..., n_rotors, 3)"""
+        height = self.hub_height
+        if height is None:
+            height = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_height", ()))
+        up = np.asarray(check_parameter(sim, "hub_height", height))[..., None]
+        pos = np.asarray(rotor_positions(sim))
+        return on_device(pos + up * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the forces and torques of the rotors in place of the linear drag."""
+        record, s, p = self.read(data), data.states, data.params
+        vel = rotation.rotate_inverse(s.quat, s.vel - air_velocity(data))
+        hub_vel = vel + rotation.cross(s.ang_vel, record.hub_pos)
+        u, v, axial = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
+        speed = RPM_TO_RAD_S * s.rotor_vel
+        static = curve(s.rotor_vel, p.rpm2thrust)
+        factor: Array | float = 1.0
+        if record.ceiling is not None:
+            height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.hub_pos)[..., 2]
+            factor = ceiling_factor(record.ceiling - height, record.propeller_radius)
+        thrust = thrust_in_flight(
+            static, speed, axial, u * u + v * v, record.blade, record.propeller_radius, record.air_density, factor
+        )
+        gain = thrust - jnp.where(static > 0, static, 0.0)
+
+        loss, bend = record.drag * speed, record.flapping * speed
+        forces = jnp.stack([-loss * u, -loss * v, gain], axis=-1)
+        moments = jnp.stack([bend * v, -bend * u, jnp.zeros_like(bend)], axis=-1)
+        force = jnp.sum(forces, axis=-2) - rotation.matvec(p.drag_matrix, vel)
+        torque = jnp.sum(rotation.cross(record.hub_pos, forces) + moments, axis=-2)
+        return data.replace(
+            states=s.replace(
+                force=rotation.rotate(s.quat, force, offset=s.force),
+                torque=rotation.rotate(s.quat, torque, offset=s.torque),
+            )
+        )
+
+
+def hover_thrust(airframe: Airframe) -> float:
+    """Return the thrust of each rotor in hover, N."""
+    return float(airframe.value("rigid_body.mass")) * float(np.linalg.norm(GRAVITY)) / airframe.n_rotors
+
+
+def hover_speed(airframe: Airframe) -> float:
+    """Return the mean speed of the rotors in hover, rad/s."""
+    return float(np.mean(RPM_TO_RAD_S * airframe.rotor_vel([hover_thrust(airframe)])))

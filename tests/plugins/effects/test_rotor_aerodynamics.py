@@ -1,0 +1,253 @@
+"""Rotors in moving air: against roots of the theories' equations, hand calculation, and recorded RotorPy wrenches."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import hover_rotor_state, vectors, with_states
+from hypothesis import given
+
+from crazysim import ConfigError, RotorAerodynamics, Sim, Wind, load_airframe, stage
+from crazysim.dynamics import inflow
+
+R, RHO = 0.0275, 1.225
+WEIGHT = 0.0434 * 9.81
+HOVER = 1661.27  # rad/s: 4.407354891648379e-10 n^2 - 3.133427287299859e-7 n = 0.0434 * 9.81 / 4 at n = 15,864 rpm
+DRAG_XY, DRAG_Z = 0.021643637770852733, 0.02477138502714662
+QUAD = {"control": "rotor_vel", "engine": "interpret"}
+
+
+def hover(n_worlds=1, drone="cf21B_500", **settings):
+    """Return a simulation of hovering drones with rotors in moving air."""
+    sim = Sim(n_worlds, drone=drone, **QUAD)
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
+    return sim, sim.add(RotorAerodynamics(**settings))
+
+
+def wrench(sim, plugin, **states):
+    """Return force, N, and torque, N m, that the plugin adds in each world, world frame. (n_worlds, 3) each"""
+    found = stage("drone")(plugin.influence)(with_states(sim.data, **states)).states
+    return np.asarray(found.force, float)[:, 0], np.asarray(found.torque, float)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def quad():
+    return hover(3)
+
+
+@functools.cache
+def compiled_thrust():
+    return jax.jit(inflow.thrust_in_flight)
+
+
+def thrust(static, ang_vel, axial, across, blade, factor=1.0):
+    with jax.enable_x64(True):
+        values = [np.float64(x) for x in (static, ang_vel, axial, across**2, blade, R, RHO, factor)]
+        return float(compiled_thrust()(*values))
+
+
+def blade():
+    disc = inflow.disc_factor(R, RHO)
+    return float(inflow.blade_coefficient(DRAG_Z / 4, WEIGHT / 4, HOVER, disc))
+
+
+@pytest.mark.parametrize("axial", [-0.5, 0.0, 1.0, 6.0])
+@pytest.mark.parametrize("across", [0.0, 1.0, 5.0, 12.0])
+@pytest.mark.parametrize("factor", [1.0, 1.8])
+def test_the_thrust_solves_blade_element_and_momentum_theory(axial, across, factor):
+    """The inflow is the positive root of ``(g 2 rho A)^2 (w - u)^2 (V^2 + w^2) = (B - b omega w)^2``."""
+    static, speed, b = 0.1, 1600.0, blade()
+    disc = 2 * RHO * np.pi * R**2
+    lift = static + b * speed * np.sqrt(static / disc)
+    lift *= 1 + 1.5 * across**2 / ((speed * R) ** 2 + across**2)
+    momentum = (disc * factor**2) ** 2 * np.polymul(np.polymul([1, -axial], [1, -axial]), [1, 0, across**2])
+    roots = np.roots(np.polysub(momentum, np.polymul([-b * speed, lift], [-b * speed, lift])))
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    expected = lift - b * speed * real
+    same_sign = (real > 0) & (np.sign(real - axial) * np.sign(expected) > 0)  # squares have lost the sign
+    assert same_sign.sum() == 1
+    # three Newton steps, and 1 mm/s in quadrature for stopped rotors
+    np.testing.assert_allclose(thrust(static, speed, axial, across, b, factor), expected[same_sign][0], rtol=1e-5)
+
+
+def test_the_thrust_worked_out_by_hand():
+    """b omega = 2 d y / (y - d), d = 6.193e-3, y = 0.10644 / 4.276 = 0.02489 N s/m: 0.01649 N s/m."""
+    b = blade()
+    np.testing.assert_allclose(b * HOVER, 0.01649, rtol=1e-3)
+    # positive root of 5.821e-3 w^2 + (0.01649 - 5.821e-3) w = 0.10644 + 0.01649 * 4.276
+    w = (-0.010669 + np.sqrt(0.010669**2 + 4 * 5.821e-3 * 0.17695)) / (2 * 5.821e-3)
+    np.testing.assert_allclose(thrust(WEIGHT / 4, HOVER, 1.0, 0.0, b), 0.17695 - 0.01649 * w, rtol=1e-3)
+    assert 0.0995 < 0.17695 - 0.01649 * w < 0.1015
+
+
+def test_a_rotor_gains_in_forward_flight_and_loses_in_climbs():
+    b = blade()
+    sideways = [thrust(0.1, 1600.0, 0.0, v, b) for v in np.linspace(0, 15, 20)]
+    upwards = [thrust(0.1, 1600.0, u, 0.0, b) for u in np.linspace(-15, 15, 20)]
+    assert np.all(np.diff(sideways) > 0)
+    assert np.all(np.diff(upwards) < 0)
+    assert sideways[-1] < 2 * 0.1
+    assert thrust(0.0, 0.0, 5.0, 5.0, b) == thrust(0.0, 0.0, -5.0, 0.0, b) == 0.0, "a stopped rotor gives none"
+
+
+def test_a_ceiling_gives_thrust_by_mass_momentum_and_energy():
+    """The far wake solves ``rho A v v_w = T - rho A v^2 (R / d)^2 / 16`` and ``T = rho A v_w^2 / 2`` at v = 1."""
+    for gap in (0.1 * R, R, 5 * R):
+        wake = max(np.roots([0.5, -1.0, -((R / gap) ** 2) / 16]))
+        found = float(inflow.ceiling_factor(np.float64(gap), np.float64(R)))
+        np.testing.assert_allclose(found, wake / 2, rtol=1e-5)
+    assert inflow.ceiling_factor(np.float64(-1.0), R) == inflow.ceiling_factor(np.float64(0.0), R)
+
+
+def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(quad):
+    """What is added vanishes in hover, and is of second order for small velocities in the body's axes."""
+    sim, plugin = quad
+    force, torque = wrench(sim, plugin)
+    np.testing.assert_allclose(force, 0.0, atol=1e-6)
+    np.testing.assert_allclose(torque, 0.0, atol=1e-8)
+    force, torque = wrench(sim, plugin, vel=0.02 * np.eye(3)[:, None])
+    # second order: 0.02 m/s over an induced velocity of 4.3 m/s, and rounding of float32 at 0.4 N
+    np.testing.assert_allclose(force, 0.0, atol=0.02 * DRAG_Z * 0.01)
+    np.testing.assert_allclose(
+        torque, [[0, -0.014 * 0.02 * DRAG_XY, 0], [0.014 * 0.02 * DRAG_XY, 0, 0], [0, 0, 0]], atol=1e-8
+    )
+
+
+def test_rotor_drag_grows_with_the_speed_of_the_rotors(quad):
+    """At twice the hover speed the drag is twice the airframe's: D v more than what the dynamics have."""
+    sim, plugin = quad
+    faster = 2 * hover_rotor_state(sim.data)
+    force, _ = wrench(sim, plugin, vel=[0.5, 0, 0], rotor_vel=faster)
+    np.testing.assert_allclose(force[:, :2], np.broadcast_to([-0.5 * DRAG_XY, 0], (3, 2)), rtol=1e-3, atol=1e-6)
+
+
+@given(vel=vectors(2, 8.0), rate=vectors(3, 3.0))
+def test_law_08_drag_in_still_air_does_no_positive_work(quad, vel, rate):
+    """Across the axes of the rotors, and on rotation: the whole wrench with the linear drag of the dynamics."""
+    sim, plugin = quad
+    force, _ = wrench(sim, plugin, vel=[*vel, 0.0])
+    drag = force[0, :2] - DRAG_XY * vel
+    assert drag @ vel <= 1e-7
+    np.testing.assert_allclose(drag, -DRAG_XY * vel, rtol=1e-3, atol=1e-6)
+    _, torque = wrench(sim, plugin, ang_vel=rate)
+    assert torque[0] @ rate <= 1e-9
+
+
+@pytest.fixture(scope="module")
+def crazyflie_20():
+    """The Crazyflie 2.0 of RotorPy 3.0.0 (BSD-3-Clause): mass, arm and thrust curve of its ``crazyflie_params``."""
+    tables = dict(load_airframe("cf2x_L250").tables)
+    arm = 0.043 * 0.70710678118
+    position = np.array([[arm, arm, 0], [arm, -arm, 0], [-arm, -arm, 0], [-arm, arm, 0]])
+    curve = np.array([0, 0, 2.3e-8 * (2 * np.pi / 60) ** 2])
+    tables["rotors"] = dict(tables["rotors"]) | {"position": position, "thrust_curve": curve}
+    tables["rigid_body"] = dict(tables["rigid_body"]) | {"mass": 0.03}
+    sim = Sim(3, drone=tables, **QUAD)
+    plugin = RotorAerodynamics(drag=10.2506e-7, inflow=7.553e-7, flapping=2e-8, hub_height=0.0)
+    return sim, sim.add(plugin)
+
+
+def test_the_wrench_is_that_of_rotorpy_where_both_are_linear(crazyflie_20):
+    """``Multirotor(crazyflie_params).compute_body_wrench`` of RotorPy 3.0.0, aero=True less aero=False, k_flap = 2e-8.
+
+    Rotors at 1788.55 rad/s, for the velocities, body rates and factors of the rotor speeds below. RotorPy's moment of
+    flapping tips a drone into the direction of flight, ours back. Its thrust is linear in the axial velocity, ours has
+    a curvature: 3 % at 0.15 m/s of an induced velocity of 4.2 m/s.
+    """
+    vel = np.array([[0.03, -0.02, 0.1], [0.01, 0.02, -0.15], [0.02, 0.01, 0.05]])
+    rate = np.array([[0, 0, 0], [0.5, -0.4, 0.8], [1.0, -2.0, 0.5]])
+    factor = np.array([[1, 1, 1, 1], [1, 1, 1, 1], [1.02, 0.98, 1.01, 0.99]])
+    force = np.array([[-0.00022000459, 0.00014666973, -0.00054035689],
+                      [-7.3334865e-05, -0.00014666973, 0.00081053533],
+                      [-0.00014611228, -7.3334865e-05, -0.00027099994]])  # fmt: skip
+    torque = np.array([[2.8616809e-06, 4.2925213e-06, 0],
+                       [-5.3594806e-06, 3.4290802e-06, -1.0847693e-05],
+                       [-6.6173825e-06, 1.2916937e-05, -6.7575103e-06]])  # fmt: skip
+    sim, plugin = crazyflie_20
+    speed = 1788.5505426 * factor
+    states = {"vel": vel[:, None], "ang_vel": rate[:, None], "rotor_vel": 30 / np.pi * speed[:, None]}
+    ours, moment = wrench(sim, plugin, **states)
+    ours = ours - vel * [0.014953790232821078, 0.014953790232821078, 0.013900090000325344]  # the drag that is replaced
+    hubs = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]]) * 0.043 * 0.70710678118
+    local = vel[:, None] + np.cross(rate[:, None], hubs)
+    flapping = 2e-8 * np.sum(speed[..., None] * np.cross(local, [0.0, 0.0, 1.0]), axis=1)
+    np.testing.assert_allclose(ours[:, :2], force[:, :2], rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(ours[:, 2], force[:, 2], rtol=0.03)
+    np.testing.assert_allclose(moment - flapping, torque + flapping, rtol=0.04, atol=1e-8)
+    assert np.abs(flapping[1:, :2] / torque[1:, :2]).max() > 0.1
+
+
+def test_wind_counts_as_velocity_of_the_drone(quad):
+    """A drone at rest in a wind has the forces of one that flies against it: both the drag and the change of thrust."""
+    air = np.array([3.0, -1.0, 0.5])
+    calm, plugin = quad
+    windy, in_wind = hover()
+    windy.add(Wind(air))
+    force, torque = wrench(calm, plugin, vel=-air)
+    found, turned = wrench(windy, in_wind)
+    np.testing.assert_allclose(found[0], force[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(turned[0], torque[0], rtol=1e-4, atol=1e-9)
+
+
+def test_a_vertical_gust_lifts_with_the_time_constant_of_the_inflow():
+    """Open loop: v = w (1 - exp(-D_zz t / m)) in an upward gust w; the time constant is 0.0434 / 0.02477 = 1.75 s."""
+    sim, _ = hover()
+    sim.add(Wind((0.0, 0.0, 0.1)))
+    sim.rotor_vel_control(sim.data.states.rotor_vel)
+    sim.step(500)
+    expected = 0.1 * (1 - np.exp(-DRAG_Z / 0.0434))
+    # second order: 0.1 m/s of an induced velocity of 4.3 m/s
+    np.testing.assert_allclose(sim.data.states.vel[0, 0, 2], expected, rtol=0.02)
+
+
+def test_a_drone_tips_back_in_forward_flight_and_is_lifted_below_a_ceiling():
+    sim, _ = hover(3, ceiling=[[50.0], [1.05], [1.02]])
+    sim.data = with_states(sim.data, vel=np.array([[[2.0, 0, 0]], [[0, 0, 0]], [[0, 0, 0]]]))
+    sim.rotor_vel_control(sim.data.states.rotor_vel)
+    sim.step()
+    rate, climb = np.asarray(sim.data.states.ang_vel)[:, 0], np.asarray(sim.data.states.vel)[:, 0, 2]
+    np.testing.assert_allclose(rate[0, 1], -0.002 * 0.014 * 2 * DRAG_XY / 28e-6, rtol=1e-3)
+    assert 0 < climb[1] < climb[2] < 0.002 * 9.81 * 0.66, "at most the thrust without inflow"
+    gap = 1.02 - 1.014
+    factor = 0.5 + 0.5 * np.sqrt(1 + (R / gap) ** 2 / 8)
+    expected = 4 * thrust(WEIGHT / 4, HOVER, 0.0, 0.0, blade(), factor) - WEIGHT
+    np.testing.assert_allclose(climb[2], 0.002 * expected / 0.0434, rtol=1e-3)
+
+
+def test_law_08_gradients_equal_central_differences(x64):
+    """60 steps in wind below a ceiling: a relative step of 1e-6 leaves 1e-12 of curvature and 1e-9 of rounding."""
+    sim = Sim(control="rotor_vel", engine="plain", integrator="rk4")
+    sim.add(Wind((1.0, 0.5, -0.3)))
+    plugin = sim.add(RotorAerodynamics(flapping=1e-8, ceiling=1.2))
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=0.98 * hover_rotor_state(sim.data))
+    rotor_vel = jnp.asarray(hover_rotor_state(sim.data) * [1.0, 1.001, 0.999, 1.002])
+    step = sim.build_step_fn()
+    scales = {"drag": 3e-6, "blade": 1e-5, "flapping": 1e-8, "ceiling": 1.2, "propeller_radius": 0.0275, "vel": 1.0}
+
+    def loss(x):
+        record = plugin.read(sim.data)
+        changed = record.replace(**{k: getattr(record, k) * x[k] for k in scales if k != "vel"})
+        data = with_states(plugin.write(sim.data, changed), vel=jnp.array([0.5, -0.3, 0.2]) * x["vel"])
+        data = data.replace(controls=data.controls.replace(rotor_vel=rotor_vel[None, None]))
+        s = step(data, 60).states
+        return jnp.sum(s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3])
+
+    loss = jax.jit(loss)
+    at = {name: jnp.float64(1.0) for name in scales}
+    gradient = jax.grad(loss)(at)
+    for name in scales:
+        ahead, behind = loss(at | {name: at[name] + 1e-6}), loss(at | {name: at[name] - 1e-6})
+        np.testing.assert_allclose(gradient[name], (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-8, err_msg=name)
+        assert abs(gradient[name]) > 1e-6, name
+
+
+def test_law_09_what_is_missing_or_impossible_is_an_error():
+    with pytest.raises(ConfigError, match="first_principles"):
+        Sim(dynamics="so_rpy").add(RotorAerodynamics())
+    with pytest.raises(ConfigError, match=r"has no linear drag.*inflow=.*RotorPy"):
+        Sim(drone="bumblebee").add(RotorAerodynamics())
+    with pytest.raises(ConfigError, match=r"expected inflow below 1\.49e-05"):
+        Sim().add(RotorAerodynamics(inflow=2e-5))
+    Sim(drone="bumblebee").add(RotorAerodynamics(drag=1e-5, inflow=1e-5))
