@@ -8,6 +8,8 @@
 - heavier: hover with 20% more mass from 0 s on, distance after 5 s, m
 - home: part of random attitudes at 5 rad/s that are within 0.1 m of their setpoint after 15 s
 - lost_178: height lost from rest at a roll of 178 degrees, m
+- overshoot_attitude, overshoot_body_rate: largest overshoot after steps of the command (``STEPS``), over their size
+- error_attitude, error_body_rate: largest error 2 s after these steps and later, over their size
 - steps_per_s: physics steps of many worlds that hover, in calls of 100 steps; without, with --worlds 0
 
 Without --drones these are all built-in airframes with rotors, and three made of plain physics (``OWN``). A controller
@@ -23,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from measure import digits, engine_of, medians, report, seconds
+from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
 from crazysim.control import TrackingLQR
@@ -36,6 +39,11 @@ from crazysim.trajectories import figure_eight
 CONTROLLERS = ("auto", "crazyflow", "mellinger", "pid", "geometric", "lqr", "tracking_lqr", "indi")
 KNOTS = 0.15
 """Time between gains of tracking_lqr, s; 60 of them last 9 s."""
+STEPS = {
+    "attitude": ((0, 0.1), (0, 0.5), (1, -0.5), (2, 0.5), (2, 2.5)),
+    "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
+}
+"""Axes and sizes of the steps of the command at each level, rad or rad/s."""
 HIGH = 100.0
 """Height of the flights that may fall, m."""
 TAKE_OFF, TRACKING, PUSHED, HEAVIER, INVERTED, TUMBLING = range(6)
@@ -94,6 +102,11 @@ def main() -> None:
         able = [airframe for airframe in airframes if is_able(name, airframe, args.dynamics)]
         if able:
             rows = fly(name, able, args.speed, args.attitudes, args.dynamics, args.device)
+            for level in STEPS:
+                if not has_rotors or not is_able(name, able[0], args.dynamics, level):
+                    continue
+                for drone, row in turn(name, able, level, args.device).items():
+                    rows[drone] |= row
             for drone, row in rows.items():
                 row = {key: digits(value) for key, value in row.items()}
                 report(args.device, benchmark="controllers", controller=name, drone=drone, speed=args.speed, **row)
@@ -101,10 +114,10 @@ def main() -> None:
         cost(args)
 
 
-def is_able(name: str, airframe: Airframe, dynamics: str) -> bool:
-    """Return True if an airframe has the numbers that a controller needs."""
+def is_able(name: str, airframe: Airframe, dynamics: str, level: str = "state") -> bool:
+    """Return True if a controller takes commands of a level and an airframe has the numbers that it needs."""
     try:
-        Sim(drone=airframe, dynamics=dynamics, control="state", controller=controller_of(name))
+        Sim(drone=airframe, dynamics=dynamics, control=level, controller=controller_of(name))
     except ConfigError:
         return False
     return True
@@ -156,6 +169,44 @@ def fly(
     target[INVERTED:, :, 2] = HIGH
     flown, wanted = positions(sim, eight, target, as_data(force))
     return {airframe.name: figures(flown[:, :, k], wanted, name) for k, airframe in enumerate(airframes)}
+
+
+def turn(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> dict[str, dict[str, float]]:
+    """Return overshoot and error of a controller for each airframe after steps of the command."""
+    answers = responses(name, airframes, level, device)
+    overshoot, error = answers.max(axis=(0, 1)) - 1, np.abs(answers[100:] - 1).max(axis=(0, 1))
+    return {
+        airframe.name: {f"overshoot_{level}": float(max(overshoot[k], 0)), f"error_{level}": float(error[k])}
+        for k, airframe in enumerate(airframes)
+    }
+
+
+def responses(name: str, airframes: list[Airframe], level: str, device: str = "cpu") -> np.ndarray:
+    """Return angles or body rates over 3 s after steps of the command, over their sizes.
+
+    One every 0.02 s. (n_times, n_steps, n_airframes)
+    """
+    steps = STEPS[level]
+    sim = Sim(len(steps), drone=airframes, control=level, controller=controller_of(name), device=device)
+    s, params = sim.data.states, sim.data.params
+    high = jnp.broadcast_to(jnp.array([0, 0, HIGH], s.pos.dtype), s.pos.shape)
+    sim.data = sim.data.replace(
+        states=s.replace(pos=high, rotor_vel=jnp.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
+    )
+    command = np.zeros((len(steps), len(airframes), 4), np.float32)
+    command[..., 3] = [9.81 * airframe.value("rigid_body.mass") for airframe in airframes]
+    for k, (axis, size) in enumerate(steps):
+        command[k, :, axis] = size
+    getattr(sim, f"{level}_control")(command)
+    out = []
+    for _ in range(150):
+        sim.step(sim.freq // 50)
+        s = sim.data.states
+        quat = np.asarray(s.quat)
+        angles = Rotation.from_quat(quat.reshape(-1, 4)).as_euler("xyz").reshape(*quat.shape[:2], 3)
+        now = angles if level == "attitude" else np.asarray(s.ang_vel)
+        out.append(np.stack([now[k, :, axis] / size for k, (axis, size) in enumerate(steps)]))
+    return np.array(out)
 
 
 def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:

@@ -257,6 +257,7 @@ def test_controllers_are_compared_on_the_same_flights(run):
     flown, cost = run("controllers.py", "--controllers", "geometric", *small)
     assert (flown["controller"], flown["drone"]) == ("geometric", "cf21B_500")  # the other one has no rotors
     assert flown["tracking"] < 0.02
+    assert "error_attitude" not in flown  # it takes states alone
     assert flown["pushed"] == pytest.approx(0.289, abs=0.02)
     assert cost["steps_per_s"] > 0
 
