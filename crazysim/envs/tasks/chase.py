@@ -119,7 +119,7 @@ class Chase(TouchDown):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 0.4), "distance": 6.0, "elevation": -25}
+        return {"elevation": -25}
 
 
 def roof() -> np.ndarray:

@@ -187,7 +187,7 @@ class Deliver(BringLoad):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 0.6), "distance": 5.5, "elevation": -20}
+        return {"lookat": (0, 0, 0.5), "distance": 4.0, "elevation": -20}
 
 
 def rings_of(car: CarData) -> Array:

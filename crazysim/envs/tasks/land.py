@@ -122,7 +122,7 @@ class Land(TouchDown):
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 0.6), "distance": 3.5, "elevation": -20}
+        return {"elevation": -12}
 
 
 def middles(n_drones: int) -> np.ndarray:
