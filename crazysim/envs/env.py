@@ -153,6 +153,14 @@ class Env(ABC):
         """
         return self._of_task(self.task.target, state)
 
+    def subjects(self, state: EnvState) -> Array | None:
+        """Return points that films hold in view besides drones and marks, m; None if the task has none.
+
+        Returns:
+            (n_worlds, n_points, 3)
+        """
+        return self._of_task(self.task.subjects, state)
+
     def succeeded(self, state: EnvState) -> Array | None:
         """Return true where a drone has succeeded; None if success is an error that stays small.
 

@@ -122,6 +122,15 @@ class Task:
         del data
         return None
 
+    def subjects(self, data: SimData) -> Array | None:
+        """Return points that films hold in view besides drones and marks, such as a pad's rim, m; None for none.
+
+        Returns:
+            (n_points, 3)
+        """
+        del data
+        return None
+
     def camera(self, n_drones: int) -> Mapping[str, Any] | None:
         """Return the camera of images and films, lookat, distance, azimuth and elevation; None to frame all starts."""
         del n_drones

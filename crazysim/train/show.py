@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.env import DroneEnv, Env
-from crazysim.envs.state import Obs
+from crazysim.envs.state import EnvState, Obs
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
@@ -158,17 +158,20 @@ def film(
     sim, rate = env.sim, env.freq
     skip = max(rate // 25, 1)
 
-    def places(_: Sim, world: int) -> np.ndarray:
-        target = targets(state)
-        return np.zeros((0, 3)) if target is None else np.asarray(target[world]).reshape(-1, 3)
+    def points(of: Callable[[EnvState], Array | None], world: int) -> np.ndarray:
+        found = of(state)
+        return np.zeros((0, 3)) if found is None else np.asarray(found[world]).reshape(-1, 3)
+
+    def held(_: Sim, world: int) -> np.ndarray:
+        return np.concatenate([points(targets, world), points(subjects, world)])
 
     def draw_target(sim: Sim, world: int) -> None:
-        at = places(sim, world)
+        at = points(targets, world)
         if len(at):
             away = np.abs(at[:, None] - np.asarray(sim.data.states.pos[world])).max()
             draw_points(sim, at, TARGET_COLOR, max(TARGET_SIZE, 0.02 * float(away)))
 
-    targets = jax.jit(env.target)
+    targets, subjects = jax.jit(env.target), jax.jit(env.subjects)
     step = jax.jit(lambda state: env.step(state, policy(state.obs)))
     state = jax.jit(env.reset)(jax.random.key(seed))
     shown = min(worlds, sim.n_worlds)
@@ -183,7 +186,7 @@ def film(
         text="{time:.1f} s",
         draw=draw_target,
         cam_config=camera,
-        hold=None if "distance" in camera else places,
+        hold=None if "distance" in camera else held,
         lag=0.6,
     )
     n_frames = env.max_steps // skip + 1

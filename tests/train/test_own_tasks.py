@@ -218,7 +218,9 @@ def test_a_film_shows_several_marks_of_a_drone(tmp_path, opengl):
 
 
 @pytest.mark.parametrize("camera", [None, {"elevation": -30}, {"lookat": (0, 0, 1), "distance": 2.0}])
-def test_a_film_holds_targets_in_view_unless_the_task_has_a_distance(tmp_path, monkeypatch, opengl, camera):
+def test_a_film_holds_targets_and_subjects_in_view_unless_the_task_has_a_distance(
+    tmp_path, monkeypatch, opengl, camera
+):
     from crazysim.train.show import film
 
     class Wide(Low):
@@ -226,6 +228,9 @@ def test_a_film_holds_targets_in_view_unless_the_task_has_a_distance(tmp_path, m
 
         def target(self, data):
             return jnp.array([[-3.0, -3.0, 1.0]])
+
+        def subjects(self, data):
+            return jnp.array([[0.0, 4.0, 0.0], [0.0, 5.0, 0.0]])
 
         def camera(self, n_drones):
             return camera
@@ -245,7 +250,7 @@ def test_a_film_holds_targets_in_view_unless_the_task_has_a_distance(tmp_path, m
     if camera and "distance" in camera:
         assert view.hold is None
     else:
-        np.testing.assert_array_equal(view.hold(env.sim, 0), [[-3.0, -3.0, 1.0]])
+        np.testing.assert_array_equal(view.hold(env.sim, 0), [[-3.0, -3.0, 1.0], [0.0, 4.0, 0.0], [0.0, 5.0, 0.0]])
 
 
 def test_the_worlds_of_a_film_are_wider_than_high(tmp_path, monkeypatch, opengl):

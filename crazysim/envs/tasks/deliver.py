@@ -184,10 +184,14 @@ class Deliver(BringLoad):
         """Return which loads are taken and delivered, and which drones have crashed."""
         return {"taken": delivery_of(data).taken} | super().info(data)
 
+    def subjects(self, data: SimData) -> Array:
+        """Return the places of the loads, m. (n_drones, 3)"""
+        return data.plugins["load"].pos
+
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"lookat": (0, 0, 0.5), "distance": 4.0, "elevation": -20}
+        return {"elevation": -20}
 
 
 def rings_of(car: CarData) -> Array:

@@ -119,10 +119,15 @@ class Land(TouchDown):
         pos = data.states.pos
         return jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)
 
+    def subjects(self, data: SimData) -> Array:
+        """Return four points on the rim of each pad, m. (4 n_drones, 3)"""
+        rim = self.radius * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], data.states.pos.dtype)
+        return (self.target(data)[:, None] + rim).reshape(-1, 3)
+
     def camera(self, n_drones: int) -> Mapping[str, Any]:
         """Return the camera of images and films."""
         del n_drones
-        return {"elevation": -12}
+        return {"elevation": -20}
 
 
 def middles(n_drones: int) -> np.ndarray:
