@@ -20,8 +20,8 @@ from crazysim.plugins.sensors.range_finder import RangeFinder
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
 
-OFFSET = 0.12
-"""Height by which the default controller misses its setpoint after a take-off, m."""
+OFFSET = 0.02
+"""Distance that a drone may still be from its setpoint a second after a move, m."""
 
 
 @pytest.fixture(scope="module")
