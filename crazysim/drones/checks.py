@@ -17,6 +17,8 @@ MAX_ANG_ACC = 1e6
 """Largest angular acceleration by the rotors, rad/s^2; that of the built-in airframes is up to 14,000."""
 MAX_ROTOR_VEL = 1e6
 """Largest rotor speed, rpm; that of the built-in airframes is up to 40,000."""
+MIN_LEVERAGE = 1e-3
+"""Smallest singular value of the mixing matrix; that of a quadrotor in X is 2."""
 TOLERANCE = 0.01
 """Relative error of moments of inertia, which are often published with two digits."""
 
@@ -74,6 +76,19 @@ def _rotors(airframe: Airframe) -> str | None:
         return f"expected yaw_torque_sign as 1 or -1 for each rotor, and not all equal, got {shown(signs.tolist())}"
     if not airframe.arm > 0:
         return "expected rotors beside the centre of mass, got all of them at x = y = 0"
+    axes = "x and y" if n < 4 else "x, y and z"  # three rotors cannot hold the heading as well
+    mixing = np.vstack([np.ones(n), airframe.mixing_matrix])[: 3 if n < 4 else 4]
+    if np.linalg.matrix_rank(mixing, tol=MIN_LEVERAGE) < len(mixing):
+        return (
+            f"expected rotors whose thrusts lift the drone and turn it about {axes}, each alone, got positions (x, y) "
+            f"{shown(value('rotors.position')[:, :2].tolist())} m with yaw_torque_sign {shown(signs.tolist())}"
+        )
+    hover = np.linalg.pinv(mixing)[:, 0] * mass * GRAVITY
+    if not np.all((hover >= low) & (hover <= high)):
+        return (
+            f"expected rotors that keep the drone level in hover with {low} to {high} N each, got "
+            f"{shown(hover.round(4).tolist())} N, which their positions around the centre of mass need"
+        )
     moments = np.linalg.eigvalsh(airframe.inertia)
     if airframe.arm * n * high / moments[0] > MAX_ANG_ACC:
         return (
@@ -105,6 +120,12 @@ def _curves(airframe: Airframe) -> str | None:
             k0, k1, k2 = np.atleast_2d(numbers["rotors.torque_curve"]).T
             torques = np.array([k0 + speed * (k1 + speed * k2) for speed in (low, high)])
             most = MAX_ANG_ACC * np.min(np.linalg.eigvalsh(airframe.inertia)) / airframe.n_rotors
+            hover = airframe.rotor_vel([numbers["rigid_body.mass"] * GRAVITY / airframe.n_rotors])
+            if not np.all(k1 + 2 * k2 * hover > 0):
+                return (
+                    f"expected torque_curve that rises at the speed of hover, got "
+                    f"{shown(np.atleast_2d(numbers['rotors.torque_curve']).tolist())}"
+                )
             if not np.all((torques >= 0) & (torques <= most)):
                 return (
                     f"expected torque_curve of at least 0 N m at the speeds of thrust_min and thrust_max, and at most "

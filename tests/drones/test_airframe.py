@@ -296,8 +296,10 @@ WRONG = {
     ),
     "torque curve negative": (
         setting("rotors.torque_curve", [0, 0, -1e-12]),
-        "expected torque_curve of at least 0 N m",
+        "expected torque_curve that rises at the speed of hover",
     ),
+    "torque curve zero": (setting("rotors.torque_curve", [0, 0, 0]), "torque_curve that rises at the speed of hover"),
+    "torque curve below zero": (setting("rotors.torque_curve", [-1, 0, 2e-12]), "torque_curve of at least 0 N m"),
     "torque curve huge": (setting("rotors.torque_curve", [0, 0, 1.0]), "torque_curve of at least 0 N m .* at most"),
     "lag negative": (setting("rotors.lag", [-14, 0, 14, 0]), "rotors.lag to be at least zero, got .-14.0"),
     "lag without spin-up": (setting("rotors.lag", [0, 0, 14, 0]), "lag with a positive linear or quadratic term"),
@@ -309,6 +311,16 @@ WRONG = {
     "signs of a half": (setting("rotors.yaw_torque_sign", [0.5, -1, 1, -1]), "yaw_torque_sign as 1 or -1"),
     "signs alike": (setting("rotors.yaw_torque_sign", [1, 1, 1, 1]), "yaw_torque_sign as 1 or -1 .* not all equal"),
     "rotors in the middle": (setting("rotors.position", [[0, 0, 0.1]] * 4), "rotors beside the centre of mass"),
+    "rotors at one side": (setting("rotors.position", [[0.1, 0, 0]] * 4), "turn it about x, y and z, each alone, got"),
+    "rotors in a row": (
+        setting("rotors.position", [[x, 0, 0] for x in (-0.1, -0.05, 0.05, 0.1)]),
+        "turn it about x, y and z, each alone, got",
+    ),
+    "signs side by side": (setting("rotors.yaw_torque_sign", [1, 1, -1, -1]), "turn it about x, y and z, each alone"),
+    "rotors off centre": (
+        setting("rotors.position", [[0.1, -0.03, 0], [0.02, -0.03, 0], [0.02, 0.03, 0], [0.1, 0.03, 0]]),
+        r"level in hover with 0.02.* to 0.2 N each, got \[-",
+    ),
     "rotors far away": (setting("rotors.position", [[1e9, 0, 0]] * 4), "rotors.position to be from -1e3 to 1e3 m"),
     "drag that pushes": (setting("drag.coefficients", [0.02, -0.02, -0.02]), "expected drag.coefficients that brakes"),
     "drag of a wall": (setting("drag.coefficients", [-1e3] * 3), "drag.coefficients .* slow for steps of 1/500 s"),
