@@ -104,7 +104,7 @@ def test_the_key_holds_machine_compiler_and_versions(source, place, compilations
     changed("other options")
     monkeypatch.setattr(native, "__version__", "99.0")
     changed("another version of this package")
-    monkeypatch.setattr(jax, "__version__", "99.0")
+    monkeypatch.setattr("crazysim.jaxcompat.versions", lambda: "99.0")
     changed("another JAX")
     monkeypatch.setattr(native.platform, "libc_ver", lambda: ("glibc", "9.9"))
     changed("another C library")

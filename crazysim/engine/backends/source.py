@@ -110,7 +110,7 @@ class Writer:
                 self._lookup(op, args, depth)
             case "sin" | "cos":
                 self._sin_cos(op, args[0], depth)
-            case "custom_jvp":  # no derivative is taken of a kernel
+            case "custom_jvp":  # its derivative is a kernel of its own
                 outs = self.block(op.blocks[0], args, depth)
                 name = self._results(op)
                 for k, out in enumerate(outs):

@@ -194,6 +194,8 @@ def test_every_effect_is_fused(every):
     assert program.unfused_stages == ()
     fused = {name for s in program.fused_segments for name in s.stages}
     assert {*STAGES, "wind_field_displacement"} <= fused
+    own = set(every.step_pipeline) - set(hovering(engine="interpret").step_pipeline)
+    assert own == {*STAGES, "wind_field_displacement"} - {"integration"}, "an effect's stages are listed in STAGES"
     assert [s.scope for s in program.fused_segments] == ["drone"]
 
 
