@@ -23,7 +23,7 @@ MAX_BASES = 8
 """Most tables that extend each other."""
 
 Shapes = tuple[tuple[int | str, ...], ...]
-"""Allowed shapes; ``"n"`` is the number of rotors."""
+"""Allowed shapes; ``"n"`` is the number of rotors, ``"any"`` any length."""
 
 
 class Range(NamedTuple):
@@ -96,7 +96,11 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
         ConfigError: If it has another shape, or an entry is out of the range.
     """
     shapes = [tuple(n if length == "n" else length for length in shape) for shape in key.shapes]
-    if value.shape not in shapes:
+    fits = any(
+        len(shape) == value.ndim and all(a in ("any", b) for a, b in zip(shape, value.shape, strict=True))
+        for shape in shapes
+    )
+    if not fits:
         raise ConfigError(f"{owner}: expected {path} of shape {' or '.join(map(str, shapes))}, got {value.shape}")
     if not np.all((value >= key.range.low) & (value <= key.range.high)):
         raise ConfigError(f"{owner}: expected {path} to be {key.range.text}, got {shown(value.tolist())}")

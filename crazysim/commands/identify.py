@@ -9,7 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter
-from crazysim.identify import Columns, errors_table, identify, prediction_errors, read_log
+from crazysim.drones import load_airframe
+from crazysim.identify import (
+    Columns,
+    Model,
+    aligned,
+    errors_table,
+    fast_rotation,
+    fit_residual,
+    identify,
+    plot_errors,
+    prediction_errors,
+    read_log,
+)
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -23,6 +35,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
     add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
     add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
+    add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
+    add("--iterations", type=int, default=3000, metavar="N", help="iterations of that training")
+    add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
     add("--columns", nargs="+", default=[], metavar="FIELD=NAMES", help="columns, such as time=s pos=px,py,pz")
 
 
@@ -40,9 +55,23 @@ def run(options: argparse.Namespace) -> None:
         print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
     if result.doubtful:
         print(f"doubtful, more than three times from the airframe: {', '.join(result.doubtful)}")
+    logs = [aligned(log, result.delays[log.name]) for log in logs]
+    held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
+    models = {
+        options.airframe: Model.create(load_airframe(options.airframe), options.mass),
+        "identified": result.model,
+    }
+    if options.network is not None:
+        trained = fit_residual(logs, result.model, n_hidden=options.network, iterations=options.iterations)
+        result = result.with_residual(trained.residual)
+        models["with residual"] = result.model
     for title, flights in (("fitted logs", logs), ("held-out logs", held_out)):
         if flights:
-            print(f"{title}\n{errors_table(prediction_errors(flights, result.model))}")
+            for name, model in models.items():
+                print(f"{title}, {name}\n{errors_table(prediction_errors(flights, model))}")
+    if options.plot:
+        plot_errors(held_out or logs, models, options.plot)
+        print(f"wrote {options.plot}")
     names = ", ".join(log.name for log in logs)
     text = result.toml(f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {names}")
     options.out.write_text(text, encoding="utf-8")

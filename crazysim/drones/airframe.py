@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.drones.keys import GUIDE, LAYOUT
 from crazysim.errors import ConfigError
 
-TUNED = ("fitted", "controller", "geometric", "mellinger", "pid")
+TUNED = ("fitted", "controller", "geometric", "mellinger", "pid", "residual")
 """Tables of gains and fits."""
 
 
@@ -23,6 +23,7 @@ class Drone(StrEnum):
     """Names of the built-in airframes."""
 
     cf21B_500 = "cf21B_500"
+    cf21B_500_idsia = "cf21B_500_idsia"
     cf2x_L250 = "cf2x_L250"
     cf2x_P250 = "cf2x_P250"
     cf2x_T350 = "cf2x_T350"

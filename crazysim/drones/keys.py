@@ -47,6 +47,11 @@ TABLES: dict[str, dict[str, Key]] = {
         "lag": Key(((4,), ("n", 4)), NOT_NEGATIVE),
     },
     "drag": {"coefficients": Key(_MATRIX)},
+    "residual": {
+        "linear": Key(((6, 14),)),
+        "hidden": Key((("any", 14),)),
+        "output": Key(((6, "any"),)),
+    },
     "fitted": {},
     "fitted.so_rpy": _RESPONSE,
     "fitted.so_rpy_rotor": _RESPONSE | {"thrust_dyn_coef": _POSITIVE},

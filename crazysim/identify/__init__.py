@@ -2,16 +2,22 @@
 
 from crazysim.identify.fit import Identification, identify
 from crazysim.identify.logs import Columns, Log, read_log
-from crazysim.identify.prediction import Extras, Model, errors_table, prediction_errors
+from crazysim.identify.network import fit_residual
+from crazysim.identify.plots import plot_errors
+from crazysim.identify.prediction import Model, errors_table, prediction_errors
+from crazysim.identify.rotation import aligned, fast_rotation
 
 __all__ = [
     "Columns",
-    "Extras",
     "Identification",
     "Log",
     "Model",
+    "aligned",
     "errors_table",
+    "fast_rotation",
+    "fit_residual",
     "identify",
+    "plot_errors",
     "prediction_errors",
     "read_log",
 ]

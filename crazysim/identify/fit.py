@@ -4,42 +4,38 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import first_principles
-from crazysim.dynamics.rotor import curve
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.errors import ConfigError
 from crazysim.identify.logs import Log
-from crazysim.identify.prediction import Extras, Model, Windows, attitude_error, predict, windows
-from crazysim.rotation import rotate_inverse
+from crazysim.identify.prediction import Model, windows
+from crazysim.identify.rotation import BLOCK, aligned, fast_rotation
+from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
+from crazysim.rotation import rotate, rotate_inverse
 
-SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
-"""Sizes of errors that count as one: m, rad, m/s, rad/s. Larger ones count linearly (Huber)."""
 DURATION = 0.5
-"""Duration of the predictions that are fitted, s."""
+"""Duration of the windows over which forces and torques change the velocities, s."""
 
 
-NAMES = (
-    "thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia",
-    "centre of mass x", "centre of mass y", "drag x", "drag y", "drag z", "torque z",
-    *(f"torque_per_vel {a}{b}" for a in "xyz" for b in "xyz"), "delay",
+FACTORS = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
+"""Factors of the airframe's curves and moments."""
+FORCES = (
+    "thrust factor", "drag x", "drag y", "drag z", "quadratic drag x", "quadratic drag y", "quadratic drag z",
 )  # fmt: skip
-"""Names of the parameters. Factors are of the airframe's curves or moments; others in m, N s/m, N m, N s, and s."""
-FACTORS = 6
-"""Number of leading parameters that are positive factors, fitted as logarithms."""
-
-
-UNITS = np.array([1.0] * FACTORS + [1e-3, 1e-3] + [1e-2] * 3 + [1e-4] + [1e-4] * 9 + [1e-2])
-"""Scales of the parameters within the fit, which make them of order one."""
+"""Parameters of the force: a factor, and coefficients in N s/m and N s^2/m^2."""
+TORQUES = (
+    "centre of mass x", "centre of mass y", "torque z", *(f"torque_per_vel {a}{b}" for a in "xyz" for b in "xyz"),
+)  # fmt: skip
+"""Parameters of the torque, m, N m and N s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +47,29 @@ class Identification:
     airframe: Airframe
     """Airframe with the identified numbers."""
     model: Model
-    """Model with the identified numbers, and the torques and delay that have no key in an airframe."""
+    """Model of that airframe, with its residual."""
     values: dict[str, float]
-    """Identified parameters by name, see ``NAMES``."""
+    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between windows."""
+    """Standard deviations of the parameters, from the scatter between blocks or windows."""
+    delays: dict[str, float]
+    """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
     """Numbers that differ from the base airframe, by dotted path."""
+
+    def with_residual(self, residual: ResidualData) -> Identification:
+        """Return the result with another residual, such as one from ``fit_residual``."""
+        changes = {key: x for key, x in self.changes.items() if not key.startswith("residual.")}
+        for key in ("linear", "hidden", "output"):
+            if (x := getattr(residual, key)) is not None:
+                changes[f"residual.{key}"] = np.asarray(x, np.float64)
+        airframe = load_airframe(_nested(self.base, self.airframe.name.removesuffix("_identified"), changes))
+        return replace(self, airframe=airframe, model=Model.create(airframe), changes=changes)
 
     @property
     def doubtful(self) -> list[str]:
         """Names of factors below 1/3 or above 3: the fit predicts with them, but they are hardly those of the body."""
-        return [name for name in NAMES[:FACTORS] if not 1 / 3 < self.values[name] < 3]
+        return [name for name in FACTORS if not 1 / 3 < self.values[name] < 3]
 
     def toml(self, source: str) -> str:
         """Return the airframe as a TOML file that names its base.
@@ -73,7 +80,8 @@ class Identification:
         units = {
             "rigid_body.mass": "kg", "rigid_body.inertia": "kg m^2", "rotors.position": "m",
             "rotors.thrust_curve": "N, N/rpm, N/rpm^2", "rotors.torque_curve": "N m, N m/rpm, N m/rpm^2",
-            "rotors.inertia": "kg m^2", "drag.coefficients": "N s/m",
+            "rotors.inertia": "kg m^2", "drag.coefficients": "N s/m", "controller.thrust2torque": "m",
+            "residual.linear": "N and N m per input", "residual.hidden": "1 per input", "residual.output": "N and N m",
         }  # fmt: skip
         lines = [f"base = {json.dumps(self.base)}", "", "[sources]", f"flights = {json.dumps(source)}"]
         if self.doubtful:
@@ -87,25 +95,22 @@ class Identification:
             text = [float(f"{x:.6g}") for x in value.ravel()]
             numbers = np.reshape(text, value.shape).tolist()
             lines.append(f'{key} = {{ value = {numbers}, unit = "{units[path]}", source = "flights" }}')
-        lines += ["", "# Every parameter with its standard deviation; torques and delay have no key in an airframe."]
+        lines += ["", "# Every parameter with its standard deviation."]
         lines += [f"# {name}: {x:.4g} +- {self.deviations[name]:.2g}" for name, x in self.values.items()]
         return "\n".join(lines) + "\n"
 
 
-def identify(
-    logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: float | None = None, iterations: int = 12
-) -> Identification:
+def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: float | None = None) -> Identification:
     """Fit the parameters of an airframe to logs with measured rotor speeds.
 
-    Linear least squares on accelerations give a start. Then a damped Gauss-Newton method minimises the errors of
-    open-loop predictions of 0.5 s, with Huber's loss, by gradients through crazysim's dynamics. Every prediction starts
-    at a measured state. The mass is not observable from the motion, so it is a given number.
+    Three linear regressions: of the changes of velocity over 0.5 s on thrust and drag, turned by the measured attitude;
+    of fast rotation on the torques of the rotors (``fast_rotation``); and of the changes of angular velocity over
+    0.5 s on the other torques. The mass is not observable from the motion, so it is a given number.
 
     Args:
         logs: Logs of the same sample time.
         airframe: Name or path of the airframe to start from.
         mass: Mass in the flights, kg; None for that of the airframe.
-        iterations: Largest number of steps of Gauss-Newton.
 
     Raises:
         ConfigError: If the mass is not positive, or if sample times, lengths or rotors of the logs do not fit.
@@ -114,25 +119,21 @@ def identify(
     if mass is not None and not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
     _check(logs, base)
-    batch = windows(logs, DURATION, DURATION)
+    windows(logs, DURATION, DURATION)
     if base.n_rotors <= 4:
         _check_order(logs, base)
     weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)
-    params = first_principles.Params.create(base).replace(mass=jnp.asarray([weight], jnp.float32))
-    start = _least_squares(logs, params)
-    dt = logs[0].dt
+    params = Model.create(base, weight).params
+    fast = fast_rotation(logs, params, float(_forces(logs, params)[0][0]))
+    logs = [aligned(log, delay) for log, delay in zip(logs, fast.delays, strict=True)]
+    force, force_spread = _forces(logs, params)
+    torque, torque_spread = _torques(logs, params, float(force[0]), fast.values)
 
-    def residuals(x: Array) -> Array:
-        return jax.vmap(lambda w: _residuals(_model(x, params), w, dt))(batch)
+    def named(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
+        numbers = [*force, *torque, *fast]
+        return dict(zip((*FORCES, *TORQUES, *FACTORS[1:]), map(float, numbers), strict=True))
 
-    x, jacobian, rest, weights = _gauss_newton(residuals, start, iterations)
-    normal = np.einsum("wri,wr,wrj->ij", jacobian, weights, jacobian)
-    score = np.einsum("wri,wr,wr->wi", jacobian, weights, rest)
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    spread = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
-    factor = np.exp(x[:FACTORS])
-    values = np.concatenate([factor, x[FACTORS:] * UNITS[FACTORS:]])
-    deviations = np.concatenate([factor * spread[:FACTORS], spread[FACTORS:] * UNITS[FACTORS:]])
+    values = named(force, torque, fast.values)
     changes = _changes(base, weight, values)
     try:
         identified = load_airframe(_nested(str(airframe), base.name, changes))
@@ -141,85 +142,109 @@ def identify(
     return Identification(
         base=str(airframe),
         airframe=identified,
-        model=_model(jnp.asarray(x, jnp.float32), params),
-        values=dict(zip(NAMES, values.tolist(), strict=True)),
-        deviations=dict(zip(NAMES, deviations.tolist(), strict=True)),
+        model=Model.create(identified),
+        values=values,
+        deviations=named(force_spread, torque_spread, fast.deviations),
+        delays=dict(zip([log.name for log in logs], fast.delays.tolist(), strict=True)),
         changes=changes,
     )
 
 
-def _model(x: Array, params: first_principles.Params) -> Model:
-    """Return the model of scaled parameters."""
-    factor, rest = jnp.exp(x[:FACTORS]), x[FACTORS:] * jnp.asarray(UNITS[FACTORS:], jnp.float32)
-    mixing = params.mixing_matrix
-    shift = jnp.stack([-rest[1], rest[0], jnp.zeros(())]) / params.L[0]
-    root = jnp.diag(jnp.sqrt(factor[1:4]))
-    inverse = jnp.diag(1 / jnp.sqrt(factor[1:4]))
-    fitted = params.replace(
-        J=root @ params.J @ root,
-        J_inv=inverse @ params.J_inv @ inverse,
-        rpm2thrust=params.rpm2thrust * factor[0],
-        rpm2torque=params.rpm2torque * factor[4],
-        prop_inertia=params.prop_inertia * factor[5],
-        mixing_matrix=mixing + shift[:, None],
-        drag_matrix=jnp.diag(rest[2:5]),
-    )
-    torque = jnp.stack([jnp.zeros(()), jnp.zeros(()), rest[5]])
-    return Model(params=fitted, extras=Extras(torque=torque, torque_per_vel=rest[6:15].reshape(3, 3), delay=rest[15]))
+def _forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArray, NDArray]:
+    """Return the parameters of the force, see ``FORCES``, and their deviations."""
+    mass, gravity = float(params.mass[0]), np.asarray(params.gravity_vec, np.float64)
+
+    def terms(log: Log) -> tuple[NDArray, NDArray]:
+        thrust = np.asarray(curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64)
+        vel, speed = _body(log, log.vel), np.linalg.norm(log.vel, axis=-1, keepdims=True)
+        axes = np.eye(3)
+        body = [thrust.sum(-1, keepdims=True) * axes[2]]
+        body += [(x[:, k : k + 1] * axes[k]) for x in (vel, vel * speed) for k in range(3)]
+        world = np.stack([np.asarray(rotate(jnp.asarray(log.quat), jnp.asarray(x))) for x in body], axis=-1)
+        return world, mass * (log.vel - gravity * log.t[:, None])
+
+    return _regressed(logs, terms, np.arange(7) > 0)
 
 
-def _residuals(model: Model, window: Windows, dt: float) -> Array:
-    """Return the scaled errors of one window at ten times. (120,)"""
-    pos, quat, vel, ang_vel = predict(model, window, dt)
-    n = window.pos.shape[0]
-    at = np.unique(np.linspace(0, n - 1, 11).round().astype(int))[1:]
-    parts = [
-        (pos - window.pos)[at] / SCALES["pos"],
-        attitude_error(quat[at], window.quat[at]) / SCALES["attitude"],
-        (vel - window.vel)[at] / SCALES["vel"],
-        (ang_vel - window.ang_vel)[at] / SCALES["ang_vel"],
-    ]
-    return jnp.concatenate([x.ravel() for x in parts])
+def _torques(
+    logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, fast: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return the parameters of the torque, see ``TORQUES``, and their deviations."""
+    mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
+    root = np.sqrt(fast[:3])
+    inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
+    rotor_inertia = fast[4] * RPM_TO_RAD_S * np.asarray(params.prop_inertia, np.float64)
+
+    def terms(log: Log) -> tuple[NDArray, NDArray]:
+        speed = jnp.asarray(log.rotor_vel)
+        thrust = thrust_factor * np.asarray(curve(speed, params.rpm2thrust), np.float64)
+        drag = fast[3] * np.asarray(curve(speed, params.rpm2torque), np.float64)
+        spin = np.zeros_like(log.ang_vel)
+        spin[:, 2] = -(rotor_inertia * log.rotor_vel) @ mixing[2]
+        momentum = log.ang_vel @ inertia + spin
+        rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
+        # Everything known, integrated, goes to the left side.
+        known = _integral(rotors - np.cross(log.ang_vel, momentum), log.t)
+        vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
+        columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
+        columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
+        return np.stack(columns, axis=-1), momentum - known
+
+    return _regressed(logs, terms, np.zeros(len(TORQUES), bool))
 
 
-def _gauss_newton(residuals, x: NDArray, iterations: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return the parameters that minimise Huber's loss, and Jacobian, residuals and weights there.
+def _integral(x: NDArray, t: NDArray) -> NDArray:
+    """Return the integral over time from the first sample (trapezoidal rule). (n, ...)"""
+    steps = (x[1:] + x[:-1]) / 2 * np.diff(t).reshape(-1, *[1] * (x.ndim - 1))
+    return np.concatenate([np.zeros_like(x[:1]), np.cumsum(steps, axis=0)])
 
-    Logarithms of factors have a prior of standard deviation 1, so that what a log does not show stays near the base.
+
+def _body(log: Log, vector: NDArray) -> NDArray:
+    """Return vectors of the world frame in the body frame. (n, 3)"""
+    return np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(vector)), np.float64)
+
+
+def _regressed(
+    logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], not_positive: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return coefficients by robust linear least squares, and their deviations from the scatter between blocks.
+
+    Args:
+        logs: Logs.
+        terms: From a log to the rate of momentum per coefficient, (n, 3, k), and the momentum, (n, 3).
+        not_positive: True for coefficients that are at most zero. (k,)
     """
-    value, slopes = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
-
-    prior = np.arange(len(x)) < FACTORS
-
-    def loss(r: NDArray, x: NDArray) -> float:
-        size = np.abs(r)
-        cost = np.sum(np.where(size < 1, 0.5 * size**2, size - 0.5)) + 0.5 * np.sum(prior * x**2)
-        return float(cost) if np.isfinite(cost) else np.inf
-
-    def evaluated(x: NDArray) -> NDArray:
-        return np.asarray(value(jnp.asarray(x, jnp.float32)), np.float64)
-
-    rest, damping = evaluated(x), 1e-3
-    for _ in range(iterations):
-        jacobian = np.asarray(slopes(jnp.asarray(x, jnp.float32)), np.float64)
-        weights = 1 / np.maximum(1, np.abs(rest))
-        normal = np.einsum("wri,wr,wrj->ij", jacobian, weights, jacobian)
-        normal += np.diag(prior.astype(float))
-        gradient = np.einsum("wri,wr,wr->i", jacobian, weights, rest) + prior * x
-        before, gain = loss(rest, x), 0.0
-        for _ in range(8):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), -gradient)
-            trial = x + np.clip(step, -1, 1)
-            new = evaluated(trial)
-            if loss(new, trial) < before:
-                gain = 1 - loss(new, trial) / before
-                x, rest, damping = trial, new, damping / 5
+    rates, changes, blocks = [], [], []
+    for number, log in enumerate(logs):
+        x, momentum = terms(log)
+        total, size = _integral(x, log.t), round(DURATION / log.dt)
+        starts = np.arange(0, len(log.t) - size, max(1, size // 5))
+        starts = starts[[not np.any((log.gaps > k) & (log.gaps <= k + size)) for k in starts]]
+        rates.append(total[starts + size] - total[starts])
+        changes.append(momentum[starts + size] - momentum[starts])
+        blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK)
+    x, y, block = np.concatenate(rates), np.concatenate(changes), np.concatenate(blocks)
+    k = x.shape[-1]
+    weights = np.ones(y.shape)
+    found, free = np.zeros(k), np.ones(k, bool)
+    for _ in range(10):
+        normal = np.einsum("wri,wr,wrj->ij", x, weights, x)
+        vector = np.einsum("wri,wr,wr->i", x, weights, y)
+        free = np.ones(k, bool)
+        while True:
+            found = np.zeros(k)
+            found[free] = np.linalg.lstsq(normal[np.ix_(free, free)], vector[free], rcond=None)[0]
+            wrong = not_positive & (found > 0)
+            if not np.any(wrong):
                 break
-            damping *= 5
-        if gain < 1e-5:
-            break
-    jacobian = np.asarray(slopes(jnp.asarray(x, jnp.float32)), np.float64)
-    return x, jacobian, rest, 1 / np.maximum(1, np.abs(rest))
+            free &= ~wrong
+        rest = y - x @ found
+        scale = 1.4826 * np.median(np.abs(rest), axis=0)  # of a normal distribution with that median
+        weights = 1 / np.maximum(scale, np.abs(rest) / 2) / np.maximum(scale, 1e-30)
+    score = np.einsum("wri,wr,wr->wi", x, weights, rest)
+    each = np.stack([score[block == b].sum(axis=0) for b in np.unique(block)])
+    inverse = np.linalg.pinv(normal, hermitian=True)
+    return found, np.sqrt(np.diag(inverse @ (each.T @ each) @ inverse)) * free
 
 
 def _smooth(x: NDArray, size: int = 9) -> NDArray:
@@ -235,34 +260,6 @@ def _regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDA
     body = np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(np.stack([acc, _smooth(log.vel)]))))
     thrust = _smooth(np.asarray(curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
     return body[0][sl], ang_acc[sl], body[1][sl], thrust[sl]
-
-
-def _least_squares(logs: Sequence[Log], params: first_principles.Params) -> NDArray:
-    """Return scaled parameters by linear least squares on accelerations and angular accelerations."""
-    pieces = [_regressors(log, params) for log in logs]
-    acc, ang_acc, vel, thrust = [np.concatenate(x) for x in zip(*pieces, strict=True)]
-    mass, inertia = float(params.mass[0]), np.diag(np.asarray(params.J, np.float64))
-    mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
-    x = np.zeros(len(NAMES))
-    for axis in range(3):
-        terms = [vel[:, axis]] + ([thrust.sum(-1)] if axis == 2 else [])
-        found = np.linalg.lstsq(np.stack(terms, -1), mass * acc[:, axis], rcond=None)[0]
-        x[8 + axis] = min(found[0], 0.0) / UNITS[8 + axis]
-        if axis == 2:
-            x[0] = np.log(np.clip(found[1], 0.3, 3))
-    factor = np.exp(x[0])
-    for axis in range(2):
-        torque = factor * arm * thrust @ mixing[axis]
-        terms = np.c_[torque, vel, factor * thrust.sum(-1)]
-        found = np.linalg.lstsq(terms, ang_acc[:, axis], rcond=None)[0]
-        scale = np.clip(1 / max(found[0] * inertia[axis], 1e-3), 0.3, 3)
-        x[1 + axis] = np.log(scale)
-        moment = scale * inertia[axis]
-        row = 12 + 3 * axis
-        x[row : row + 3] = moment * found[1:4] / UNITS[row : row + 3]
-        arm_shift = moment * found[4]
-        x[6 if axis == 1 else 7] = (arm_shift if axis == 1 else -arm_shift) / UNITS[6]
-    return x
 
 
 def _check(logs: Sequence[Log], airframe: Airframe) -> None:
@@ -315,21 +312,30 @@ def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
         )
 
 
-def _changes(base: Airframe, mass: float, values: NDArray) -> dict[str, NDArray]:
+def _changes(base: Airframe, mass: float, values: dict[str, float]) -> dict[str, NDArray]:
     """Return the numbers of the identified airframe that differ from its base."""
-    root = np.sqrt(values[1:4])
+    thrust, *moments, torque, rotor = [values[name] for name in FACTORS]
+    root = np.sqrt(moments)
     inertia = base.inertia * np.outer(root, root)
     inertia = np.diag(inertia) if np.allclose(inertia, np.diag(np.diag(inertia)), atol=0) else inertia
-    shift = np.array([values[6], values[7], 0.0])
-    return {
+    x = np.array([values[name] for name in (*FORCES, *TORQUES)])
+    linear = np.zeros((6, N_INPUTS))
+    linear[range(3), range(4, 7)] = x[4:7]
+    linear[5, 0], linear[3:, 1:4] = x[9], x[10:].reshape(3, 3)
+    changes = {
         "rigid_body.mass": np.asarray(mass),
         "rigid_body.inertia": inertia,
-        "rotors.position": base.value("rotors.position") - shift,
-        "rotors.thrust_curve": base.value("rotors.thrust_curve") * values[0],
-        "rotors.torque_curve": base.value("rotors.torque_curve") * values[4],
-        "rotors.inertia": base.value("rotors.inertia") * values[5],
-        "drag.coefficients": np.minimum(values[8:11], 0.0),
+        "rotors.position": base.value("rotors.position") - [x[7], x[8], 0.0],
+        "rotors.thrust_curve": base.value("rotors.thrust_curve") * thrust,
+        "rotors.torque_curve": base.value("rotors.torque_curve") * torque,
+        "rotors.inertia": base.value("rotors.inertia") * rotor,
+        "drag.coefficients": x[1:4],
+        "residual.linear": linear,
     }
+    if "controller.thrust2torque" in base.values:
+        ratio = base.value("controller.thrust2torque") * torque / thrust
+        changes["controller.thrust2torque"] = np.asarray(ratio)
+    return changes
 
 
 def _nested(base: str, name: str, changes: dict[str, NDArray]) -> dict:

@@ -31,6 +31,8 @@ class Columns:
     """Angular velocity, body frame, rad/s."""
     rotor_vel: tuple[str, ...] = ("rpm1", "rpm2", "rpm3", "rpm4")
     """Rotor speeds in the order of the airframe's rotors."""
+    command: tuple[str, ...] = ()
+    """Commands of the rotors in any unit, in the order of the airframe's rotors; none if not logged."""
     time: str = "t"
     """Time, s."""
     rpm_per_unit: float = 1.0
@@ -42,6 +44,7 @@ KNOWN = {
     "idsia": Columns(
         pos=("x_mocap", "y_mocap", "z_mocap"),
         rotor_vel=("m1_erpm", "m2_erpm", "m3_erpm", "m4_erpm"),
+        command=("m1_thrust", "m2_thrust", "m3_thrust", "m4_thrust"),
         rpm_per_unit=1 / 6,
     ),
 }
@@ -66,6 +69,8 @@ class Log:
     """Angular velocity, body frame, rad/s. (n, 3)"""
     rotor_vel: NDArray
     """Rotor speeds, rpm. (n, n_rotors)"""
+    command: NDArray | None = None
+    """Commands of the rotors, in the unit of the log; None if it has none. (n, n_rotors)"""
     gaps: NDArray = field(default_factory=lambda: np.zeros(0, int))
     """Indices of samples that follow a gap. (n_gaps,)"""
     repairs: tuple[str, ...] = ()
@@ -107,6 +112,8 @@ def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | 
     t = np.asarray(table[columns.time], np.float64)
     data = {key: stacked(getattr(columns, key)) for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
     data["rotor_vel"] = data["rotor_vel"] * columns.rpm_per_unit
+    if columns.command:
+        data["command"] = stacked(columns.command)
     t, data = _increasing(name, t, data, repairs)
     data = {key: _finite(name, key, x, repairs) for key, x in data.items()}
     data["rotor_vel"] = _without_spikes(name, data["rotor_vel"], repairs)
@@ -138,7 +145,15 @@ def _table(path: str | Path | Mapping[str, NDArray]) -> tuple[str, Mapping[str, 
 
 
 def _missing(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
-    names = (columns.time, *columns.pos, *columns.quat, *columns.vel, *columns.ang_vel, *columns.rotor_vel)
+    names = (
+        columns.time,
+        *columns.pos,
+        *columns.quat,
+        *columns.vel,
+        *columns.ang_vel,
+        *columns.rotor_vel,
+        *columns.command,
+    )
     return [x for x in names if x not in table]
 
 

@@ -11,30 +11,16 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import reaction_torque
 from crazysim.errors import ConfigError
 from crazysim.identify.logs import Log
+from crazysim.plugins.effects.residual import N_INPUTS, ResidualData, residual_inputs, residual_wrench
 from crazysim.pytree import PyTree
 
 HORIZONS = (0.1, 0.25, 0.5)
 """Horizons of the tables of errors, s."""
-
-
-class Extras(PyTree):
-    """Torques and a delay that are fitted but have no key in an airframe file."""
-
-    torque: Array
-    """Constant torque, body frame, N m. (3,)"""
-    torque_per_vel: Array
-    """Torque per velocity of the body, both in the body frame, N s. (3, 3)"""
-    delay: Array
-    """Delay of the state behind the rotor speeds, s. ()"""
-
-    @staticmethod
-    def none() -> Extras:
-        """Return extras that add nothing."""
-        return Extras(torque=jnp.zeros(3), torque_per_vel=jnp.zeros((3, 3)), delay=jnp.zeros(()))
 
 
 class Model(PyTree):
@@ -42,8 +28,23 @@ class Model(PyTree):
 
     params: first_principles.Params
     """Parameters of the first-principles model."""
-    extras: Extras
-    """Torques and delay beside them."""
+    residual: ResidualData
+    """Forces and torques beside it."""
+
+    @staticmethod
+    def create(airframe: Airframe, mass: float | None = None) -> Model:
+        """Return the model of an airframe, with its table ``[residual]`` if it has one.
+
+        Args:
+            airframe: Airframe.
+            mass: Mass, kg; None for that of the airframe.
+        """
+        params = first_principles.Params.create(airframe)
+        if mass is not None:
+            params = params.replace(mass=jnp.asarray([mass], jnp.float32))
+        known = "residual.linear" in airframe.values
+        residual = ResidualData.create(airframe) if known else ResidualData(jnp.zeros((6, N_INPUTS)), None, None)
+        return Model(params=params, residual=residual)
 
 
 class Windows(PyTree):
@@ -61,8 +62,8 @@ class Windows(PyTree):
     """Rotor speeds, with ``PADDING`` samples before and after, rpm. (n_windows, n + 2 PADDING, n_rotors)"""
 
 
-PADDING = 6
-"""Samples of rotor speeds before and after a window. Delays are limited to ``PADDING - 2`` samples of either sign."""
+PADDING = 1
+"""Samples of rotor speeds before and after a window, for their accelerations at its ends."""
 
 
 def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
@@ -96,12 +97,11 @@ def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
 def predict(model: Model, window: Windows, dt: float) -> tuple[Array, Array, Array, Array]:
     """Return the predicted states of one window, which begin at its first sample: pos, quat, vel, ang_vel.
 
-    Rotor speeds are interpolated linearly, delayed by ``extras.delay``. Each sample is one Runge-Kutta step of order 4.
+    Rotor speeds are interpolated linearly. Each sample is one Runge-Kutta step of order 4.
     """
     n = window.pos.shape[0]
-    p, extras = model.params, model.extras
-    limit = (PADDING - 2) * dt
-    at = jnp.arange(2 * n - 1) / 2 + PADDING - jnp.clip(extras.delay, -limit, limit) / dt
+    p = model.params
+    at = jnp.arange(2 * n - 1) / 2 + PADDING
     index = jnp.arange(n + 2 * PADDING, dtype=at.dtype)
     speeds = jax.vmap(lambda x: jnp.interp(at, index, x), 1, 1)(window.rotor_vel)
     accelerations = jnp.asarray(jnp.gradient(speeds, axis=0)) / (dt / 2)
@@ -109,12 +109,10 @@ def predict(model: Model, window: Windows, dt: float) -> tuple[Array, Array, Arr
 
     def derivative(state: tuple, speed: Array, rotor_acc: Array) -> tuple:
         pos, quat, vel, ang_vel = state
-        torque = extras.torque + extras.torque_per_vel @ rotation.rotate_inverse(quat, vel)
+        force, torque = residual_wrench(residual_inputs(quat, vel, ang_vel, speed, p), model.residual)
         torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
-        torque = rotation.rotate(quat, torque)
-        _, acc, ang_acc, _ = first_principles.dynamics(
-            pos, quat, vel, ang_vel, speed, speed, None, torque, params=model.params
-        )
+        force, torque = rotation.rotate(quat, force), rotation.rotate(quat, torque)
+        _, acc, ang_acc, _ = first_principles.dynamics(pos, quat, vel, ang_vel, speed, speed, force, torque, params=p)
         return vel, ang_vel, acc, ang_acc
 
     def moved(state: tuple, rates: tuple, duration: float) -> tuple:
@@ -160,8 +158,8 @@ def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[floa
 
     Returns:
         RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
-        name: ``position``, ``attitude``,
-        ``position at constant velocity``, ``attitude unchanged``. (len(horizons),) each
+        name: ``position``, ``attitude``, ``position at constant velocity``, ``attitude unchanged``; and the mean
+        distance between predicted and measured position, ``position (mean)``, m. (len(horizons),) each
     """
     batch, dt = windows(logs, max(horizons), 0.05), logs[0].dt
     pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
@@ -175,6 +173,7 @@ def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[floa
     degrees = 180 / np.pi
     return {
         "position": rmse(pos[:, at] - truth),
+        "position (mean)": np.mean(np.linalg.norm(np.asarray(pos[:, at] - truth, np.float64), axis=-1), axis=0),
         "position at constant velocity": rmse(batch.pos[:, :1] + times * batch.vel[:, :1] - truth),
         "attitude": rmse(attitude_error(quat[:, at], turned), degrees),
         "attitude unchanged": rmse(attitude_error(jnp.broadcast_to(batch.quat[:, :1], turned.shape), turned), degrees),
@@ -183,7 +182,7 @@ def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[floa
 
 def errors_table(errors: dict[str, NDArray], horizons: Sequence[float] = HORIZONS) -> str:
     """Return errors as a table of text."""
-    head = f"{'RMSE after':34}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
+    head = f"{'Error after':34}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
     unit = {"p": "m", "a": "degrees"}
     return "\n".join(
         [head, *(f"{f'{k}, {unit[k[0]]}':34}" + "".join(f"{x:10.4g}" for x in v) for k, v in errors.items())]

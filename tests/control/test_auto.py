@@ -48,7 +48,7 @@ def airframes():
 def test_every_airframe_goes_where_it_is_sent():
     """The figures of the page on controllers for all built-in airframes and three of plain physics."""
     found = benchmark().fly("auto", airframes(), 2.0, 100)
-    assert len(found) == 10
+    assert len(found) == 11
     for name, row in found.items():
         assert row["hover"] < 2e-3, (name, row)
         assert row["tracking"] < 0.03, (name, row)

@@ -14,6 +14,7 @@ from crazysim import (
     Latency,
     MotorFailure,
     Plugin,
+    Residual,
     RotorAerodynamics,
     Sim,
     Wind,
@@ -34,6 +35,11 @@ ON = {
     Latency: {"delay": 2},
     RotorAerodynamics: {"flapping": 1e-8, "ceiling": 4.0},
     MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
+    Residual: {
+        "linear": np.full((6, 14), 1e-6),
+        "hidden": np.arange(28).reshape(2, 14) / 50,
+        "output": np.full((6, 2), 1e-6),
+    },
     Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
     WindField: {
         "field": Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0)),
@@ -184,7 +190,17 @@ def test_stages_are_straight_line(every, flown, name):
 
 
 def test_docstrings_give_the_shapes(every):
-    sizes = {"n_worlds": 3, "n_drones": 2, "n_rotors": 4, "n_rows": 3, "k": 4, "n_x": 3, "n_y": 3, "n_z": 2}
+    sizes = {
+        "n_worlds": 3,
+        "n_drones": 2,
+        "n_rotors": 4,
+        "n_rows": 3,
+        "k": 4,
+        "n_x": 3,
+        "n_y": 3,
+        "n_z": 2,
+        "n_hidden": 2,
+    }
     for record in every.data.plugins.values():
         assert n_documented(record, **sizes) == len(jax.tree.leaves(record))
 

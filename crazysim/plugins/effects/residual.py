@@ -1,0 +1,159 @@
+"""Identified forces and torques that the model lacks: terms of flights, and a small network."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.drones import Airframe
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.rotor import curve, rotor_torque
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.moving_air import require_rotors
+from crazysim.pytree import PyTree, leaf, on_device
+
+N_INPUTS = 14
+"""Number of inputs: see ``residual_inputs``."""
+
+
+class ResidualData(PyTree):
+    """Coefficients of the force and torque, which are those of the airframe's table ``[residual]``."""
+
+    linear: Array = leaf("parameter", 2, (6, N_INPUTS))
+    """Force, N, and torque, N m, in the body frame, per input. (6, 14)"""
+    hidden: Array | None = leaf("parameter", 2)
+    """Weights of the network's hidden layer, 1 per input; None without a network. (n_hidden, 14)"""
+    output: Array | None = leaf("parameter", 2)
+    """Force, N, and torque, N m, in the body frame, per activation; None without a network. (6, n_hidden)"""
+
+    @staticmethod
+    def create(airframe: Airframe) -> ResidualData:
+        """Return the shared coefficients of an airframe.
+
+        Raises:
+            ConfigError: If the airframe has no table ``[residual]``.
+        """
+        dtype = jnp.result_type(float)
+        names = ("hidden", "output") if "residual.hidden" in airframe.values else ()
+        return ResidualData(
+            linear=on_device(airframe.value("residual.linear"), dtype),
+            hidden=on_device(airframe.value("residual.hidden"), dtype) if names else None,
+            output=on_device(airframe.value("residual.output"), dtype) if names else None,
+        )
+
+
+class Residual(Plugin):
+    """Force and torque that flights showed beyond the model: linear terms and an optional network; needs rotors.
+
+    They depend on the velocity over ground, so that wind does not change them. Coefficients are for all drones, as
+    given here, or for each, with (n_worlds, n_drones) in front; without them they are those of the airframe's table
+    ``[residual]``.
+    """
+
+    linear: ArrayLike | None = parameter(default=None)
+    """Force, N, and torque, N m, in the body frame, per input; None for the airframe's. (6, 14)"""
+    hidden: ArrayLike | None = parameter(default=None)
+    """Weights of the network's hidden layer, 1 per input; None for none, or the airframe's. (n_hidden, 14)"""
+    output: ArrayLike | None = parameter(default=None)
+    """Force, N, and torque, N m, in the body frame, per activation; None as for ``hidden``. (6, n_hidden)"""
+    name: str = "residual"
+
+    def record(self, sim: Simulation) -> ResidualData:
+        """Return the coefficients."""
+        require_rotors(sim, "a residual")
+        given = {key: getattr(self, key) for key in ("linear", "hidden", "output")}
+        if (self.hidden is None) != (self.output is None) or (self.linear is None and self.hidden is not None):
+            raise ConfigError(
+                "expected hidden and output together, and linear with them. Give zeros for no linear terms."
+            )
+        if self.linear is None:
+            given = _of_airframes(sim)
+        n_hidden = 0 if given["hidden"] is None else np.shape(given["hidden"])[-2]
+
+        def checked(key: str, shape: tuple[int, int]) -> Array | None:
+            value = given[key]
+            return None if value is None else check_parameter(sim, key, value, shape)
+
+        linear = check_parameter(sim, "linear", given["linear"], (6, N_INPUTS))
+        return ResidualData(linear, checked("hidden", (n_hidden, N_INPUTS)), checked("output", (6, n_hidden)))
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the force and torque added."""
+        s = data.states
+        inputs = residual_inputs(s.quat, s.vel, s.ang_vel, s.rotor_vel, data.params)
+        force, torque = residual_wrench(inputs, self.read(data))
+        force = rotation.rotate(s.quat, force, offset=s.force)
+        torque = rotation.rotate(s.quat, torque, offset=s.torque)
+        return data.replace(states=s.replace(force=force, torque=torque))
+
+
+def residual_inputs(
+    quat: Array, vel: Array, ang_vel: Array, rotor_vel: Array, params: first_principles.Params
+) -> Array:
+    """Return the inputs of a residual, all in the body frame.
+
+    They are 1; velocity, m/s; velocity times speed, m^2/s^2; angular velocity, rad/s; collective thrust over weight;
+    torque of the rotors over weight and arm.
+
+    Args:
+        quat: Attitude, body to world, unit, xyzw. (..., 4)
+        vel: Velocity, world frame, m/s. (..., 3)
+        ang_vel: Angular velocity, body frame, rad/s. (..., 3)
+        rotor_vel: Rotor speeds, rpm. (..., n_rotors)
+        params: Parameters of the model.
+
+    Returns:
+        Inputs. (..., 14)
+    """
+    p = params
+    body_vel = rotation.rotate_inverse(quat, vel)
+    thrust = curve(rotor_vel, p.rpm2thrust)
+    weight = p.mass * rotation.safe_norm(p.gravity_vec)
+    torque = rotor_torque(thrust, curve(rotor_vel, p.rpm2torque), p.L, p.mixing_matrix)
+    collective = jnp.sum(thrust, axis=-1, keepdims=True) / weight
+    return jnp.concatenate(
+        [
+            jnp.ones_like(collective),
+            body_vel,
+            body_vel * rotation.safe_norm(body_vel),
+            ang_vel,
+            collective,
+            torque / (weight * jnp.max(p.L, axis=-1, keepdims=True)),
+        ],
+        axis=-1,
+    )
+
+
+def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array]:
+    """Return the force, N, and the torque, N m, of a residual in the body frame: linear terms plus the network.
+
+    Args:
+        inputs: Inputs, see ``residual_inputs``. (..., 14)
+        residual: Coefficients.
+
+    Returns:
+        Force and torque. (..., 3) each
+    """
+    wrench = rotation.matvec(residual.linear, inputs)
+    if residual.hidden is not None and residual.output is not None:
+        wrench = rotation.matvec(residual.output, jnp.tanh(rotation.matvec(residual.hidden, inputs)), wrench)
+    return wrench[..., :3], wrench[..., 3:]
+
+
+def _of_airframes(sim: Simulation) -> dict[str, Any]:
+    """Return the coefficients of the airframes, of which all or none have a network of one size."""
+    sizes = {len(airframe.values.get("residual.hidden", ())) for airframe in sim.airframes}
+    if len(sizes) > 1:
+        raise ConfigError(
+            f"expected residuals of one number of hidden units, got {sorted(sizes)}. Use airframes of equal networks."
+        )
+    keys = ("linear", "hidden", "output") if max(sizes) else ("linear",)
+    found = {key: of_airframes(sim, lambda a, key=key: a.value(f"residual.{key}")) for key in keys}
+    return {"hidden": None, "output": None} | found
