@@ -1,12 +1,13 @@
 """Estimators: filters that fuse the measurements of sensors, each a plugin that ``sim.add`` adds."""
 
 from crazysim.errors import ConfigError
+from crazysim.plugins.estimators.complementary import Complementary
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.estimators.kalman import Kalman
 
-__all__ = ["Estimator", "Kalman", "find_estimator"]
+__all__ = ["Complementary", "Estimator", "Kalman", "find_estimator"]
 
-ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman}
+ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman, "complementary": Complementary}
 """Estimators by the names that ``Sim(estimator=...)`` takes."""
 
 

@@ -1,0 +1,215 @@
+"""The complementary filter of the Crazyflie's firmware: attitude and height, without a position."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim import rotation
+from crazysim.control import Control
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, parameter, per_drone
+from crazysim.core.settings import dividing_rate
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError
+from crazysim.plugins.estimators.error_state import GRAVITY
+from crazysim.plugins.estimators.estimator import Estimator, at_the_start
+from crazysim.plugins.sensors.barometer import Barometer
+from crazysim.plugins.sensors.flow_deck import TimeOfFlight
+from crazysim.plugins.sensors.imu import IMU
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.pytree import PyTree, leaf
+
+HEIGHT_FREQ = 100
+"""Updates of the height per second, Hz (estimator_complementary.c)."""
+KEEP_HEIGHT, KEEP_VELOCITY = 0.9, 0.995
+"""Share of the height, and of the velocity, that an update keeps (position_estimator_altitude.c)."""
+DEADBAND = 0.04
+"""Vertical acceleration that counts as zero, in units of gravity (position_estimator_altitude.c)."""
+OLDEST = 0.05
+"""Greatest age of a distance to the ground that is used, s (position_estimator_altitude.c)."""
+
+
+class ComplementaryData(PyTree):
+    """The filter of every drone."""
+
+    quat: Array = leaf("drone", 1)
+    """Attitude, body to world, xyzw. (n_worlds, n_drones, 4)"""
+    integral: Array = leaf("drone", 1, (3,))
+    """Integral of the attitude error, rad/s. (n_worlds, n_drones, 3)"""
+    height: Array = leaf("drone", 1, (1,))
+    """Height, m. (n_worlds, n_drones, 1)"""
+    climb: Array = leaf("drone", 1, (1,))
+    """Change of the height in the last update, m/s. (n_worlds, n_drones, 1)"""
+    inertial_climb: Array = leaf("drone", 1, (1,))
+    """Integral of the vertical acceleration, which decays, m/s. (n_worlds, n_drones, 1)"""
+    over_surface: Array = leaf("drone", 1, (1,))
+    """1 from the first distance to the ground on, after which pressure is not used; else 0. (n_worlds, n_drones, 1)"""
+    kp: Array = leaf("parameter", 1, (1,))
+    """Gain of the attitude error, 1/s. (1,)"""
+    ki: Array = leaf("parameter", 1, (1,))
+    """Gain of its integral, 1/s^2. (1,)"""
+
+
+class Complementary(Estimator):
+    """The Crazyflie's complementary filter: attitude from an ``IMU``, height from a ``Barometer`` or ``TimeOfFlight``.
+
+    The gyroscope is integrated and slowly drawn to the direction of gravity that the accelerometer shows (Mahony's
+    filter); the heading is integrated only. Positions and velocities along x and y are zero, as in the firmware, so
+    it flies commands of attitude and below. Sources: sensfusion6.c, estimator_complementary.c and
+    position_estimator_altitude.c of bitcraze/crazyflie-firmware, commit 2a18fc29. It begins at the true attitude and
+    height, with an accelerometer that shows 1 g at rest.
+    """
+
+    _: dataclasses.KW_ONLY
+    freq: int = 250
+    """Updates of the attitude per second, Hz, a divisor of ``sim.freq``."""
+    kp: ArrayLike = parameter(default=0.4, low=0.0)
+    """Gain of the attitude error, 1/s. () or (n_worlds, n_drones)"""
+    ki: ArrayLike = parameter(default=0.001, low=0.0)
+    """Gain of its integral, 1/s^2. () or (n_worlds, n_drones)"""
+    name: str = "complementary"
+
+    @classmethod
+    def default(cls) -> Complementary:
+        """Return the filter on the Crazyflie's inertial measurement unit and a barometer without errors."""
+        return cls([IMU.crazyflie(), Barometer()])
+
+    @property
+    def kinds(self) -> tuple[type[Sensor], ...]:
+        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
+        return Barometer, TimeOfFlight
+
+    def record(self, sim: Simulation) -> ComplementaryData:
+        """Return the filter before its first step."""
+        self.check_sensors(sim)
+        if not self.aids or len({type(sensor) for sensor in self.aids}) < len(self.aids):
+            raise ConfigError(f"expected a Barometer, a TimeOfFlight or one of each for {self.name!r}")
+        if self.control and sim.data.controls.mode == Control.state:
+            raise ConfigError(
+                f"expected control at the level 'attitude' or below with {self.name!r}, which estimates no position, "
+                f"got 'state'. Use estimator=\"kalman\"."
+            )
+        return self.filled(sim, ComplementaryData, quat=per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4))
+
+    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
+        """Return the stages of the filter by name, in their order."""
+        period = freq // dividing_rate("freq", self.freq, freq)
+        height_period = freq // dividing_rate("rate of the height", HEIGHT_FREQ, freq)
+
+        def turns(data: SimData) -> SimData:
+            """Update the attitude and the inertial velocity of one drone."""
+            record, dt = self.read(data), period / data.core.freq
+            gyro, accel = self.inertial(data)
+            quat, integral = mahony(record.quat, record.integral, gyro, accel, dt, record.kp, record.ki)
+            climb = inertial_climb(record.inertial_climb, quat, accel, dt)
+            return self.write(data, record.replace(quat=quat, integral=integral, inertial_climb=climb))
+
+        def rises(data: SimData) -> SimData:
+            """Update the height of one drone."""
+            record, dt = self.read(data), height_period / data.core.freq
+            height, over_surface = self._height(data, record, dt)
+            climb = (height - record.height) / dt
+            return self.write(data, record.replace(height=height, climb=climb, over_surface=over_surface))
+
+        def every(steps: int) -> Any:
+            return lambda data: (data.core.steps + 1) % steps == 0
+
+        return [
+            ("begin", Stage(self._begin, "drone", at_the_start)),
+            ("attitude", Stage(turns, "drone", every(period))),
+            ("", Stage(rises, "drone", every(height_period))),
+        ]
+
+    def estimated_states(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated attitude, height and vertical velocity of one drone; the rest of both is zero."""
+        record, s = self.read(data), data.states
+        zero = jnp.zeros_like(s.pos[..., :2])
+        pos, vel = (jnp.concatenate([zero, up], axis=-1) for up in (record.height, record.climb))
+        return {"pos": pos, "vel": vel, "quat": rotation.safe_normalize(record.quat, s.quat)}
+
+    def _begin(self, data: SimData) -> SimData:
+        """Begin at the true attitude and height of one drone."""
+        s, record = data.states, self.read(data)
+        up = s.vel[2:]
+        return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=up, inertial_climb=up))
+
+    def _height(self, data: SimData, record: ComplementaryData, dt: float) -> tuple[Array, Array]:
+        """Return the height of one drone, m, and 1 once it has measured the ground. (1,) each"""
+        height, over_surface, shift = record.height, record.over_surface, dt * record.inertial_climb
+        after = height
+        for sensor in self.aids:
+            if isinstance(sensor, Barometer):
+                after = filtered_height(height, sensor.part(data, "height"), shift)
+        for sensor in self.aids:
+            if isinstance(sensor, TimeOfFlight):
+                distance = sensor.latest(data)
+                useful = (sensor.age(data) <= OLDEST) & (distance < sensor.read(data).max_range)
+                after, over_surface = height_over_surface(height, after, distance, useful, over_surface, shift)
+        return after, over_surface
+
+
+def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
+    """Return the height, m, (1,), after a measured one, m, (1,), and the inertial change in the interval, m. (1,)"""
+    return KEEP_HEIGHT * height + (1 - KEEP_HEIGHT) * measured + shift
+
+
+def height_over_surface(
+    height: Array, by_pressure: Array, distance: Array, useful: Array, over_surface: Array, shift: Array
+) -> tuple[Array, Array]:
+    """Return the height, m, and 1 once the ground has been measured, else 0 (``positionEstimateInternal``). (1,) each
+
+    Args:
+        height: Height before. (1,)
+        by_pressure: Height to use if the ground was never measured, m. (1,)
+        distance: Distance to the ground, m. (1,)
+        useful: True where it is of this interval. (1,)
+        over_surface: 1 if the ground has been measured before. (1,)
+        shift: Inertial change of the height in the interval, m. (1,)
+    """
+    over_surface = jnp.where(useful, 1.0, over_surface)
+    held = jnp.where(over_surface > 0, height, by_pressure)
+    return jnp.where(useful, filtered_height(height, distance, shift), held), over_surface
+
+
+def mahony(
+    quat: Array, integral: Array, gyro: Array, accel: Array, dt: float, kp: Array | float, ki: Array | float
+) -> tuple[Array, Array]:
+    """Return attitude and integral after an interval (``sensfusion6UpdateQ``).
+
+    The firmware's fast inverse square root, which is off by up to 0.2%, is an exact one here.
+
+    Args:
+        quat: Attitude, body to world, unit, xyzw. (4,)
+        integral: Integral of the attitude error, rad/s. (3,)
+        gyro: Angular velocity, body frame, rad/s. (3,)
+        accel: Specific force, body frame, in any unit; zero for no correction. (3,)
+        dt: Length of the interval, s.
+        kp: Gain of the attitude error, 1/s. (1,)
+        ki: Gain of its integral, 1/s^2. (1,)
+    """
+    error = rotation.cross(rotation.safe_normalize(accel, jnp.zeros_like(accel)), rotation.matrix(quat)[2])
+    integral = integral + ki * dt * error
+    falls = jnp.any(accel != 0)
+    rate = gyro + jnp.where(falls, integral + kp * error, 0.0)
+    step = jnp.concatenate([0.5 * dt * rate, jnp.ones_like(rate[:1])])
+    return rotation.safe_normalize(rotation.multiply(quat, step), quat), integral
+
+
+def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
+    """Return the velocity upwards, m/s, (1,), after an interval (``positionUpdateVelocity``).
+
+    Args:
+        climb: The velocity before. (1,)
+        quat: Attitude, body to world, unit, xyzw. (4,)
+        accel: Specific force, body frame, m/s^2. (3,)
+        dt: Length of the interval, s.
+    """
+    acc = rotation.matrix(quat)[2:] @ accel / GRAVITY - 1.0
+    beyond = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - DEADBAND, 0.0)
+    return KEEP_VELOCITY * (climb + GRAVITY * dt * beyond)

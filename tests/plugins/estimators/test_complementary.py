@@ -1,0 +1,112 @@
+"""The complementary filter: that of the compiled firmware, flown on, and honest about what it does not estimate."""
+
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.plugins.estimators import Complementary, complementary
+from crazysim.plugins.sensors import IMU, Barometer, TimeOfFlight
+
+RECORDED = np.load(Path(__file__).with_name("firmware_complementary.npz"))
+
+
+@pytest.mark.parametrize("kind", ["pressure", "ground"])
+def test_the_filter_is_that_of_the_compiled_firmware(kind):
+    """In 2 s of 1 ms: but for rounding of float32, in 500 updates of numbers around one."""
+    inputs, recorded = jnp.asarray(RECORDED[f"{kind}/inputs"]), RECORDED[f"{kind}/outputs"]
+
+    def tick(carry, x):
+        (quat, integral, climb, height, rate, over), (k, row) = carry, x
+        gyro, accel = jnp.radians(row[:3]), complementary.GRAVITY * row[3:6]
+        turned = complementary.mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
+        turned = *turned, complementary.inertial_climb(climb, turned[0], accel, 0.004)
+        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))
+        shift = 0.01 * climb
+        by_pressure = complementary.filtered_height(height, row[6:7], shift)
+        useful = row[8:] <= 1000 * complementary.OLDEST
+        risen, above = complementary.height_over_surface(height, by_pressure, row[7:8], useful, over, shift)
+        rises = k % 10 == 0
+        rate, over = jnp.where(rises, (risen - height) / 0.01, rate), jnp.where(rises, above, over)
+        height = jnp.where(rises, risen, height)
+        return (quat, integral, climb, height, rate, over), jnp.concatenate([quat, height, rate])
+
+    zero = jnp.zeros(1)
+    start = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), zero, inputs[0, 6:7], zero, zero
+    run = jax.jit(lambda start, x: jax.lax.scan(tick, start, (jnp.arange(len(x)), x))[1])
+    found = np.asarray(run(start, inputs))[19::20]
+    assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved: the run shows nothing"
+    np.testing.assert_allclose(found[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
+    np.testing.assert_allclose(found[:, 4], recorded[:, 4], rtol=0, atol=5e-6)
+    np.testing.assert_allclose(found[:, 5], recorded[:, 5], rtol=0, atol=5e-4)  # differences over 10 ms
+
+
+def flying(estimator, n_worlds=4, engine="auto", seconds=2.0):
+    """Return a simulation of drones at 1 m that fly a tilt back and forth on the estimate."""
+    sim = Sim(n_worlds, control="attitude", rng_key=4, engine=engine, estimator=estimator)
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[..., 2].set(1.0)))
+    thrust = float(sim.data.params.mass[..., 0].reshape(-1)[0]) * 9.81
+    for k in range(round(10 * seconds)):
+        sim.attitude_control(np.tile(np.float32([0.2 * math.sin(1.5 * k), 0.0, 0.0, thrust]), (n_worlds, 1, 1)))
+        sim.step(50)
+    return sim
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Return a simulation that has flown on the filter of the name, with the Crazyflie's sensors."""
+    return flying("complementary")
+
+
+def test_drones_fly_on_the_estimate(flown):
+    """Attitudes agree within some degrees (the accelerometer shows thrust, not gravity), heights within centimetres."""
+    record, s = flown.data.plugins["complementary"], flown.data.states
+    down, true = (np.asarray(rotation.matrix(q))[..., 2, :] for q in (record.quat, s.quat))
+    tilt = np.degrees(np.arccos(np.clip(np.sum(down * true, axis=-1), -1, 1)))
+    assert 1e-3 < tilt.max() < 5
+    assert np.abs(np.asarray(record.height - s.pos[..., 2:])).max() < 0.1
+    assert np.abs(np.asarray(s.quat)[..., 3]).min() > 0.9
+    measured = flown.plugins.observations(flown.data)
+    np.testing.assert_array_equal(measured["complementary.pos"][..., :2], 0.0)
+    assert list(flown.plugins) == ["imu", "barometer", "complementary"]
+
+
+def test_every_engine_flies_alike():
+    """With noise in all sensors, but for rounding of float32 of an accelerometer at 500 Hz."""
+    ends = []
+    for engine in ("plain", "fused"):
+        sensors = [IMU.bmi088(), Barometer(noise=2.0), TimeOfFlight(noise=0.01)]
+        sim = flying(Complementary(sensors), 3, engine, 0.2)
+        record = sim.data.plugins["complementary"]
+        assert np.asarray(record.over_surface).all()
+        ends.append([np.asarray(x) for x in (record.quat, record.height, sim.data.states.pos)])
+    assert np.ptp(ends[0][0], axis=0).max() > 1e-5, "all worlds are alike: there is no noise"
+    for one, other in zip(*ends, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=2e-4)
+
+
+def test_gradients_of_the_estimate_are_central_differences(x64):
+    """With respect to rates and forces; the dead band and the fresh measurement are kinks that stay away."""
+    quat = jnp.array([0.1, -0.2, 0.05, 0.97])
+    quat = quat / jnp.linalg.norm(quat)
+
+    def loss(x):
+        turned, integral = complementary.mahony(quat, jnp.zeros(3), x[:3], x[3:], 0.004, 0.4, 0.001)
+        climb = complementary.inertial_climb(jnp.zeros(1), turned, x[3:], 0.004)
+        return jnp.sum(turned * jnp.arange(4.0)) + 1e3 * jnp.sum(integral) + climb[0]
+
+    x, h = jnp.array([0.3, -0.2, 0.1, 1.0, 2.0, 12.0]), 1e-5
+    slope = [(loss(x + d) - loss(x - d)) / (2 * h) for d in h * jnp.eye(6)]
+    np.testing.assert_allclose(jax.grad(loss)(x), slope, rtol=1e-6, atol=1e-9)
+
+
+def test_what_it_cannot_do_is_refused():
+    with pytest.raises(ConfigError, match="estimates no position"):
+        Sim(control="state", estimator="complementary")
+    with pytest.raises(ConfigError, match="a TimeOfFlight or one of each"):
+        Sim(control="attitude", estimator=Complementary([IMU()]))
