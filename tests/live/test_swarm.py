@@ -16,8 +16,8 @@ from crazysim.live.swarm import Commander, DroneState, Swarm
 from crazysim.live.swarm.plan import Plan, move, nearest_yaw
 from crazysim.trajectories import Trajectory, circle, line, minimum_snap
 
-OFFSET = 0.12
-"""Height by which the default controller misses its setpoint after a take-off, m: it takes a wrong mass for its own."""
+OFFSET = 0.02
+"""Distance that a drone may still be from its setpoint shortly after a move, m."""
 
 
 def flying(control="state", **commands):
