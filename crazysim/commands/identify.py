@@ -30,7 +30,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("identify", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
-    add("logs", type=Path, nargs="+", metavar="LOG", help="logs to fit, .csv or .npz")
+    add("logs", type=Path, nargs="+", metavar="LOG", help="logs to fit: .csv, .npz, PX4's .ulg, or of a micro-SD card")
     add("--airframe", default="cf21B_500", help="airframe to start from: a name or a TOML file")
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
     add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
@@ -84,5 +84,5 @@ def _columns(texts: Sequence[str]) -> Columns:
     unknown = sorted(set(fields) - set(Columns.__dataclass_fields__))
     if unknown:
         raise ValueError(f"expected fields of {', '.join(Columns.__dataclass_fields__)}, got {unknown[0]!r}")
-    convert: dict[str, Callable[[str], Any]] = {"time": str, "rpm_per_unit": float}
+    convert: dict[str, Callable[[str], Any]] = {"time": str, "rpm_per_unit": float, "rad_per_unit": float}
     return Columns(**{k: convert.get(k, lambda x: tuple(x.split(",")))(x) for k, x in fields.items()})

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.identify.readers import read_crazyflie, read_ulog
 
 REPAIRABLE = 0.05
 """Largest share of samples that may be repaired; a log with more is an error."""
@@ -35,6 +36,8 @@ class Columns:
     """Commands of the rotors in any unit, in the order of the airframe's rotors; none if not logged."""
     time: str = "t"
     """Time, s."""
+    rad_per_unit: float = 1.0
+    """Factor from the logged angular velocities to rad/s."""
     rpm_per_unit: float = 1.0
     """Factor from the logged rotor speeds to rpm."""
 
@@ -83,7 +86,10 @@ class Log:
 
 
 def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | None = None) -> Log:
-    """Return the log of a ``.csv`` or ``.npz`` file, or of a dict of columns, checked and repaired.
+    """Return the log of a file or of a dict of columns, checked and repaired.
+
+    A file is a table, ``.csv`` or ``.npz``; a PX4 ULog, ``.ulg``; or, with any other ending, a log of a Crazyflie's
+    micro-SD card, whose columns are its log variables.
 
     Args:
         path: File, or columns by name.
@@ -92,7 +98,8 @@ def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | 
     Raises:
         ConfigError: If columns are missing, or the samples cannot be repaired.
     """
-    name, table = _table(path)
+    repairs: list[str] = []
+    name, table = _table(path, repairs)
     if columns is None:
         columns = next((c for c in reversed(KNOWN.values()) if not _missing(table, c)), KNOWN["crazysim"])
     elif isinstance(columns, str):
@@ -104,7 +111,6 @@ def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | 
         raise ConfigError(
             f"{name}: expected columns {', '.join(missing)}, got {', '.join(sorted(table))}. Name them in a Columns."
         )
-    repairs: list[str] = []
 
     def stacked(names: tuple[str, ...]) -> NDArray:
         return np.stack([np.asarray(table[n], np.float64) for n in names], axis=-1)
@@ -112,6 +118,7 @@ def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | 
     t = np.asarray(table[columns.time], np.float64)
     data = {key: stacked(getattr(columns, key)) for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel")}
     data["rotor_vel"] = data["rotor_vel"] * columns.rpm_per_unit
+    data["ang_vel"] = data["ang_vel"] * columns.rad_per_unit
     if columns.command:
         data["command"] = stacked(columns.command)
     t, data = _increasing(name, t, data, repairs)
@@ -125,12 +132,16 @@ def read_log(path: str | Path | Mapping[str, NDArray], columns: Columns | str | 
     return Log(name, t, **data, gaps=gaps, repairs=tuple(repairs))
 
 
-def _table(path: str | Path | Mapping[str, NDArray]) -> tuple[str, Mapping[str, NDArray]]:
+def _table(path: str | Path | Mapping[str, NDArray], repairs: list[str]) -> tuple[str, Mapping[str, NDArray]]:
     if isinstance(path, Mapping):
         return "log", path
     path = Path(path)
-    if not path.is_file() or path.suffix not in (".npz", ".csv"):
-        raise ConfigError(f"expected an existing .csv or .npz file, got {str(path)!r}")
+    if not path.is_file():
+        raise ConfigError(f"expected an existing file, got {str(path)!r}")
+    if path.suffix == ".ulg":
+        return path.stem, read_ulog(path, repairs)
+    if path.suffix not in (".npz", ".csv"):
+        return path.stem, read_crazyflie(path, repairs)
     if path.suffix == ".npz":
         with np.load(path, allow_pickle=False) as file:
             return path.stem, {key: file[key] for key in file.files}
