@@ -1,0 +1,80 @@
+"""Betaflight's software in the loop, over UDP."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.live.sitl.link import Datagrams, FirmwareLink, Rate
+from crazysim.live.sitl.measured import TURN, ZURICH, Measured, Origin, frd
+
+PORTS = (9002, 9003, 9004)
+"""Ports of the motors, which Betaflight sends, and of the state and the remote control, which it receives."""
+N_CHANNELS = 16
+
+
+class Betaflight(FirmwareLink):
+    """A process ``betaflight_SITL``, which runs in real time.
+
+    Packets are those of ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware follows the
+    simulation's clock while packets keep coming, and answers each packet of the state with at most one of the motors.
+    """
+
+    positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))
+    yaw_torque_signs = (1, -1, -1, 1)
+    remedy = "set yaw_motors_reversed = ON in the firmware"
+    lockstep = False
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        *,
+        ports: tuple[int, int, int] = PORTS,
+        gazebo: bool = True,
+        origin: Origin = ZURICH,
+        rc_freq: float = 50.0,
+    ):
+        """Open the ports.
+
+        Args:
+            host: Address of the process.
+            ports: Ports of the motors, the state and the remote control.
+            gazebo: True for a firmware with ``ENABLE_GAZEBO_BRIDGE=1``, the default of its build.
+            origin: Place of the world's origin.
+            rc_freq: Packets of the remote control per second, Hz.
+
+        Raises:
+            ConfigError: If the port of the motors is in use.
+        """
+        self.gazebo, self.origin, self._rc_rate = gazebo, origin, Rate(rc_freq)
+        self._link = Datagrams(host, ports[0])
+        _, self._state, self._rc = ports
+        self.channels: NDArray = np.array([1500, 1500, 1000, 1500, *[1000] * (N_CHANNELS - 4)], np.uint16)
+        """Remote control, us: roll, pitch, throttle, yaw, and the switches, 1,000 to 2,000. (16,)"""
+
+    def send(self, measured: Measured) -> None:
+        """Send the state, and the remote control when it is due."""
+        gyro, (x, y, z, w) = frd(measured.gyro), measured.quat
+        latitude, longitude, altitude = self.origin.place(measured.gps_pos)
+        if self.gazebo:
+            quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
+            latitude, longitude = 2 * self.origin.latitude - latitude, 2 * self.origin.longitude - longitude  # mirrored
+        else:
+            quat = TURN * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
+            gyro = gyro * [1, 1, -1]
+        place = (longitude, latitude, altitude)
+        state = (*gyro, *frd(measured.accel), *quat, *measured.gps_vel, *place, self.origin.pressure(measured.height))
+        self._link.send(struct.pack("<18d", measured.time, *state), self._state)
+        if self._rc_rate.is_due(measured.time):
+            self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *self.channels), self._rc)
+
+    def receive(self, timeout: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived in time. (4,)"""
+        packet = self._link.newest(timeout, struct.calcsize("<4f"))
+        return None if packet is None else np.clip(np.frombuffer(packet, "<f4"), 0, 1)
+
+    def close(self) -> None:
+        """Close the ports."""
+        self._link.close()

@@ -1,0 +1,99 @@
+"""Measurements of one drone for a firmware, in the axes of crazysim and in those of aviation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE
+
+METRES_PER_DEGREE = 6371000.0 * np.pi / 180
+"""Length of a degree of latitude on a sphere with the mean radius of the earth (IUGG), m."""
+TURN = np.sqrt(0.5)
+"""Cosine and sine of half a quarter turn, 1."""
+
+
+class Measured(NamedTuple):
+    """Measurements of one drone.
+
+    World axes are x east, y north and z up (ENU), body axes x forward, y left and z up (FLU).
+    """
+
+    time: float
+    """Time since the start, s."""
+    gyro: NDArray
+    """Angular velocity, body frame, rad/s. (3,)"""
+    accel: NDArray
+    """Specific force, body frame, m/s^2: (0, 0, 9.81) at rest. (3,)"""
+    pos: NDArray
+    """Position, world frame, m. (3,)"""
+    quat: NDArray
+    """Attitude, body to world, unit, xyzw. (4,)"""
+    vel: NDArray
+    """Velocity, world frame, m/s. (3,)"""
+    gps_pos: NDArray
+    """Position by satellite navigation, world frame, m. (3,)"""
+    gps_vel: NDArray
+    """Velocity by satellite navigation, world frame, m/s. (3,)"""
+    height: float
+    """Height by barometer, m."""
+    field: NDArray
+    """Magnetic field, body frame, T. (3,)"""
+
+
+class Origin(NamedTuple):
+    """Place of the world's origin on the earth."""
+
+    latitude: float
+    """Latitude, degrees."""
+    longitude: float
+    """Longitude, degrees."""
+    altitude: float
+    """Altitude above sea level, m."""
+
+    def place(self, pos: NDArray) -> tuple[float, float, float]:
+        """Return latitude and longitude, degrees, and altitude, m, on the plane that touches the earth here.
+
+        Args:
+            pos: Position, world frame, m. (3,)
+        """
+        east, north, up = map(float, pos)
+        return (
+            self.latitude + north / METRES_PER_DEGREE,
+            self.longitude + east / (METRES_PER_DEGREE * math.cos(math.radians(self.latitude))),
+            self.altitude + up,
+        )
+
+    def pressure(self, height: float) -> float:
+        """Return the pressure of the standard atmosphere at a height above the origin, m, in Pa."""
+        base = 1 - LAPSE / SEA_LEVEL_TEMPERATURE * (self.altitude + height)
+        return SEA_LEVEL_PRESSURE * base**EXPONENT
+
+
+ZURICH = Origin(47.397742, 8.545594, 488.0)
+"""Default place, at which simulations of PX4 start."""
+
+
+def frd(vector: NDArray) -> NDArray:
+    """Return a vector of the body's axes forward, left, up in those forward, right, down. (3,)"""
+    return vector * np.array([1.0, -1.0, -1.0])
+
+
+def ned(vector: NDArray) -> NDArray:
+    """Return a vector of the world's axes east, north, up in those north, east, down. (3,)"""
+    return np.array([vector[1], vector[0], -vector[2]])
+
+
+def quat_ned(quat: NDArray) -> NDArray:
+    """Return the attitude of the body's axes forward, right, down in the world's north, east, down, wxyz. (4,)
+
+    The quaternion of ENU to NED, ``(x + y) / sqrt(2)``, times the attitude, times that of FRD to FLU, ``x``.
+
+    Args:
+        quat: Attitude of forward, left, up in east, north, up, xyzw. (4,)
+    """
+    x, y, z, w = quat
+    return TURN * np.array([w + z, x + y, x - y, w - z])

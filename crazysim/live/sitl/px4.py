@@ -1,0 +1,164 @@
+"""PX4's software in the loop, over MAVLink's HIL messages."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.live.sitl.link import FirmwareLink, Rate
+from crazysim.live.sitl.measured import ZURICH, Measured, Origin, frd, ned, quat_ned
+
+PORT = 4560
+"""Port at which the first instance of PX4 looks for a simulation."""
+ALL_FIELDS = 0x1FFF
+"""Bits of ``HIL_SENSOR.fields_updated`` for all fields."""
+GPS_FREQ = 5
+"""Messages of satellite navigation per second, Hz."""
+TEMPERATURE = 25.0
+"""Temperature that is reported, degrees Celsius."""
+GAUSS, HECTOPASCAL = 1e-4, 100.0
+"""T in a gauss, Pa in a hectopascal."""
+CHUNK = 65536
+"""Most bytes that are read at once."""
+
+
+class Px4(FirmwareLink):
+    """A process of PX4 that was started without a simulator of its own, as ``make px4_sitl none_iris``.
+
+    PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
+    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. It takes a sensor that always measures the same
+    for a broken one, so give the simulation an ``IMU`` with noise.
+    """
+
+    positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
+    yaw_torque_signs = (-1, -1, 1, 1)
+    remedy = "set the parameters CA_ROTOR0_KM to CA_ROTOR3_KM"
+    lockstep = True
+
+    def __init__(
+        self, host: str = "127.0.0.1", *, port: int = PORT, origin: Origin = ZURICH, connect_timeout: float = 60.0
+    ):
+        """Listen for PX4, which connects when it is started.
+
+        Args:
+            host: Address to listen at.
+            port: Port, 4560 plus the number of the instance.
+            origin: Place of the world's origin.
+            connect_timeout: Time to wait for PX4 when the first measurements are sent, s.
+
+        Raises:
+            ConfigError: If pymavlink is not installed, or the port is in use.
+        """
+        try:
+            from pymavlink.dialects.v20 import common
+        except ImportError as error:
+            raise ConfigError("expected pymavlink, got none. Run pip install 'crazysim[mavlink]'.") from error
+        self._mavlink: Any = common
+        self.origin, self.connect_timeout = origin, connect_timeout
+        self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._server.bind((host, port))
+        except OSError as error:
+            self._server.close()
+            raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
+        self._server.listen(1)
+        self._client: socket.socket | None = None
+        self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        self._gps_rate = Rate(GPS_FREQ)
+        self.armed = False
+        """True while PX4 is armed."""
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Address at which it listens."""
+        return self._server.getsockname()
+
+    def send(self, measured: Measured) -> None:
+        """Send ``HIL_SENSOR``, and at their own rate ``HIL_GPS`` and ``HIL_STATE_QUATERNION``."""
+        origin, mav, micros = self.origin, self._mavlink, round(measured.time * 1e6)
+        field = frd(measured.field) / GAUSS
+        altitude = origin.altitude + measured.height
+        pressure = origin.pressure(measured.height) / HECTOPASCAL
+        self._send(
+            mav.MAVLink_hil_sensor_message(
+                micros, *frd(measured.accel), *frd(measured.gyro), *field, pressure, 0.0, altitude, TEMPERATURE,
+                ALL_FIELDS,
+            )
+        )  # fmt: skip
+        if not self._gps_rate.is_due(measured.time):
+            return
+        latitude, longitude, altitude = origin.place(measured.gps_pos)
+        place = round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
+        north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
+        speed = round(float(np.hypot(north, east)))
+        course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
+        self._send(mav.MAVLink_hil_gps_message(micros, 3, *place, 30, 40, speed, north, east, down, course, 10))
+        latitude, longitude, altitude = origin.place(measured.pos)
+        place = round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
+        vel = [round(100 * v) for v in ned(measured.vel)]
+        accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
+        self._send(
+            mav.MAVLink_hil_state_quaternion_message(
+                micros, quat_ned(measured.quat).tolist(), *frd(measured.gyro), *place, *vel, 0, 0, *accel
+            )
+        )
+
+    def receive(self, timeout: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived in time. (4,)"""
+        deadline, found = time.monotonic() + timeout, None
+        while found is None or self._readable(0.0):
+            if not self._readable(max(deadline - time.monotonic(), 0.0)):
+                break
+            for message in self._messages():
+                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
+                    self.armed = bool(message.mode & self._mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+                    found = np.clip(np.array(message.controls[:4]), 0, 1) * self.armed
+        return found
+
+    def close(self) -> None:
+        """Close the connection."""
+        for each in (self._client, self._server):
+            if each is not None:
+                each.close()
+
+    def _connected(self) -> socket.socket:
+        if self._client is None:
+            self._server.settimeout(self.connect_timeout)
+            try:
+                self._client = self._server.accept()[0]
+            except TimeoutError:
+                host, port = self.address
+                raise ConfigError(
+                    f"expected PX4 to connect to {host}:{port} within {self.connect_timeout:g} s, got no connection. "
+                    f"Start it, or set connect_timeout."
+                ) from None
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return self._client
+
+    def _send(self, message: Any) -> None:
+        try:
+            self._connected().sendall(message.pack(self._mav))
+        except (BrokenPipeError, ConnectionResetError):
+            raise ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.") from None
+
+    def _readable(self, timeout: float) -> bool:
+        client = self._connected()
+        client.settimeout(max(timeout, 1e-6))
+        with contextlib.suppress(TimeoutError, BlockingIOError):
+            return bool(client.recv(1, socket.MSG_PEEK))
+        return False
+
+    def _messages(self) -> list[Any]:
+        client = self._connected()
+        client.settimeout(0)
+        try:
+            return self._mav.parse_buffer(client.recv(CHUNK)) or []
+        except BlockingIOError:
+            return []

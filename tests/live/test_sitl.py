@@ -1,0 +1,280 @@
+"""Firmware in the loop: stand-ins that speak each protocol and fly a drone by what they receive."""
+
+import json
+import socket
+import struct
+import threading
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common
+
+from crazysim import IMU, ConfigError, Sim
+from crazysim.live.sitl import ArduPilot, Betaflight, Measured, Origin, Px4, SoftwareInTheLoop
+from crazysim.live.sitl.loop import motor_order
+from crazysim.live.sitl.measured import quat_ned
+from crazysim.plugins.sensors import Barometer
+
+TO_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+"""Axes east, north, up to north, east, down, and back."""
+TO_FRD = np.diag([1.0, -1, -1])
+"""Axes forward, left, up to forward, right, down, and back."""
+HOVER = 0.733
+"""Part of the largest rotor speed at which a cf21B_500 hovers (15,864 of 21,661 rpm)."""
+
+
+def matrix(quat):
+    """Return the rotation matrix of a quaternion, xyzw."""
+    x, y, z, w = quat
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def flown(link, pos, vel, rotation, gyro):
+    """Return the motor commands of a simple autopilot that holds 1 m above the origin and heads east.
+
+    All in the axes east, north, up and forward, left, up; motors by the position and the torque that the firmware gives
+    each of its numbers.
+    """
+    wanted = -1.0 * pos - 1.0 * vel
+    thrust = HOVER + 0.15 * (wanted[2] + 1.0)
+    tilt = np.cross([0, 0, 1.0], rotation[2])  # from the body's z to the world's z, in the body
+    lean = rotation.T @ np.array([-wanted[1], wanted[0], 0.0]) * 0.1
+    heading = np.arctan2(rotation[1, 0], rotation[0, 0])
+    roll, pitch = (0.3 * (tilt + lean) - 0.03 * gyro)[:2]
+    yaw = -0.1 * heading - 0.05 * gyro[2]
+    x, y = np.array(link.positions).T
+    return np.clip(thrust + y * roll - x * pitch + np.array(link.yaw_torque_signs) * yaw, 0, 1)
+
+
+class Thread(threading.Thread):
+    """Thread of a stand-in, which ends when its socket is closed or silent; an error is raised by ``end``."""
+
+    def __init__(self, serve):
+        super().__init__(daemon=True)
+        self.serve, self.error = serve, None
+        self.start()
+
+    def run(self):
+        try:
+            self.serve()
+        except OSError:
+            pass
+        except Exception as error:
+            self.error = error
+
+    def end(self):
+        self.join(10.0)
+        if self.error:
+            raise self.error
+
+
+def free_port(kind):
+    with socket.socket(socket.AF_INET, kind) as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+def disturbed(**settings):
+    """Return a simulation whose drone hangs in the air, turned and beside its goal."""
+    sim = Sim(control="rotor_vel", **settings)
+    states = sim.data.states
+    pos, quat = np.array(states.pos), np.array(states.quat)
+    pos[..., :] = [0.3, -0.2, 1.2]
+    quat[..., :] = np.array([0.05, -0.08, 0.25, 1.0]) / np.linalg.norm([0.05, -0.08, 0.25, 1.0])
+    rotor_vel = np.full_like(states.rotor_vel, 15864.0)
+    sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat, rotor_vel=rotor_vel))
+    return sim
+
+
+def require_home(sim):
+    """Check that the drone is at its goal, level, and heads east."""
+    states = sim.data.states
+    np.testing.assert_allclose(states.pos[0, 0], [0, 0, 1.0], atol=0.1)  # the autopilot has no integral
+    np.testing.assert_allclose(matrix(states.quat[0, 0]), np.eye(3), atol=0.05)
+
+
+class Waiting(Betaflight):
+    """Waits for each answer, so that the flight does not depend on how fast the machine is."""
+
+    lockstep = True
+
+
+def test_betaflight_receives_the_state_and_flies():
+    ports = tuple(free_port(socket.SOCK_DGRAM) for _ in range(3))
+    state, rc = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    state.bind(("127.0.0.1", ports[1]))
+    rc.bind(("127.0.0.1", ports[2]))
+    state.settimeout(2.0)
+    rc.settimeout(0.0)
+    received, origin = [], Origin(10.0, 20.0, 100.0)
+
+    def serve():
+        while True:
+            packet = np.frombuffer(state.recv(200), "<f8")
+            received.append(packet)
+            gyro, quat, vel, place = packet[1:4], packet[7:11], packet[11:14], packet[14:17]
+            w, x, y, z = quat * [1, 1, -1, -1]
+            # Longitude and latitude are mirrored at the origin.
+            east, north = (place[:2] - [20.0, 10.0]) * -111194.93 * np.array([np.cos(np.radians(10.0)), 1])
+            pos = np.array([east, north, place[2] - 100.0])
+            motors = flown(Betaflight, pos, vel, matrix([x, y, z, w]), TO_FRD @ gyro)
+            state.sendto(np.asarray(motors, "<f4").tobytes(), ("127.0.0.1", ports[0]))
+
+    sim = disturbed(freq=250)
+    with state, rc, SoftwareInTheLoop(sim, Waiting(ports=ports, origin=origin, rc_freq=5.0)) as loop:
+        thread = Thread(serve)
+        loop.links[0].channels[:] = np.arange(1000, 1016)
+        loop.run(12.0)
+        controls = [rc.recv(100) for _ in range(12 * 5)]
+    thread.end()
+    require_home(sim)
+    times = np.array([packet[0] for packet in received])
+    np.testing.assert_allclose(times, np.arange(len(times)) / 250, atol=1e-9)
+    # Hovering: the specific force points up, which is minus 9.81 in the axes forward, right, down.
+    np.testing.assert_allclose(received[-1][4:7], [0, 0, -9.81], atol=0.3)
+    assert received[-1][17] == pytest.approx(101325 * (1 - 0.0065 / 288.15 * 101.0) ** 5.2559, rel=1e-4)
+    assert struct.unpack("<d16H", controls[3])[1:] == tuple(range(1000, 1016))
+
+
+def test_ardupilot_steps_with_the_simulation_and_flies():
+    port, n_steps = free_port(socket.SOCK_DGRAM), 2000
+    lines = []
+
+    def serve():
+        peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        peer.settimeout(5.0)
+        motors = np.zeros(4)
+        for count in range(n_steps):
+            pulses = np.full(16, 1500)
+            pulses[:4] = np.round(1000 + 1000 * motors)
+            peer.sendto(struct.pack("<HHI16H", 18458, 400, count, *pulses.astype(int)), ("127.0.0.1", port))
+            if count == n_steps - 1:
+                break
+            line = json.loads(peer.recv(2000))
+            lines.append(line)
+            w, x, y, z = line["quaternion"]
+            rotation = TO_NED @ matrix([x, y, z, w]) @ TO_FRD
+            pos, vel, gyro = TO_NED @ line["position"], TO_NED @ line["velocity"], TO_FRD @ line["imu"]["gyro"]
+            motors = flown(ArduPilot, pos, vel, rotation, gyro)
+        peer.close()
+
+    sim = disturbed()
+    with SoftwareInTheLoop(sim, ArduPilot(port=port), freq=250) as loop:
+        thread = Thread(serve)
+        loop.run(n_steps / 250)
+    thread.end()
+    require_home(sim)
+    assert len(lines) == n_steps - 1
+    np.testing.assert_allclose([line["timestamp"] for line in lines], np.arange(1, n_steps) / 250, atol=1e-9)
+
+
+def test_px4_is_in_lockstep_and_flies():
+    n_steps, sensors, places = 2500, [], []
+    link = Px4(port=0, origin=Origin(10.0, 20.0, 100.0))
+
+    def serve():
+        client = socket.create_connection(link.address)
+        client.settimeout(5.0)
+        mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        truth = None
+        while len(sensors) < n_steps:
+            for message in mav.parse_buffer(client.recv(4096)) or []:
+                if message.get_type() == "HIL_STATE_QUATERNION":
+                    truth = message
+                if message.get_type() == "HIL_GPS":
+                    places.append(message)
+                if message.get_type() == "HIL_SENSOR":
+                    sensors.append(message)
+                    # A real one estimates its state; the stand-in takes the simulation's.
+                    m = loop.measure()[0]
+                    gyro = np.array([message.xgyro, -message.ygyro, -message.zgyro])
+                    motors = flown(Px4, m.pos, m.vel, matrix(m.quat), gyro)
+                    mode = common.MAV_MODE_FLAG_SAFETY_ARMED
+                    answer = common.MAVLink_hil_actuator_controls_message(
+                        message.time_usec, [*motors, *[0] * 12], mode, 1
+                    )
+                    client.sendall(answer.pack(mav))
+        assert truth is not None
+        client.close()
+
+    sim = disturbed(freq=250)
+    sim.add(Barometer(altitude=100.0))
+    loop = SoftwareInTheLoop(sim, link)
+    with loop:
+        thread = Thread(serve)
+        loop.run(n_steps / 250)
+    thread.end()
+    require_home(sim)
+    assert link.armed
+    assert [message.time_usec for message in sensors[:3]] == [0, 4000, 8000]
+    last = sensors[-1]
+    np.testing.assert_allclose([last.xacc, last.yacc, last.zacc], [0, 0, -9.81], atol=0.3)
+    # About the field of central Europe, in the body's axes of a drone that heads east: right is south.
+    np.testing.assert_allclose([last.xmag, last.ymag, last.zmag], [0, -0.2, 0.45], atol=0.02)
+    assert last.abs_pressure == pytest.approx(1013.25 * (1 - 0.0065 / 288.15 * 101.0) ** 5.2559, rel=1e-4)
+    assert len(places) == n_steps / 250 * 5
+    assert (places[-1].lat, places[-1].lon) == (pytest.approx(10e7, abs=20), pytest.approx(20e7, abs=20))
+
+
+def test_px4_turns_no_motor_while_it_is_disarmed():
+    link = Px4(port=0)
+    with link, socket.create_connection(link.address) as client:
+        mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        client.sendall(common.MAVLink_hil_actuator_controls_message(0, [0.5] * 16, 0, 0).pack(mav))
+        np.testing.assert_array_equal(link.receive(5.0), np.zeros(4))
+        assert not link.armed
+        assert link.receive(0.0) is None
+
+
+def test_attitudes_in_the_axes_of_aviation():
+    rng = np.random.default_rng(2)
+    for quat in rng.normal(size=(20, 4)):
+        quat /= np.linalg.norm(quat)
+        w, x, y, z = quat_ned(quat)
+        np.testing.assert_allclose(matrix([x, y, z, w]), TO_NED @ matrix(quat) @ TO_FRD, atol=1e-12)
+
+
+@pytest.mark.parametrize("link", [Betaflight, ArduPilot, Px4])
+def test_each_motor_drives_the_rotor_at_its_place(link):
+    airframe = Sim(control="rotor_vel").airframe
+    link = object.__new__(link)  # no ports
+    order = motor_order(airframe, link)
+    assert [tuple(np.sign(p[:2])) for p in airframe.value("rotors.position")[order]] == list(link.positions)
+    with pytest.raises(ConfigError, match=rf"motors 1 to 4 of {type(link).__name__}.*Pass reversed=False, and set"):
+        motor_order(airframe, link, reversed=True)
+
+
+def test_wrong_settings_are_refused():
+    link = ArduPilot(port=free_port(socket.SOCK_DGRAM))
+    with link:
+        for message, sim, settings in (
+            ("expected control='rotor_vel', got 'attitude'", Sim(control="attitude"), {}),
+            ("expected a link for each of 2 drones, got 1", Sim(n_drones=2, control="rotor_vel"), {}),
+            ("expected freq as a divisor of sim.freq=500, got 300", Sim(control="rotor_vel"), {"freq": 300}),
+            ("expected motors as 'speed' or 'thrust', got 'volt'", Sim(control="rotor_vel"), {"motors": "volt"}),
+        ):
+            with pytest.raises(ConfigError, match=message):
+                SoftwareInTheLoop(sim, link, **settings)
+        with pytest.raises(ConfigError, match=r"expected motor commands of ArduPilot within 0\.1 s, got none"):
+            SoftwareInTheLoop(Sim(control="rotor_vel"), link, timeout=0.1).exchange()
+        with pytest.raises(ConfigError, match="expected a free port"):
+            ArduPilot(port=link._link._socket.getsockname()[1])
+    with Px4(port=0, connect_timeout=0.1) as px4, pytest.raises(ConfigError, match=r"within 0\.1 s, got no connection"):
+        px4.send(SoftwareInTheLoop(Sim(control="rotor_vel"), px4).measure()[0])
+
+
+def test_measurements_are_those_of_the_plugins():
+    sim = Sim(control="rotor_vel")
+    imu = sim.add(IMU(delay=0.01))
+    with SoftwareInTheLoop(sim, ArduPilot(port=free_port(socket.SOCK_DGRAM))) as loop:
+        assert isinstance(loop.measure()[0], Measured)
+        sim.rotor_vel_control(np.full((1, 1, 4), 18000.0))
+        sim.step(50)
+        measured = loop.measure()[0]
+        value = np.asarray(imu.read(sim.data).samples.value)[0, 0]
+        np.testing.assert_array_equal(np.concatenate([measured.gyro, measured.accel]), value.astype(float))
+        assert measured.height == pytest.approx(float(sim.data.states.pos[0, 0, 2]))
