@@ -12,7 +12,8 @@ from crazysim.commands import airframe, demo, identify, info, live, replay, show
 from crazysim.errors import DivergedError, RenderError
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
-          "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio", "pymavlink": "mavlink"}  # fmt: skip
+          "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio",
+          "pymavlink": "mavlink"}  # fmt: skip
 """Extra of crazysim that brings a package."""
 
 

@@ -80,7 +80,7 @@ class Datagrams(Closing):
             raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
 
     def send(self, packet: bytes, port: int) -> None:
-        """Send a packet; one that nobody listens for is lost."""
+        """Send a packet, which is lost if no program listens."""
         with contextlib.suppress(ConnectionRefusedError):
             self._socket.sendto(packet, (self._host, port))
 
