@@ -82,7 +82,9 @@ def start(pos: Array, vel: Array, quat: Array, deviations: Sequence[Array | floa
     return Estimate(pos, vel, quat, jnp.zeros_like(vel), jnp.diag(variance)[_UPPER])
 
 
-def predict(estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: Array | None = None) -> Estimate:
+def predict(
+    estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: Array | None = None, all_axes: bool = False
+) -> Estimate:
     """Return the estimate after an interval, without process noise.
 
     Args:
@@ -90,8 +92,9 @@ def predict(estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: A
         accel: Specific force, body frame, m/s^2. (3,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         dt: Length of the interval, s.
-        resting: Attitude to which that of a drone on the ground is drawn, (4,); None in flight, where only the force
-            along the z axis of the body is used, as rotors can make no other.
+        resting: Attitude to which that of a drone on the ground is drawn, (4,); None in flight.
+        all_axes: True to use the force along all axes in flight; False for that along the z axis of the body only, as
+            the firmware does, because rotors can make no other.
     """
     pos, vel, quat = estimate.pos, estimate.vel, estimate.quat
     rot, identity, angle = rotation.matrix(quat), jnp.eye(3, dtype=pos.dtype), dt * gyro
@@ -111,7 +114,7 @@ def predict(estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: A
     vel_columns = rows[:, 3:6] @ keep_vel.T + rows[:, 6:] @ att_to_vel.T
     p = jnp.concatenate([pos_columns, vel_columns, rows[:, 6:] @ turn.T], axis=1)
 
-    force = rotation.along_z(accel[2]) if resting is None else accel
+    force = rotation.along_z(accel[2]) if resting is None and not all_axes else accel
     shift = dt * vel + 0.5 * dt**2 * force
     pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY * dt**2], pos.dtype)
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)

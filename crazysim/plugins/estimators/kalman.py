@@ -81,6 +81,9 @@ class Kalman(Estimator):
     """
 
     _: dataclasses.KW_ONLY
+    all_axes: bool = False
+    """True to use the accelerometer along all axes, for any airframe and in wind; False as the firmware, which takes
+    the force of the rotors to be the only one."""
     freq: int = 100
     """Predictions per second, Hz, a divisor of ``sim.freq``."""
     accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0), low=0.0)
@@ -159,7 +162,8 @@ class Kalman(Estimator):
             """Predict the state of one drone from the mean of its inertial measurements."""
             record = self.read(data)
             accel, gyro = record.accel / period, record.gyro / period
-            estimate = error_state.predict(record.estimate, accel, gyro, period / data.core.freq)
+            dt = period / data.core.freq
+            estimate = error_state.predict(record.estimate, accel, gyro, dt, all_axes=self.all_axes)
             zero = jnp.zeros_like(accel)
             return self.write(data, record.replace(estimate=estimate, accel=zero, gyro=zero))
 

@@ -203,6 +203,23 @@ def test_all_sensors_on_all_engines():
         np.testing.assert_allclose(one, other, rtol=0, atol=2e-4)
 
 
+@pytest.mark.parametrize("drone", ["cf2x_L250", "bumblebee"])
+def test_all_axes_of_the_accelerometer_serve_any_airframe(drone):
+    """In a steady push of a tenth of the weight, which the firmware's filter takes for a drift, as it expects none."""
+    wrong = []
+    for all_axes in (False, True):
+        estimator = Kalman([IMU(), MotionCapture()], all_axes=all_axes, control=False)
+        sim = Sim(drone=drone, control="state", controller="auto", estimator=estimator)
+        states, push = sim.data.states, float(sim.airframe.value("rigid_body.mass", ()))
+        pos, force = states.pos.at[..., 2].set(1.0), states.force.at[..., 0].set(push)
+        sim.data = sim.data.replace(states=states.replace(pos=pos, force=force))
+        sim.state_control(pos=(0.0, 0.0, 1.0))
+        sim.step(2500)
+        wrong.append(np.abs(errors(sim)[0, 3]))
+    assert wrong[0] > 0.02
+    assert wrong[1] < 0.1 * wrong[0]
+
+
 def test_removal_gives_the_controllers_back():
     sim = build(imu=IMU())
     names = [stage for stage in sim.step_pipeline if not stage.startswith("kalman")]
