@@ -1,9 +1,10 @@
 """Environment steps per second, with random actions and with a policy, in one compiled rollout with automatic resets.
 
-    python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576]
+    python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576] [--randomize]
 
 An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
-contains the fraction of worlds whose episode ends per step.
+contains the fraction of worlds whose episode ends per step. With ``--randomize`` the same rollouts with
+``Randomize.crazyflie()`` are timed in turn with them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 from measure import digits, engine_of, medians, report
 
 import crazysim.envs as envs
+from crazysim import Randomize
 from crazysim.envs.state import bare, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.train.networks import Policy, init_mlp
@@ -31,26 +33,31 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", help="numbers of worlds")
     parser.add_argument("--steps", type=int, default=50, help="environment steps per call")
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--randomize", action="store_true", help="time the same with Randomize.crazyflie() in turn")
     args = parser.parse_args()
     for task in args.tasks:
         for n_worlds in args.worlds or SIZES["cpu" if args.device == "cpu" else "gpu"]:
-            rollouts(task, n_worlds, args.steps, args.device, args.repeats)
+            rollouts(task, n_worlds, args.steps, args.device, args.repeats, args.randomize)
 
 
-def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) -> None:
+def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int, randomize: bool) -> None:
     """Print the rates of both kinds of rollout."""
     base = envs.make(task, n_worlds, device=device)
-    env = envs.AutoReset(base)
+    places = {"as the airframe": envs.AutoReset(base)}
+    if randomize:
+        drawn = envs.make(task, n_worlds, device=device, effects=[Randomize.crazyflie()])
+        places["randomized"] = envs.AutoReset(drawn)
     place = base.sim.device
-    start = jax.jit(env.reset)(jax.device_put(jax.random.key(0), place))
-    n_obs = flatten(start.obs).shape[-1]
+    key = jax.device_put(jax.random.key(0), place)
+    starts = {drones: jax.jit(env.reset)(key) for drones, env in places.items()}
+    n_obs = flatten(starts["as the airframe"].obs).shape[-1]
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, place)
 
     def flying(policy: Policy) -> Any:
         return lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape)
 
-    def jitted(act: Any) -> Any:
+    def jitted(env: Any, act: Any) -> Any:
         def run(carry: Any) -> Any:
             state, key = carry
             key, now = jax.random.split(key)
@@ -68,33 +75,38 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int) 
         ),
     }
     for name, act in acts.items():
-        carry = (bare(start), jax.device_put(jax.random.key(2), place))
-        begin = time.perf_counter()
-        run = jitted(act).lower(carry).compile()
-        compile_s = time.perf_counter() - begin
-        carry, _ = run(carry)
-        last: list[Any] = [carry]
-
-        def measure(run: Any = run, last: list[Any] = last) -> float:
-            jax.block_until_ready(last[0])
+        measures: dict[str, Any] = {}
+        compile_s, lasts = {}, {}
+        for drones, env in places.items():
+            carry = (bare(starts[drones]), jax.device_put(jax.random.key(2), place))
             begin = time.perf_counter()
-            last[0], last[1:] = (out := run(last[0]))[0], [out[1]]
-            jax.block_until_ready(last)
-            return time.perf_counter() - begin
+            run = jitted(env, act).lower(carry).compile()
+            compile_s[drones] = time.perf_counter() - begin
+            carry, _ = run(carry)
+            last: list[Any] = [carry]
 
-        seconds = medians({name: measure}, repeats)[name]
-        report(
-            device,
-            benchmark="envs",
-            task=task,
-            actions=name,
-            n_worlds=n_worlds,
-            n_steps=n_steps,
-            engine=engine_of(base.sim),
-            compile_s=round(compile_s, 2),
-            env_steps_per_s=digits(n_worlds * base.sim.n_drones * n_steps / seconds),
-            ended=digits(float(jnp.mean(last[1][1]))),
-        )
+            def measure(run: Any = run, last: list[Any] = last) -> float:
+                jax.block_until_ready(last[0])
+                begin = time.perf_counter()
+                last[0], last[1:] = (out := run(last[0]))[0], [out[1]]
+                jax.block_until_ready(last)
+                return time.perf_counter() - begin
+
+            measures[drones], lasts[drones] = measure, last
+        for drones, seconds in medians(measures, repeats).items():
+            report(
+                device,
+                benchmark="envs",
+                task=task,
+                actions=name,
+                drones=drones,
+                n_worlds=n_worlds,
+                n_steps=n_steps,
+                engine=engine_of(base.sim),
+                compile_s=round(compile_s[drones], 2),
+                env_steps_per_s=digits(n_worlds * base.sim.n_drones * n_steps / seconds),
+                ended=digits(float(jnp.mean(lasts[drones][1][1]))),
+            )
 
 
 if __name__ == "__main__":

@@ -85,6 +85,7 @@ def make(
     freq: int = 50,
     actions: Actions | None = None,
     sensors: Sequence[Plugin] = (),
+    effects: Sequence[Plugin] = (),
     **options: Any,
 ) -> DroneEnv:
     """Return an environment of many worlds of a task, with a simulation of its own.
@@ -96,6 +97,8 @@ def make(
         actions: Meaning of an action; None for the usual one of the command level.
         sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Empty for the
             true states, or for those that ``estimator``, a setting of ``Sim``, estimates.
+        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. What ``env.sim.add`` adds later is
+            not part of the environment.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
 
@@ -119,8 +122,8 @@ def make(
     task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
     sim = Sim(n_worlds=n_worlds, **settings)
     task.install(sim)
-    for sensor in sensors:
-        sim.add(sensor)
+    for plugin in (*effects, *sensors):
+        sim.add(plugin)
     return DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
 
 

@@ -7,6 +7,7 @@ from crazysim.plugins.effects.ground import ground_at, ground_height
 from crazysim.plugins.effects.ground_effect import GroundEffect
 from crazysim.plugins.effects.latency import Latency
 from crazysim.plugins.effects.motors import MotorFailure
+from crazysim.plugins.effects.randomize import Randomize
 from crazysim.plugins.effects.residual import Residual
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics
 from crazysim.plugins.effects.wind import Wind
@@ -19,6 +20,7 @@ __all__ = [
     "GroundEffect",
     "Latency",
     "MotorFailure",
+    "Randomize",
     "Residual",
     "RotorAerodynamics",
     "Wind",

@@ -14,6 +14,7 @@ from crazysim import (
     Latency,
     MotorFailure,
     Plugin,
+    Randomize,
     Residual,
     RotorAerodynamics,
     Sim,
@@ -33,6 +34,7 @@ ON = {
     Downwash: {},
     GroundEffect: {},
     Latency: {"delay": 2},
+    Randomize: {"mass": (0.9, 1.1), "drag": (0.5, 1.5), "wind": (0.0, 2.0)},
     RotorAerodynamics: {"flapping": 1e-8, "ceiling": 4.0},
     MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
     Residual: {

@@ -1,0 +1,224 @@
+"""Randomisation: drones that differ from their airframe, drawn at the beginning of every episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
+from crazysim.core.random import drone_key
+from crazysim.core.stage import Stage
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects.battery import BatteryData
+from crazysim.plugins.effects.latency import LatencyData
+from crazysim.plugins.effects.moving_air import Air, require_drag, require_rotors, with_moving_air
+from crazysim.pytree import leaf
+
+FACTORS = ("mass", "inertia", "torque", "lag", "drag")
+"""Settings that are factors of one number of a drone, in the order of ``RandomizeData.factors``."""
+
+
+class RandomizeData(Air):
+    """Factors of the parameters of every drone, and the ranges that they are drawn from."""
+
+    factors: Array = leaf("drone", 1)
+    """Factors of mass, inertia, drag torque, rates of the rotors' lag, and linear drag, 1. (n_worlds, n_drones, 5)"""
+    thrust_factors: Array = leaf("drone", 1)
+    """Factors of the thrust of the rotors, 1. (n_worlds, n_drones, n_rotors)"""
+    air_vel: Array | None = leaf("drone", 1, (3,))
+    """Mean wind, world frame, m/s; None without. (n_worlds, n_drones, 3)"""
+    mass: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the mass, 1; None for one. (2,)"""
+    inertia: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the inertia, 1; None for one. (2,)"""
+    thrust: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the thrust of all rotors, 1; None for one. (2,)"""
+    rotor_thrust: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the thrust of each rotor, 1; None for one. (2,)"""
+    torque: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the drag torque, 1; None for one. (2,)"""
+    lag: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the rates of the rotors' lag, 1; None for one. (2,)"""
+    drag: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest factor of the linear drag, 1; None for one. (2,)"""
+    wind: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest speed of the mean wind, m/s; None without. (2,)"""
+    charge: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest state of charge of a battery, 1; None for that of ``Battery``. (2,)"""
+    delay: Array | None = leaf("parameter", 1, (2,))
+    """Least and largest delay of commands, steps; None for that of ``Latency``. (2,)"""
+
+    def at_drone(self, data: SimData) -> Array:
+        """Return the mean wind at the drone."""
+        return jnp.zeros_like(data.states.vel) if self.air_vel is None else self.air_vel
+
+
+class Randomize(Plugin):
+    """Drones that differ from their airframe, in another way in every episode; needs rotors.
+
+    Each setting is a range (low, high), for all drones, (2,), or for each, (n_worlds, n_drones, 2), from which a number
+    is drawn uniformly for every drone in the first step of an episode; a single number is fixed,
+    None changes nothing. Controllers keep the
+    airframe's numbers. The numbers drawn do not depend on the other settings. ``Randomize.crazyflie()`` and
+    ``Randomize.generic()`` have ranges with sources.
+    """
+
+    mass: ArrayLike | None = parameter(default=None, positive=True)
+    """Factor of the mass."""
+    inertia: ArrayLike | None = parameter(default=None, positive=True)
+    """Factor of the inertia, the same for all axes."""
+    thrust: ArrayLike | None = parameter(default=None, positive=True)
+    """Factor of the thrust, the same for all rotors of a drone."""
+    rotor_thrust: ArrayLike | None = parameter(default=None, positive=True)
+    """Factor of the thrust, another for each rotor; it multiplies ``thrust``."""
+    torque: ArrayLike | None = parameter(default=None, positive=True)
+    """Factor of the rotors' drag torque."""
+    lag: ArrayLike | None = parameter(default=None, positive=True)
+    """Factor of the rates of the rotors' lag: their time constants are divided by it."""
+    drag: ArrayLike | None = parameter(default=None, low=0.0)
+    """Factor of the linear drag."""
+    wind: ArrayLike | None = parameter(default=None, low=0.0)
+    """Speed of a mean wind of random horizontal direction, m/s; needs a model with drag."""
+    charge: ArrayLike | None = parameter(default=None, low=0.0, high=1.0)
+    """State of charge in which an episode begins, of simulations with ``Battery``."""
+    delay: ArrayLike | None = parameter(default=None, low=0.0)
+    """Delay of commands, steps, rounded down, of simulations with ``Latency``, whose delay must be one per drone."""
+    name: str = "randomize"
+    order: ClassVar[int] = -2  # before effects that change the same parameters
+
+    @classmethod
+    def crazyflie(cls, **changes: ArrayLike | None) -> Randomize:
+        """Return the spread between published identifications of Crazyflies 2.x, and between flights.
+
+        The page *Disturbances and randomisation* has the source of each range.
+
+        Args:
+            changes: Other settings, by name.
+        """
+        ranges: dict[str, Any] = {
+            "mass": (0.91, 1.05),
+            "inertia": (0.85, 1.32),
+            "thrust": (0.88, 1.12),
+            "rotor_thrust": (0.95, 1.05),
+            "lag": (0.9, 1.9),
+            "drag": (0.5, 1.6),
+            "charge": (0.1, 1.0),
+        }
+        return cls(**(ranges | changes))
+
+    @classmethod
+    def generic(cls, **changes: ArrayLike | None) -> Randomize:
+        """Return 30 % either way in all factors of an airframe, the widest of Ferede et al. 2025 (arXiv 2504.21586).
+
+        Args:
+            changes: Other settings, by name.
+        """
+        ranges: dict[str, Any] = dict.fromkeys((*FACTORS, "thrust"), (0.7, 1.3))
+        ranges |= {"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)}
+        return cls(**(ranges | changes))
+
+    def record(self, sim: Simulation) -> RandomizeData:
+        """Return factors of one and no wind, until the first step of an episode."""
+        require_rotors(sim, "randomisation of motors")
+        if self.wind is not None:
+            require_drag(sim, "wind")
+        record = self.filled(
+            sim,
+            RandomizeData,
+            factors=per_drone(sim, 1.0, len(FACTORS)),
+            thrust_factors=per_drone(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
+            air_vel=None if self.wind is None else per_drone(sim, 0.0, 3),
+        )
+        for name in (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay"):
+            limits = getattr(record, name)
+            if limits is not None and np.any(np.asarray(limits[..., 0]) > np.asarray(limits[..., 1])):
+                raise ConfigError(
+                    f"expected {name} as (low, high), got {getattr(self, name)!r}. Use the smaller number first."
+                )
+        if self.delay is not None:
+            self._check_delay(sim)
+        return record
+
+    def _check_delay(self, sim: Simulation) -> None:
+        """Check that delays are one per drone, and that the queues are long enough.
+
+        Raises:
+            ConfigError: If they are not.
+        """
+        batch = (sim.n_worlds, sim.n_drones)
+        longest = int(np.max(np.asarray(self.delay)))
+        for name, latency in sim.data.plugins.items():
+            if not isinstance(latency, LatencyData):
+                continue
+            if latency.delay.shape[:-1] != batch or latency.queue.shape[-2] <= longest:
+                raise ConfigError(
+                    f"expected plugin {name!r} with one delay per drone, of up to {longest} steps, got delay of shape "
+                    f"{latency.delay.shape} and queues of {latency.queue.shape[-2]} rows. Use "
+                    f"Latency(delay=np.zeros({batch}, int), max_delay={longest})."
+                )
+
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that draws, in the first step of an episode, before all others."""
+        first = next(name for name in sim.step_pipeline if name != self.name)
+        return [Placement(Stage(self.begin, "drone", when=lambda data: data.core.steps == 0), before=first)]
+
+    def influence(self, data: SimData) -> SimData:
+        """Return the data with the parameters of the drone that was drawn."""
+        record, p = self.read(data), data.params
+        mass, inertia, torque, lag, drag = (record.factors[k : k + 1] for k in range(len(FACTORS)))
+        changes = {}
+        if record.mass is not None:
+            changes["mass"] = mass * p.mass
+        if record.inertia is not None:
+            changes |= {"J": inertia * p.J, "J_inv": p.J_inv / inertia}
+        if record.torque is not None:
+            changes["rpm2torque"] = torque * p.rpm2torque
+        if record.lag is not None:
+            changes["rotor_dyn_coef"] = lag * p.rotor_dyn_coef
+        if record.drag is not None:
+            changes["drag_matrix"] = drag * p.drag_matrix
+        if record.thrust is not None or record.rotor_thrust is not None:
+            changes["rpm2thrust"] = record.thrust_factors[:, None] * p.rpm2thrust
+        data = data.replace(params=p.replace(**changes))
+        return data if record.air_vel is None else with_moving_air(data, record.air_vel)
+
+    def observations(self, data: SimData) -> dict[str, Array]:
+        """Return the factors, for critics and policies that are to be given what is drawn."""
+        record = self.read(data)
+        found = {"factors": record.factors, "thrust_factors": record.thrust_factors}
+        return found if record.air_vel is None else found | {"air_vel": record.air_vel}
+
+    def begin(self, data: SimData) -> SimData:
+        """Draw the factors of one drone for an episode."""
+        record = self.read(data)
+        n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
+        u = jax.random.uniform(drone_key(data, self.name), (len(FACTORS) + 5 + n_rotors,), dtype)
+
+        def drawn(limits: Array | None, share: Array) -> Array:
+            return jnp.ones_like(share) if limits is None else limits[0] + share * (limits[1] - limits[0])
+
+        single = [drawn(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTORS)]
+        rest = u[len(FACTORS) :]
+        thrust = drawn(record.thrust, rest[:1]) * drawn(record.rotor_thrust, rest[5:])
+        changes = {"factors": jnp.concatenate(single), "thrust_factors": thrust}
+        if record.wind is not None:
+            speed, angle = drawn(record.wind, rest[1:2]), 2 * math.pi * rest[2:3]
+            changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
+        data = self.write(data, record.replace(**changes))
+
+        others = dict(data.plugins)
+        for name, other in data.plugins.items():
+            if isinstance(other, BatteryData) and record.charge is not None:
+                others[name] = other.replace(charge=drawn(record.charge, rest[3:4]))
+            if isinstance(other, LatencyData) and record.delay is not None:
+                steps = jnp.floor(drawn(record.delay, rest[4:5])).astype(other.delay.dtype)
+                others[name] = other.replace(delay=steps)
+        return data.replace(plugins=others)

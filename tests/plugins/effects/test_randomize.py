@@ -1,0 +1,181 @@
+"""Randomisation: what is drawn, that it acts as parameters do, and that it follows the laws of random numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import FAST, hover_rotor_state, with_states
+
+from crazysim import Battery, ConfigError, Latency, Randomize, Sim, Wind
+from crazysim.engine import Step
+from crazysim.envs import AutoReset, make
+
+RANGES = {
+    "mass": (0.9, 1.2),
+    "inertia": (0.8, 1.1),
+    "thrust": (0.9, 1.0),
+    "rotor_thrust": (0.95, 1.05),
+    "torque": (0.5, 2.0),
+    "lag": (0.7, 1.3),
+    "drag": (0.0, 3.0),
+    "wind": (1.0, 3.0),
+}
+
+
+def build(n_worlds=3, n_drones=2, engine="interpret", **settings):
+    sim = Sim(n_worlds, n_drones, control="rotor_vel", rng_key=5, engine=engine)
+    sim.data = with_states(sim.data, pos=[0, 0, 2.0], rotor_vel=hover_rotor_state(sim.data))
+    sim.build_default_data()
+    return sim, sim.add(Randomize(**settings))
+
+
+@pytest.fixture(scope="module")
+def many():
+    """A thousand worlds after one step."""
+    sim, plugin = build(1000, 1, **RANGES)
+    sim.rotor_vel_control(sim.data.states.rotor_vel)
+    sim.step()
+    return sim, plugin
+
+
+def test_numbers_are_uniform_in_their_ranges_and_independent(many):
+    """Mean and deviation of 1000 uniform numbers: four standard errors."""
+    sim, plugin = many
+    record = plugin.read(sim.data)
+    names = ("mass", "inertia", "torque", "lag", "drag")
+    columns = [np.asarray(record.factors)[:, 0, k] for k in range(5)]
+    columns.append(np.linalg.norm(record.air_vel[:, 0, :2], axis=-1))
+    for name, x in zip((*names, "wind"), columns, strict=True):
+        low, high = RANGES[name]
+        assert low <= x.min() < x.max() <= high
+        np.testing.assert_allclose(x.mean(), (low + high) / 2, atol=4 * (high - low) / np.sqrt(12 * 1000))
+    thrust = np.asarray(record.thrust_factors)[:, 0]
+    assert thrust.min() > 0.9 * 0.95
+    assert thrust.max() < 1.05
+    np.testing.assert_allclose(np.sqrt(thrust.var(axis=1, ddof=1).mean()), 0.95 * 0.1 / np.sqrt(12), rtol=0.1)
+    correlation = np.corrcoef([*columns, *thrust.T])
+    assert np.abs(correlation[:6, :6] - np.eye(6)).max() < 4 / np.sqrt(1000)
+    angle = np.arctan2(record.air_vel[:, 0, 1], record.air_vel[:, 0, 0])
+    assert np.histogram(angle, 4, (-np.pi, np.pi))[0].min() > 190
+    np.testing.assert_array_equal(record.air_vel[..., 2], 0.0)
+
+
+def test_factors_act_as_the_parameters_themselves(many):
+    """One step of each drone against one of a simulation whose parameters are set to what was drawn, with the wind."""
+    sim, plugin = many
+    record = jax.tree.map(np.asarray, plugin.read(sim.data))
+    other = Sim(1000, control="rotor_vel", engine="interpret")
+    p, f = other.data.params, record.factors[..., None]
+    other.data = with_states(other.data, pos=[0, 0, 2.0], rotor_vel=hover_rotor_state(other.data))
+    other.data = other.data.replace(
+        params=p.replace(
+            mass=f[..., 0, :] * p.mass,
+            J=f[..., 1:2, :] * p.J,
+            J_inv=p.J_inv / f[..., 1:2, :],
+            rpm2torque=f[..., 2:3, :] * p.rpm2torque,
+            rotor_dyn_coef=f[..., 3:4, :] * p.rotor_dyn_coef,
+            drag_matrix=f[..., 4:5, :] * p.drag_matrix,
+            rpm2thrust=record.thrust_factors[..., None] * p.rpm2thrust,
+        )
+    )
+    other.add(Wind(record.air_vel))
+    command = 1.05 * np.asarray(other.data.states.rotor_vel)
+    again, same = build(1000, 1, **RANGES)
+    for one in (other, again):
+        one.rotor_vel_control(command)
+        one.step(20)
+    np.testing.assert_array_equal(same.read(again.data).factors, record.factors)
+    for name in ("pos", "vel", "ang_vel", "rotor_vel"):
+        # float32 over 20 steps
+        found, expected = (np.asarray(getattr(x.data.states, name)) for x in (again, other))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-5, err_msg=name)
+    assert again.data.params.mass.shape == (1,)
+
+
+def test_law_10_numbers_depend_on_the_episode_and_not_on_other_worlds():
+    found = []
+    for n_worlds in (2, 3):
+        sim, plugin = build(n_worlds, **RANGES)
+        sim.step()
+        found.append(np.asarray(plugin.read(sim.data).factors))
+    np.testing.assert_array_equal(found[0], found[1][:2])
+    assert len(np.unique(found[1][..., 0])) == 6
+    sim.step()
+    np.testing.assert_array_equal(plugin.read(sim.data).factors, found[1])
+    sim.reset(np.array([False, True, False]))
+    sim.step()
+    after = np.asarray(plugin.read(sim.data).factors)
+    np.testing.assert_array_equal(after[::2], found[1][::2])
+    assert np.all(after[1] != found[1][1])
+
+
+def test_batteries_and_delays_of_their_plugins_are_drawn():
+    sim, _ = build(50, 2, charge=(0.2, 0.6), delay=(1, 4))
+    battery = sim.add(Battery())
+    latency = sim.add(Latency(delay=np.zeros((50, 2), int), max_delay=4))
+    sim.step()
+    charge, delay = np.asarray(battery.read(sim.data).charge), np.asarray(latency.read(sim.data).delay)
+    assert 0.199 < charge.min() < 0.25 < 0.55 < charge.max() <= 0.6
+    assert set(np.unique(delay)) == {1, 2, 3}
+    sim.step(5)
+    np.testing.assert_array_equal(latency.read(sim.data).delay, delay)
+
+
+def test_every_engine_draws_and_flies_alike():
+    sim, plugin = build(3, 2, engine="plain", **RANGES, charge=(0.2, 0.6), delay=(1, 4))
+    sim.add(Battery())
+    sim.add(Latency(delay=np.zeros((3, 2), int), max_delay=4))
+    expected = Step(sim.step_pipeline, "plain")(sim.data, np.int32(20))
+    assert np.ptp(expected.states.vel[..., 2]) > 1e-2
+    for engine in FAST:
+        found = Step(sim.step_pipeline, engine)(sim.data, np.int32(20))
+        np.testing.assert_array_equal(plugin.read(found).factors, plugin.read(expected).factors)
+        for name in ("pos", "vel"):
+            a, b = getattr(found.states, name), getattr(expected.states, name)
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5, err_msg=f"{engine} {name}")
+
+
+def test_presets_fly_and_take_changes():
+    for preset in (Randomize.crazyflie, Randomize.generic):
+        assert preset(drag=None, mass=(1.0, 1.1)).drag is None
+        sim = Sim(50, control="state", rng_key=1)
+        sim.data = with_states(sim.data, pos=[0, 0, 1.0], rotor_vel=hover_rotor_state(sim.data))
+        plugin = sim.add(preset(delay=None))
+        sim.state_control(pos=[0.0, 0.0, 1.0])
+        errors = []
+        for n_steps in (100, 1900):
+            sim.step(n_steps)
+            errors.append(np.median(np.linalg.norm(np.asarray(sim.data.states.pos) - [0, 0, 1.0], axis=-1)))
+        assert errors[0] > 3e-3 > errors[1], "the drones differ, and the controller corrects them"
+        assert np.ptp(plugin.read(sim.data).factors[..., 0]) > 0.05
+        assert set(sim.plugins.observations(sim.data)) == {"randomize.factors", "randomize.thrust_factors"}
+    assert Randomize.crazyflie(mass=(1.0, 1.1)).mass == (1.0, 1.1)
+
+
+def test_a_task_flies_other_drones_in_every_episode():
+    env = AutoReset(make("hover", 4, effects=[Randomize.crazyflie()], seconds=0.1))
+    state = jax.jit(env.reset)(jax.random.key(0))
+    step, seen = jax.jit(env.step), []
+    for _ in range(8):
+        state = step(state, jnp.zeros_like(state.action))
+        seen.append(np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0])
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert len(np.unique(seen[0])) == 4
+    assert np.all(seen[-1] != seen[0])
+
+
+def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
+    with pytest.raises(ConfigError, match=r"expected mass as \(low, high\), got \(1.1, 0.9\)"):
+        build(mass=(1.1, 0.9))
+    with pytest.raises(ConfigError, match="mass to be finite and positive"):
+        build(mass=(-1.0, 0.9))
+    with pytest.raises(ConfigError, match="mass as real numbers of shape"):
+        build(mass=(0.9, 1.0, 1.1))
+    with pytest.raises(ConfigError, match="first_principles"):
+        Sim(dynamics="so_rpy").add(Randomize.crazyflie())
+    with pytest.raises(ConfigError, match="acts through drag"):
+        Sim(drone="bumblebee").add(Randomize(wind=(0.0, 1.0)))
+    sim = Sim(3)
+    sim.add(Latency(delay=2))
+    with pytest.raises(ConfigError, match=r"Use Latency\(delay=np.zeros\(\(3, 1\), int\), max_delay=4\)"):
+        sim.add(Randomize(delay=(0, 4)))
