@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from crazysim.envs.task import Task
-from crazysim.errors import RenderError
+from crazysim.errors import ConfigError, RenderError
 from crazysim.train.config import TrainConfig
 from crazysim.train.show import film as film_policy
 from crazysim.train.show import plot_curve, plot_episode, read_curve
 from crazysim.train.training import CHECKPOINT, POLICY, TrainResult, stored_config, train
+
+SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config")
+"""Settings of ``TrainConfig.create`` that ``run`` takes."""
 
 
 def run(
@@ -48,6 +51,11 @@ def run(
         DivergedError: If weights or losses become non-finite; the last checkpoint stays.
         KeyboardInterrupt: After the checkpoint of an interrupted run has been written.
     """
+    if unknown := settings.keys() - SETTINGS:
+        raise ConfigError(
+            f"expected settings among {', '.join(SETTINGS)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "
+            f"in config={{...}}, such as config={{'iterations': 100}}."
+        )
     config = TrainConfig.create(task, **settings)
     folder = Path("out") / config.title if folder is None else Path(folder)
     if resume:

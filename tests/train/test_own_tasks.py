@@ -313,3 +313,9 @@ def test_law_09_wrong_places_and_names_are_errors(file, tmp_path):
         envs.make(f"{tmp_path / 'broken.py'}:Any")
     with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
         train.run("hover", tmp_path / "x", options={"pos": jnp.zeros(3)})
+
+
+def test_a_hyperparameter_among_the_settings_is_an_error_that_says_where_it_belongs(tmp_path):
+    with pytest.raises(ConfigError, match=r"settings among .*, got iterations\. Hyperparameters belong in config="):
+        train.run("hover", tmp_path / "run", iterations=1)
+    assert not (tmp_path / "run").exists()
