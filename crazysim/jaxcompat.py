@@ -163,6 +163,23 @@ def batched_primitive(
     return primitive
 
 
+def simple_primitive(name: str, fn: Callable[..., list[Any]], batched: Callable[..., Any]) -> Primitive:
+    """Return a primitive for a function without a derivative that has a rule of its own for ``vmap``.
+
+    Args:
+        name: Its name.
+        fn: The function, from operands to a list of results.
+        batched: From operands and their batched dimensions to results and their batched dimensions.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(fn)
+    primitive.def_abstract_eval(lambda *args: [jax.typeof(x) for x in jax.eval_shape(fn, *args)])
+    batching.primitive_batchers[primitive] = batched
+    mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True))
+    return primitive
+
+
 def primitive_by_platform(
     name: str, results: Callable[..., Sequence[Any]], on: Mapping[str, Callable[..., Any]]
 ) -> Primitive:

@@ -61,14 +61,10 @@ def hit_distance(shape: Shape | Sized, origin: Components, direction: Components
         origin: Origin of each ray, in the frame of the shape, m. 3 of (...)
         direction: Unit direction of each ray, in the frame of the shape. 3 of (...)
     """
-    if shape.kind == "plane":
-        t, hit = _plane(origin, direction)
-    else:
-        near, far, meets = LINE_INTERVAL[shape.kind](shape, origin, direction)
-        hit = meets & (far >= 0)
-        t = jnp.where(near >= 0, near, far)
-    # A miss must not contribute NaN, in gradients either.
-    return jnp.where(hit, jnp.where(hit, t, 0.0), jnp.inf)
+    if shape.kind != "plane":
+        return first_of(LINE_INTERVAL[shape.kind](shape, origin, direction))
+    t, hit = _plane(origin, direction)
+    return first_of((t, t, hit))
 
 
 def hit_normal(shape: Shape | Sized, origin: Array, direction: Array, distance: Array) -> Array:
@@ -177,6 +173,14 @@ def _mesh_line(shape: Shape, origin: Components, direction: Components) -> Inter
     near = jnp.max(jnp.where(~parallel & (rises < 0), t, -jnp.inf), axis=-1)
     far = jnp.min(jnp.where(~parallel & (rises > 0), t, jnp.inf), axis=-1)
     return near, far, (near <= far) & ~jnp.any(parallel & (below < 0), axis=-1)
+
+
+def first_of(interval: Interval) -> Array:
+    """Return the distance at which a ray meets what it is in along an interval; infinite where it does not. (...)"""
+    near, far, meets = interval
+    hit = meets & (far >= 0)
+    # A miss must not contribute NaN, in gradients either.
+    return jnp.where(hit, jnp.where(hit, jnp.where(near >= 0, near, far), 0.0), jnp.inf)
 
 
 LINE_INTERVAL = {

@@ -17,12 +17,16 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
+from crazysim.scene.first_hit import NOBODY
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.placement import Placing, place, placed_by
-from crazysim.scene.rays import Hits, cast
+from crazysim.scene.rays import Hits, RayKernels, cast_in_worlds
 
 MAX_RAYS = 1 << 22
-"""Most rays that are cast at a time; larger batches of worlds are split."""
+"""Most rays that XLA casts at a time; larger batches of worlds are split."""
+
+MAX_RAYS_OF_KERNEL = 1 << 28
+"""Most rays of a kernel; numbers of rays and places in tables are int32."""
 
 Along = Literal["axis", "ray"]
 
@@ -124,7 +128,8 @@ def build(
     drones: bool,
     hide_own: bool,
     along: Along,
-    plugins: Placing = tuple,
+    plugins: Placing,
+    kernels: RayKernels,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``.
 
@@ -137,22 +142,19 @@ def build(
     for name, n in (("width", width), ("height", height)):
         if type(n) is not int or n < 1:
             raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
-    pixels = np.stack([pixel_directions(c.fovy, width, height).reshape(-1, 3) for c in cameras])
-    own = np.repeat([c.row if c.carrier == "drone" and hide_own else -1 for c in cameras], width * height)
+    looks = np.zeros((len(cameras), height * width, 4))
+    for camera, rays in zip(cameras, looks, strict=True):
+        rays[:, :3] = pixel_directions(camera.fovy, width, height).reshape(-1, 3)
+        rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else NOBODY
     n_rays = len(cameras) * width * height
 
     def of_worlds(data: SimData) -> Hits:
-        poses = [_pose(camera, data) for camera in cameras]
-        eye = jnp.stack([pos for pos, _ in poses], axis=1)  # (n_worlds, n_cameras, 3)
-        axes = jnp.stack([rot for _, rot in poses], axis=1)
-        rays = jnp.asarray(pixels, eye.dtype)
-        direction = sum(axes[:, :, None, :, k] * rays[..., None, k] for k in range(3))
-        origin = jnp.broadcast_to(eye[:, :, None], direction.shape)
-        flat = (direction.shape[0], n_rays, 3)
-        hits = cast(in_data, data, origin.reshape(flat), direction.reshape(flat), own, drones)
-        cosine = jnp.asarray(-pixels[..., 2].reshape(-1), eye.dtype) if along == "axis" else 1.0
+        eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1)
+                          for pos, rot in (_pose(camera, data) for camera in cameras)], axis=1)  # fmt: skip
+        hits = cast_in_worlds(in_data, data, eyes, looks, drones, kernels)
+        cosine = jnp.asarray(-looks[..., 2].reshape(-1), eyes.dtype) if along == "axis" else 1.0
         hits = hits.replace(distance=hits.distance * cosine)
-        shape = (flat[0], len(cameras), height, width)
+        shape = (eyes.shape[0], len(cameras), height, width)
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), hits)
 
     # Their poses become part of the data before the rays are cast.
@@ -162,7 +164,8 @@ def build(
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
         require_poses(model, bodies, mocap)
         data = with_mocap_bodies(model, place(data, placed_by(plugins(), bodies)), mocap)
-        n_worlds, at_a_time = data.core.n_worlds, max(1, MAX_RAYS // n_rays)
+        most = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
+        n_worlds, at_a_time = data.core.n_worlds, max(1, most // n_rays)
         if n_worlds <= at_a_time:
             return of_worlds(data)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)

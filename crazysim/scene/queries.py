@@ -21,6 +21,7 @@ from crazysim.scene.contact_report import ContactReport, ObjectSelection
 from crazysim.scene.depth import Along
 from crazysim.scene.mocap import MocapPoses, with_mocap_bodies
 from crazysim.scene.objects import Handle
+from crazysim.scene.rays import RayKernels
 from crazysim.scene.scene import Scene
 
 MAX_SIZE = 256
@@ -42,6 +43,7 @@ class SceneQueries:
         self._scene, self._strict = scene, strict
         self._reported: set[str] = set()
         self._platform = None if platform is None or fused.missing(platform) else platform
+        scene.ray_kernels = RayKernels(self._platform, strict)
         self._model: mujoco.MjModel | None = None
         self._compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
 

@@ -5,28 +5,28 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import DTypeLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.engine.errors import report_unsupported
+from crazysim.engine.mapped import mapped
+from crazysim.errors import UnsupportedError
 from crazysim.geometry import Shape, ray_distance
-from crazysim.geometry.points import Components, components
-from crazysim.geometry.rays import Sized, hit_distance, hit_normal
+from crazysim.geometry.points import components
+from crazysim.geometry.rays import hit_distance, hit_normal
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionGeom, CollisionModel
+from crazysim.scene.first_hit import NOBODY, Targets, first_hit, in_frame, shape_of
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 MAX_UNROLLED = 16
 """Geoms of equal objects up to which the program is unrolled; more go through a loop, which compiles once."""
-
-GEOMS_A_TURN = 2
-"""Geoms in a turn of the loop over many: more take longer to compile, fewer read and write the rays more often."""
 
 
 class Hits(PyTree):
@@ -55,6 +55,7 @@ def cast(
     own: np.ndarray | None = None,
     drones: bool = True,
     mocap: MocapPoses = None,
+    kernels: RayKernels | None = None,
 ) -> Hits:
     """Return the first surfaces that rays meet, in all worlds, in one world, or around one drone, as the data is.
 
@@ -66,6 +67,7 @@ def cast(
         own: Index of the drone that a ray passes through; None for no drone. (n_rays,)
         drones: True for rays to meet drones; a stage of one drone has no access to the others.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
+        kernels: Kernels that may cast the rays of all worlds; None for XLA.
 
     Raises:
         ConfigError: If the scene has such bodies and their poses are not given.
@@ -73,7 +75,13 @@ def cast(
     require_poses(model, [body.name for body in model.objects], mocap)
     data = with_mocap_bodies(model, data, mocap)
     if origin.ndim == 3:
-        return _cast_in_worlds(model, data, origin, direction, own, drones)
+        # A camera for each ray, whose first axis is its direction.
+        zero, passes = jnp.zeros((*direction.shape, 2), direction.dtype), NOBODY if own is None else own
+        axes = jnp.concatenate([direction[..., None], zero], axis=-1).reshape(*direction.shape[:2], 9)
+        ahead = np.zeros((origin.shape[1], 1, 4))
+        ahead[..., 0], ahead[:, 0, 3] = 1.0, passes
+        eyes = jnp.concatenate([origin, axes], axis=-1)
+        return cast_in_worlds(model, data, eyes, ahead, drones, kernels or RayKernels())
     best = Hits(
         distance=jnp.full(origin.shape[:-1], jnp.inf, origin.dtype),
         normal=jnp.zeros_like(origin),
@@ -168,196 +176,92 @@ def _nearer(best: Hits, far: Array, normal: Array, number: Array | int) -> Hits:
     )
 
 
-# Rays of all worlds: many, so that a loop over tables of geoms is worth it --------------------------------------------
+# Rays of all worlds -------------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class _Alike:
-    """Geoms of one kind, over which a loop runs."""
-
-    kind: Shape
-    """A shape of the kind; all have it if the kind is a mesh or a height field."""
-    carrier: Literal["world", "object", "drone"]
-    """Kind of the bodies that carry them."""
-    is_turned: bool
-    """True if a geom may have a rotation."""
-    geoms: list[CollisionGeom]
-    """Geoms, in the frames of their bodies."""
-    rows: list[int]
-    """Row of each body among the objects or drones."""
-    numbers: list[int]
-    """Number of each body in ``Hits.number``."""
-
-    def table(self, data: SimData, dtype: DTypeLike) -> Array:
-        """Return position, rotation by rows if they are turned, and size of each. (n_worlds or 1, n_geoms, k)"""
-        pos = np.array([geom.pos for geom in self.geoms])
-        rot = np.array([np.eye(3) if geom.rot is None else geom.rot for geom in self.geoms])
-        size = jnp.asarray([geom.shape.size for geom in self.geoms], dtype)[None]
-        at, axes = jnp.asarray(pos, dtype)[None], [jnp.asarray(rot[:, :, k], dtype)[None] for k in range(3)]
-        if self.carrier == "object" and data.objects is not None:
-            poses = data.objects.pos[:, 0], data.objects.quat[:, 0]
-        else:
-            poses = data.states.pos, data.states.quat
-        if self.carrier != "world":
-            body_pos, quat = (x[:, np.array(self.rows)] for x in poses)
-            at = body_pos + rotation.rotate(quat, at)
-            axes = [rotation.rotate(quat, axis) for axis in axes]
-            size = jnp.broadcast_to(size, (*at.shape[:-1], size.shape[-1]))
-        turned = [jnp.stack(axes, axis=-1).reshape(*at.shape[:-1], 9)] if self.is_turned else []
-        return jnp.concatenate([at, *turned, size], axis=-1)
-
-    def in_frame(self, row: Sequence[Array], origin: Components, direction: Components) -> _Placed:
-        """Return shape and rays in the frames of geoms, whose entries of the table are given."""
-        start: Components = tuple(o - p for o, p in zip(origin, row, strict=False))  # type: ignore[assignment]
-        if self.is_turned:
-            start, direction = (
-                tuple(sum(row[3 + 3 * i + k] * v[i] for i in range(3)) for k in range(3)) for v in (start, direction)
-            )  # type: ignore[assignment]
-        constant = self.kind.kind in ("mesh", "hfield")
-        return (self.kind if constant else Sized(self.kind.kind, row[12 if self.is_turned else 3 :])), start, direction
-
-
-_Placed = tuple[Shape | Sized, Components, Components]
-
-
-def _all_alike(model: CollisionModel, data: SimData, own: np.ndarray | None, drones: bool) -> list[_Alike]:
-    """Return the geoms that rays can meet, by kind."""
-    found: dict[Any, _Alike] = {}
-
-    def add(
-        carrier: Literal["world", "object", "drone"], geoms: Sequence[CollisionGeom], row: int, number: int
-    ) -> None:
-        for geom in geoms:
-            constant = geom.shape.kind in ("mesh", "hfield")
-            is_turned = carrier != "world" or geom.rot is not None
-            key = carrier, geom.shape if constant else geom.shape.kind, is_turned
-            alike = found.setdefault(key, _Alike(geom.shape, carrier, is_turned, [], [], []))
-            alike.geoms.append(geom)
-            alike.rows.append(row)
-            alike.numbers.append(number)
-
-    add("world", model.floor, 0, 0)
-    for number, body in enumerate(model.objects, start=1):
-        add("world" if body.row is None else "object", body.geoms, body.row or 0, number)
-    for kind in model.drones if drones else ():
-        for row in range(data.core.n_drones) if kind.drones is None else kind.drones:
-            if own is None or not np.all(own == row):
-                add("drone", kind.geoms, row, 1 + len(model.objects) + row)
-    return list(found.values())
-
-
-def _cast_in_worlds(
-    model: CollisionModel, data: SimData, origin: Array, direction: Array, own: np.ndarray | None, drones: bool
+def cast_in_worlds(
+    model: CollisionModel, data: SimData, eyes: Array, pixels: np.ndarray, drones: bool, kernels: RayKernels
 ) -> Hits:
-    """Return the first surfaces that rays of all worlds meet; see ``cast``.
+    """Return the first surfaces that the rays of cameras meet, in all worlds. (n_worlds, n_cameras * n_pixels)
 
-    A loop over all geoms computes the distance, without a derivative. Another finds which geom is the nearest, and for
-    that geom alone the normal and the derivative of the distance are computed. A compiler drops the second loop where
-    only distances are used.
+    A function of one ray finds the distance and the nearest geom, without a derivative, in a kernel of the engine where
+    that is possible. The normal and the derivative of the distance are those of that geom alone; XLA computes them
+    where they are used.
+
+    Args:
+        model: Model, without bodies whose poses are not part of the data.
+        data: Simulation, for the poses of objects and drones.
+        eyes: Position, m, and axes by rows, of the cameras, world frame. (n_worlds, n_cameras, 12)
+        pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``NOBODY``.
+            (n_cameras, n_pixels, 4)
+        drones: True for rays to meet drones.
+        kernels: Kernels that may be used.
     """
-    groups = _all_alike(model, data, own, drones)
-    tables = [group.table(data, origin.dtype) for group in groups]
-    fixed = jax.lax.stop_gradient((tables, origin, direction))
-    distance, which = _nearest(*fixed, groups, own), _which(*fixed, groups, own)
-    starts = np.cumsum([0, *(len(group.geoms) for group in groups)])
-    placed, exact = [], jnp.full(distance.shape, jnp.inf, distance.dtype)
-    for group, table, first in zip(groups, tables, starts, strict=False):
-        mine = (which >= first) & (which < first + len(group.geoms))
-        place = jnp.clip(which - first, 0, len(group.geoms) - 1)
-        if group.carrier == "world":
-            table = jnp.take(table[0], place, axis=0)
+    passed = np.unique(pixels[..., 3])
+    targets = Targets(model, data.core.n_drones, drones, int(passed[0]) if len(passed) == 1 else NOBODY)
+    n_worlds, (n_cameras, n_pixels, _) = eyes.shape[0], pixels.shape
+    balls, movable = targets.movable_rows(data)
+    n, tables = n_worlds * n_cameras * n_pixels, targets.tables(balls, movable, eyes, jnp.asarray(pixels, eyes.dtype))
+    fn = functools.partial(first_hit, targets.surfaces, n_pixels, n_cameras)
+    far, which = kernels.run(fn, n, jax.lax.stop_gradient(tables), targets)
+    distance, which = far.reshape(n_worlds, -1), which.reshape(n_worlds, -1)
+
+    look, axes = jnp.asarray(pixels[..., :3], eyes.dtype), eyes[..., 3:].reshape(n_worlds, n_cameras, 1, 3, 3)
+    direction = sum(axes[..., k] * look[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
+    origin = jnp.repeat(eyes[..., :3], n_pixels, axis=1)
+    if not targets.all:
+        return Hits(distance, jnp.zeros_like(origin), which, names(model, data.core.n_drones if drones else 0))
+    fixed = jnp.broadcast_to(targets.fixed_rows(eyes.dtype), (n_worlds, len(targets.fixed), 16))
+    rows = jnp.concatenate([fixed, movable], axis=1)
+    rows = jnp.take_along_axis(rows, jnp.maximum(which, 0)[..., None], axis=1)
+    row = [rows[..., k] for k in range(16)]
+    start, along = in_frame(row, components(origin), components(direction))
+    begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
+    code = jnp.asarray(targets.codes)[jnp.maximum(which, 0)]
+    exact, across = jnp.full_like(distance, jnp.inf), jnp.zeros_like(origin)
+    for number, surface in enumerate(targets.surfaces):
+        mine = (which >= 0) & (code == number)
+        shape = shape_of(surface, row)
+        if isinstance(shape, Shape) and shape.kind == "hfield":
+            far, normal = ray_distance(shape, begin, way)
         else:
-            table = jnp.take_along_axis(table, place[..., None], axis=1)
-        row = [table[..., k] for k in range(table.shape[-1])]
-        here = group.in_frame(row, components(origin), components(direction))
-        exact = jnp.where(mine, _distance(*here), exact)
-        placed.append((group, mine, row, *here))
-    distance = _with_derivative_of(distance, exact)
-    normal = jnp.zeros_like(origin)
-    for group, mine, row, shape, start, along in placed:
-        begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
-        if shape.kind == "hfield":
-            _, across = ray_distance(shape, begin, way)
-        else:
-            across = hit_normal(shape, begin, way, distance)
-        if group.is_turned:
-            across = jnp.stack([sum(row[3 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
-        normal = jnp.where(mine[..., None], across, normal)
-    numbers = jnp.asarray([*(n for group in groups for n in group.numbers), -1], jnp.int32)
-    return Hits(distance, normal, numbers[which], names(model, data.core.n_drones if drones else 0))
+            far = hit_distance(shape, start, along)
+            normal = hit_normal(shape, begin, way, distance)
+        exact = jnp.where(mine, far, exact)
+        across = jnp.where(mine[..., None], normal, across)
+    normal = jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
+    numbers = jnp.asarray([*(target.number for target in targets.all), -1], jnp.int32)
+    return Hits(
+        _with_derivative_of(distance, exact), normal, numbers[which], names(model, data.core.n_drones if drones else 0)
+    )
 
 
-def _distance(shape: Shape | Sized, origin: Components, direction: Components) -> Array:
-    """Return the distance along rays in the frame of a shape, m. (...)"""
-    if isinstance(shape, Shape) and shape.kind == "hfield":
-        return ray_distance(shape, jnp.stack(origin, axis=-1), jnp.stack(direction, axis=-1))[0]
-    return hit_distance(shape, origin, direction)
+@dataclasses.dataclass
+class RayKernels:
+    """Choice of what casts rays: kernels of the engine, or XLA where there are none."""
 
+    platform: str | None = None
+    """Platform of the kernels, ``"cpu"`` or ``"gpu"``; None for XLA."""
+    strict: bool = False
+    """True to raise an error where XLA would be used with an ``EngineWarning``."""
+    used: str = ""
+    """Description of what cast rays last, for ``Sim.explain``."""
+    reported: set[str] = dataclasses.field(default_factory=set)
+    """Warnings that were given."""
 
-def _nearest(
-    tables: Sequence[Array], origin: Array, direction: Array, groups: Sequence[_Alike], own: np.ndarray | None
-) -> Array:
-    """Return the distance to the nearest geom, m. (..., n_rays)"""
-
-    def nearer(best: Array, far: Array, _: Array) -> Array:
-        return jnp.where(far < best, far, best)
-
-    best = jnp.full(origin.shape[:-1], jnp.inf, origin.dtype)
-    return _over_geoms(tables, origin, direction, groups, own, nearer, best)
-
-
-def _which(
-    tables: Sequence[Array], origin: Array, direction: Array, groups: Sequence[_Alike], own: np.ndarray | None
-) -> Array:
-    """Return the index of the nearest geom among those of all groups, -1 for none. (..., n_rays)
-
-    Beside the distance it is slow on CPUs, where XLA computes every geom once for each of the two.
-    """
-
-    def nearer(best: tuple[Array, Array], far: Array, k: Array) -> tuple[Array, Array]:
-        return jnp.where(far < best[0], far, best[0]), jnp.where(far < best[0], k, best[1])
-
-    best = jnp.full(origin.shape[:-1], jnp.inf, origin.dtype), jnp.full(origin.shape[:-1], -1, jnp.int32)
-    return _over_geoms(tables, origin, direction, groups, own, nearer, best)[1]
-
-
-Best = TypeVar("Best")
-
-
-def _over_geoms(
-    tables: Sequence[Array],
-    origin: Array,
-    direction: Array,
-    groups: Sequence[_Alike],
-    own: np.ndarray | None,
-    nearer: Callable[[Best, Array, Array], Best],
-    best: Best,
-) -> Best:
-    """Return what a loop over all geoms leaves of ``best = nearer(best, distance, index of the geom)``."""
-    rays, first = (components(origin), components(direction)), 0
-    for group, table in zip(groups, tables, strict=True):
-        # Geoms in front, so that a turn of the loop reads what is contiguous.
-        rows = jnp.moveaxis(table, 0, -1)[..., None]
-        turn = functools.partial(_turn, group, rows, rays, own, first, nearer)
-        best = jax.lax.fori_loop(0, len(group.geoms), turn, best, unroll=min(len(group.geoms), GEOMS_A_TURN))
-        first += len(group.geoms)
-    return best
-
-
-def _turn(
-    group: _Alike,
-    rows: Array,
-    rays: tuple[Components, Components],
-    own: np.ndarray | None,
-    first: int,
-    nearer: Callable[[Best, Array, Array], Best],
-    k: Array,
-    best: Best,
-) -> Best:
-    far = _distance(*group.in_frame(list(rows[k]), *rays))
-    if own is not None and group.carrier == "drone":
-        far = jnp.where(jnp.asarray(own) == jnp.asarray(group.rows)[k], jnp.inf, far)
-    return nearer(best, far, first + k)
+    def run(self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets) -> list[Array]:
+        """Return the results of a function of one ray for ``n`` rays; see ``mapped``."""
+        where = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in a list"
+        if self.platform is not None:
+            try:
+                found = mapped(fn, n, tables, self.platform)
+                self.used = f"one kernel with a lane for each ray; {where}"
+                return found
+            except UnsupportedError as error:
+                problem, remedy = f"rays have no kernel: {error.reason}", "Leave out the geoms that need it"
+                report_unsupported([problem], self.strict, self.reported, remedy)
+        self.used = f"XLA, without a kernel; {where}"
+        return mapped(fn, n, tables, None)
 
 
 @jax.custom_jvp

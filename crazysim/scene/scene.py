@@ -22,6 +22,7 @@ from crazysim.scene.collision import CollisionModel
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.scene.objects import IDENTITY, Handle, SceneObjects, Source
 from crazysim.scene.placement import Placing
+from crazysim.scene.rays import RayKernels
 from crazysim.scene.renderer import SceneRenderer
 from crazysim.scene.sync import sync_one_world, with_poses_of
 
@@ -82,6 +83,7 @@ class Scene:
         self.spec = build.build_spec(xml_path, airframes, freq, self.max_geom_pairs)
         self.added = SceneObjects(n_worlds)
         self.plugins = plugins
+        self.ray_kernels = RayKernels()
         self.revision = 0
         self.compile()
 
@@ -253,7 +255,9 @@ class Scene:
         """
         objects = (*self.added.movable, *self.visual_model.mocap_bodies)
         cameras = depth.find_cameras(self.mj_model, camera, objects)
-        return depth.build(self.visual_model, cameras, width, height, drones, hide_own, along, self.plugins)
+        return depth.build(
+            self.visual_model, cameras, width, height, drones, hide_own, along, self.plugins, self.ray_kernels
+        )
 
     # State of all worlds ----------------------------------------------------------------------------------------------
 

@@ -186,6 +186,8 @@ def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Se
             return [op.param("numbers").array]
         case "lookup":
             return [args[0][args[1] + op.param("offset")]]
+        case "any_lane":
+            return args
         case "threefry2x32":
             return list(threefry2x32(*args))
     raise RuntimeError(

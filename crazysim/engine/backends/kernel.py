@@ -230,6 +230,35 @@ def _n_operations(block: Block) -> int:
     return len(block.operations) + sum(inner)
 
 
+def write_map(block: Block, target: str) -> Kernel:
+    """Return the source of a function of an index and tables for ``cuda`` or ``host``; each lane has an index.
+
+    Args:
+        block: The function: its inputs are the index and the tables, its outputs single numbers.
+        target: ``"cuda"`` or ``"host"``.
+
+    Raises:
+        UnsupportedError: If there is no source for an operation or a type.
+    """
+    require(block)
+    writer, tables = Writer(), block.inputs[1:]
+    inputs, outputs = ([type_name(x.dtype) for x in some] for some in (tables, block.outputs))
+    pointers = [f"const {kind}* __restrict__ p{k}" for k, kind in enumerate(inputs)]
+    pointers += [f"{kind}* __restrict__ q{k}" for k, kind in enumerate(outputs)]
+    values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
+    for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
+        write_results(writer, f"q{k}", kind, 1, [x], 2)
+    threads, lanes = lanes_of_block(1)
+    body = "\n".join(writer.lines)
+    frame = _cuda(pointers, body, threads, lanes) if target == "cuda" else _host(pointers, "", body, False, False)
+    text = (
+        f"#define WIDEST {8 if 'f64' in (*inputs, *outputs) else 4}\n#define GROUP 1\n#define BLOCK_THREADS {threads}\n"
+    )
+    text += f"#define OPERATIONS {_n_operations(block)}\n{preamble(target)}"
+    text += "".join(f"{line}\n" for line in writer.tables) + frame + epilogue(target)
+    return Kernel(text, tuple(range(len(inputs))), tuple(range(len(outputs))), (), threads, lanes)
+
+
 def require_source(program: Program) -> None:
     """Check that a program has source.
 

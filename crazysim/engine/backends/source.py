@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from crazysim.engine.backends.exchange import Exchange, Registers
+from crazysim.engine.backends.uniform import shared_carry, shared_results
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value, is_constant
@@ -53,6 +54,8 @@ class Writer:
         self.exchange = Registers() if exchange is None else exchange
         self.lines: list[str] = []
         self.names: dict[Value, str] = {}
+        self.shared: set[Value] = set()
+        """Values that are single numbers, because all lanes share them."""
         self.pairs: dict[str, str] = {}
         self.tests: dict[Value, Operation] = {}
         self.tables: list[str] = []
@@ -76,8 +79,10 @@ class Writer:
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
                 self._over_others(op, depth, _live(block, position))
+                self.shared.clear()  # what is kept for behind the loop is kept for each lane
             else:
                 self._operation(op, depth)
+                self.shared.update(shared_results(op, self.shared))
         self.pairs, self.fours = outside
         return [self.element(x) for x in block.outputs]
 
@@ -108,6 +113,9 @@ class Writer:
                 self._table(op)
             case "lookup":
                 self._lookup(op, args, depth)
+            case "any_lane":
+                name = self.names[op.results[0]] = self.new()
+                self.line(f"const auto {name} = any_lane({args[0]});", depth)
             case "sin" | "cos":
                 self._sin_cos(op, args[0], depth)
             case "custom_jvp":  # its derivative is a kernel of its own
@@ -158,7 +166,7 @@ class Writer:
 
     def _when(self, op: Operation, args: list[str], depth: int) -> None:
         mask, *old = args
-        name = self._carry(op, old, depth)
+        name = self._carry(op, old, [False] * len(old), depth)
         self.line(f"if (any({mask})) {{", depth)
         for k, out in enumerate(self.block(op.blocks[0], [], depth + 1)):
             self.line(f"{name}_{k} = select_n_({mask}, {name}_{k}, {out});", depth + 1)
@@ -166,11 +174,12 @@ class Writer:
 
     def _loop(self, op: Operation, args: list[str], depth: int) -> None:
         (body,) = op.blocks
-        name = self._carry(op, args, depth)
+        shared = self._shared_carry(op)
+        name = self._carry(op, args, shared, depth)
         turn = self.new("n")
         self.line(f"for (int {turn} = 0; {turn} < {op.param('length')}; ++{turn}) {{", depth)
         outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
-        self._assign(name, outs, None, depth + 1)
+        self._assign(op, name, outs, shared, None, depth + 1)
         self.line("}", depth)
 
     def _over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
@@ -179,7 +188,8 @@ class Writer:
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
         first = [ops.neutral(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
-        name, turn = self._carry(op, [literal(x) for x in first], depth), self.new("j")
+        name = self._carry(op, [literal(x) for x in first], [False] * len(first), depth)
+        turn = self.new("j")
         self.line(f"UNROLL for (int {turn} = 0; {turn} < GROUP; ++{turn}) {{", depth)
         inputs = [self.new() for _ in body.inputs]
         for variable, read in zip(inputs, reads, strict=False):
@@ -192,28 +202,40 @@ class Writer:
 
     def _while(self, op: Operation, args: list[str], depth: int) -> None:
         test, body = op.blocks
-        name = self._carry(op, args, depth)
+        shared = self._shared_carry(op)
+        name = self._carry(op, args, shared, depth)
         carry = [f"{name}_{k}" for k in range(len(args))]
         self.line("for (;;) {", depth)
         (continues,) = self.block(test, carry, depth + 1)
         self.line(f"if (!any({continues})) break;", depth + 1)
-        self._assign(name, self.block(body, carry, depth + 1), continues, depth + 1)
+        self._assign(op, name, self.block(body, carry, depth + 1), shared, continues, depth + 1)
         self.line("}", depth)
 
-    def _carry(self, op: Operation, start: Sequence[str], depth: int) -> str:
+    def _shared_carry(self, op: Operation) -> list[bool]:
+        """Return which numbers that a loop carries are single, and mark those that begin its turns as such."""
+        shared = shared_carry(op, self.shared)
+        for block in op.blocks:
+            self.shared.update(x for x, same in zip(block.inputs, shared, strict=True) if same)
+        return shared
+
+    def _carry(self, op: Operation, start: Sequence[str], shared: Sequence[bool], depth: int) -> str:
         """Write a variable for each result of an operation that changes them, with the numbers it starts from."""
         name = self._results(op)
-        for k, (x, value) in enumerate(zip(op.results, start, strict=True)):
-            self.line(f"auto {name}_{k} = {type_name(x.dtype)}_lanes({value});", depth)
+        for k, (x, value, same) in enumerate(zip(op.results, start, shared, strict=True)):
+            kind = type_name(x.dtype)
+            self.line(f"{kind} {name}_{k} = {value};" if same else f"auto {name}_{k} = {kind}_lanes({value});", depth)
         return name
 
-    def _assign(self, name: str, outs: Sequence[str], mask: str | None, depth: int) -> None:
+    def _assign(
+        self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
+    ) -> None:
         """Assign all results of a turn at once: one may be what another was."""
         fresh = [self.new() for _ in outs]
         for k, (f, out) in enumerate(zip(fresh, outs, strict=True)):
-            self.line(f"const auto {f} = {out if mask is None else f'select_n_({mask}, {name}_{k}, {out})'};", depth)
-        for k, f in enumerate(fresh):
-            self.line(f"{name}_{k} = {f};", depth)
+            text = out if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {out})"
+            self.line(f"const auto {f} = {text};", depth)
+        for k, (f, x, same) in enumerate(zip(fresh, op.results, shared, strict=True)):
+            self.line(f"{name}_{k} = {f};" if same else f"{name}_{k} = {type_name(x.dtype)}_lanes({f});", depth)
 
 
 def _live(block: Block, position: int) -> list[tuple[Value, str]]:

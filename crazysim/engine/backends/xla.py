@@ -205,6 +205,10 @@ def _lookup(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) ->
     return [jnp.asarray(table).at[index + op.param("offset")].get(mode="promise_in_bounds")]
 
 
+def _any_lane(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
+    return args
+
+
 def _threefry(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     return jaxcompat.threefry2x32_p.bind(*_broadcast(args))
 
@@ -218,4 +222,5 @@ STRUCTURE: dict[str, Callable[..., Any]] = {
     "table": _table,
     "lookup": _lookup,
     "threefry2x32": _threefry,
+    "any_lane": _any_lane,
 }

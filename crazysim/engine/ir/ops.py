@@ -205,6 +205,7 @@ def _rows() -> list[Row]:
         Row(name="barrier", operands="", results="", cost=0, structured=True),
         Row(name="table", operands="", results="*", cost=0, structured=True),
         Row(name="lookup", operands="**", results="*", structured=True),
+        Row(name="any_lane", operands="b", results="b", kinds="b", structured=True),
         Row(name="threefry2x32", operands="uuuu", results="uu", cost=60, structured=True),
         *(Row(name=name, operands="...", results="...", cost=0, structured=True)
           for name in ("when", "loop", "while", "custom_jvp", "over_others")),
@@ -230,6 +231,7 @@ operation that combines its outputs. It stands in no inner block. ``threefry2x32
 numbers.
 ``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
 int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
+``any_lane`` is true at least where its operand is: a target may give all lanes of a vector what is true of any.
 
 Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
 hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;

@@ -148,6 +148,32 @@ class Lowering:
         return self.builder.finish(scalars(*outputs))
 
 
+class Rows:
+    """A table in memory with any number of rows, of which a function reads whole ones (``table_row``)."""
+
+    def __init__(self, builder: Builder, aval: Any):
+        """Add the table as an input of a block.
+
+        Args:
+            builder: Takes the input.
+            aval: Shape and type of the table: two axes.
+        """
+        self._size = int(aval.shape[1])
+        self._table = builder.input(aval.dtype, self._size)
+
+    def row(self, ctx: Lowering, index: Element, sizes: Sequence[int]) -> Elements:
+        """Return the row at an index, which is in range. (1, k)
+
+        Raises:
+            UnsupportedError: If not one whole row is read.
+        """
+        if tuple(sizes) != (1, self._size):
+            raise UnsupportedError(f"a part of shape {tuple(sizes)} of a table; only whole rows are read")
+        base = ctx.scalar("mul", index, constant(self._size, np.int32))
+        found = [ctx.lookup(self._table, base, k, self._size % 4 == 0) for k in range(self._size)]
+        return as_elements(found, (1, self._size))
+
+
 def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:
     """Return a flat sequence of elements as an array. NumPy must not convert them."""
     out = np.empty(len(items), dtype=object)

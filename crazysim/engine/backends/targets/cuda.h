@@ -22,6 +22,7 @@
 #include "scalar.h"
 
 FN b1 any(b1 x) { return x; }
+FN b1 any_lane(b1 x) { return x; }  // threads go their own ways
 FN f32 f32_lanes(f32 x) { return x; }
 FN f64 f64_lanes(f64 x) { return x; }
 FN i32 i32_lanes(i32 x) { return x; }
@@ -37,6 +38,7 @@ FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
 #define PUT(SIZE, DRONES, p)
 #define LOAD(SIZE, DRONES, p, k) p[lane / DRONES * SIZE + k]
 #define STORE(SIZE, DRONES, p, k, value) if (active && lane % DRONES == 0) p[lane / DRONES * SIZE + k] = value;
+#define LANE lane
 // A row of numbers, one for each lane.
 #define LOAD_ROW(p, k) p[size_t(k) * n_lanes + lane]
 #define STORE_ROW(p, k, value) if (active) p[size_t(k) * n_lanes + lane] = value;

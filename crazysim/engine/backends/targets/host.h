@@ -109,7 +109,9 @@ FN b1 of_place(const b1v* x, int d) { return x[d / W].m[d % W] != 0; }
 FN b1v mask(i32v m) { return {m}; }
 FN b1v mask(i64v m) { return {__builtin_convertvector(m, i32v)}; }
 FN b1 any(b1 x) { return x; }
+FN b1 any_lane(b1 x) { return x; }
 FN b1 any(b1v x) { i32 sum = 0; for (int i = 0; i < W; ++i) sum |= x.m[i]; return sum != 0; }
+FN b1 any_lane(b1v x) { return any(x); }
 
 #define LANES1(A) template <class A, class = only_if_t<is_lanes<A>::value>> FN
 #define LANES2(A, B) template <class A, class B, class = only_if_t<any_lanes<A, B>::value>> FN
@@ -176,6 +178,7 @@ FN f64v quotient(f64v a, f64v b) { return a / b; }
 FN i32v quotient(i32v a, i32v b) { return each2([](i32 s, i32 t) { return div_(s, t); }, a, b); }
 FN u32v quotient(u32v a, u32v b) { return each2([](u32 s, u32 t) { return div_(s, t); }, a, b); }
 LANES2(A, B) auto div_(A a, B b) { return quotient(lift(a), lift(b)); }
+FN i32v div_(i32v a, i32 b) { return __builtin_constant_p(b) && b > 0 ? a / b : quotient(a, lift(b)); }  // without division
 LANES1(V) b1v is_finite_(V x) { return eq_(x - x, V{}); }
 LANES1(V) V integer_pow(V x, int y) {
   V p = lift(typename is_lanes<V>::one(1)), one = p;
@@ -364,6 +367,9 @@ template <int SIZE, int DRONES, class T, class V> FN void put(T* p, int64_t firs
 #define RESULT(T, SIZE, p) vec<T>::type result_##p[SIZE];
 #define STORE(SIZE, DRONES, p, k, value) result_##p[k] = value;
 #define PUT(SIZE, DRONES, p) put<SIZE, DRONES>(p, first, n_active, result_##p);
+// The number of each lane; lanes beyond the last have that of the last.
+FN i32v lane_numbers(int64_t first, int n) { const i32v own = numbers(); return i32(first) + (own < n ? own : lift(n - 1)); }
+#define LANE lane_numbers(first, n_active)
 // A row of numbers, one for each lane.
 template <class T> FN typename vec<T>::type load_row(const T* p, int n) {
   T buffer[W];

@@ -163,6 +163,12 @@ def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
     return _results(ctx, "while", eqn, scalars(*carry), (goes_on, turn))
 
 
+@rule("any_lane")
+def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+    (condition,) = args
+    return [condition if is_constant(condition[()]) else as_elements([ctx.scalar("any_lane", condition[()])], ())]
+
+
 def _inputs(ctx: Lowering, like: Elements) -> Elements:
     def new(x: Any) -> Any:
         return tuple(map(new, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)

@@ -1,0 +1,65 @@
+"""What a function of one element can do where many elements are computed side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from crazysim.jaxcompat import simple_primitive
+
+Carry = TypeVar("Carry")
+
+
+def any_lane(condition: Array) -> Array:
+    """Return True where a condition holds for this element or, by choice of the engine, for one computed beside it.
+
+    The result may be True where the condition is False, depending on which elements are computed together. Use it only
+    to decide what is computed, never what the result is: a loop whose path all elements of a vector share reads its
+    tables once for all of them.
+
+    Args:
+        condition: The condition. ()
+    """
+    return any_lane_p.bind(condition)[0]
+
+
+def _batched(args: Sequence[Array], dims: Sequence[int]) -> tuple[list[Array], list[None]]:
+    """Return the condition of any element of a batch, which all of them share."""
+    return any_lane_p.bind(jnp.any(args[0], axis=dims[0])), [None]
+
+
+any_lane_p = simple_primitive("any_lane", lambda condition: [condition], _batched)
+"""``any_lane`` as a primitive of one operand."""
+
+
+def compute_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) -> Carry:
+    """Return ``fn(value)`` where a condition holds and the value elsewhere; ``fn`` is skipped if it holds nowhere.
+
+    Kernels branch. ``lax.cond`` computes both cases in functions of one element. There is no reverse mode.
+
+    Args:
+        condition: The condition. ()
+        fn: The function.
+        value: Its argument, any tree of arrays.
+    """
+    carry = condition, value
+    return lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(c[0]), fn(c[1])), carry)[1]
+
+
+def table_row(table: Array, index: Array) -> Array:
+    """Return a row of a table at a computed index, which must be in range. (k,)
+
+    Args:
+        table: The table. (n, k)
+        index: Index of the row, int32. ()
+    """
+    return lax.dynamic_slice(table, (index, jnp.int32(0)), (1, table.shape[1]), allow_negative_indices=False)[0]
+
+
+def table_rows(table: Array, index: Array) -> list[Any]:
+    """Return the numbers of a row of a table, each for itself. k of ()"""
+    row = table_row(table, index)
+    return [row[k] for k in range(table.shape[1])]

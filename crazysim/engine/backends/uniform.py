@@ -1,0 +1,51 @@
+"""Values that all lanes of a vector share, in blocks with loops: there a variable of one number is enough."""
+
+from __future__ import annotations
+
+from collections.abc import Set
+
+from crazysim.engine.ir.blocks import Block, Element, Operation, Value
+
+
+def is_shared(x: Element, shared: Set[Value]) -> bool:
+    """Return True where an element is a constant, a table, or one of the values that are known to be shared."""
+    return not isinstance(x, Value) or x.size > 0 or x in shared
+
+
+def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
+    """Return the results of an operation that all lanes share, given the values before it that they share."""
+    match op.name:
+        case "any_lane":
+            return list(op.results)
+        case "loop" | "while":
+            return [x for x, same in zip(op.results, shared_carry(op, shared), strict=True) if same]
+        case "custom_jvp":
+            (body,) = op.blocks
+            inside = _inside(body, [is_shared(x, shared) for x in op.args], shared)
+            return [x for x, out in zip(op.results, body.outputs, strict=True) if is_shared(out, inside)]
+        case "when" | "over_others" | "threefry2x32":
+            return []
+    return list(op.results) if all(is_shared(x, shared) for x in op.args) else []
+
+
+def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
+    """Return for each number that a loop carries whether all lanes share it, from its first turn to its last."""
+    *tests, body = op.blocks
+    found = [is_shared(x, shared) for x in op.args]
+    while True:
+        inside = _inside(body, found, shared)
+        after = [same and is_shared(x, inside) for same, x in zip(found, body.outputs, strict=True)]
+        for test in tests:  # where lanes stop at different turns, they share nothing that changes
+            if not all(is_shared(x, _inside(test, found, shared)) for x in test.outputs):
+                after = [False] * len(found)
+        if after == found:
+            return found
+        found = after
+
+
+def _inside(block: Block, inputs: list[bool], shared: Set[Value]) -> set[Value]:
+    """Return the values that lanes share at the end of a block, given which of its inputs they share."""
+    found = {*shared, *(x for x, same in zip(block.inputs, inputs, strict=True) if same)}
+    for op in block.operations:
+        found.update(shared_results(op, found))
+    return found

@@ -1,0 +1,116 @@
+"""Functions of an index and tables, evaluated for all indices by one kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
+from crazysim import jaxcompat
+from crazysim.engine.backends import cuda, kernel, native
+from crazysim.engine.backends.native import Launch
+from crazysim.engine.ir.blocks import Block, prune
+from crazysim.engine.lowering.jaxprs import Lowering, Rows, as_elements
+
+Function = Callable[..., Sequence[Array]]
+"""``fn(index, *tables)`` returns single numbers for an index, int32 (); it reads tables by ``table_row`` only."""
+
+
+class MapKernels:
+    """Kernels of one function: that of the platform it is made for, and those of others once JAX lowers it there."""
+
+    def __init__(self, block: Block, platform: str):
+        """Compile the kernel for a platform.
+
+        Args:
+            block: The function.
+            platform: ``"cpu"`` or ``"gpu"``.
+
+        Raises:
+            UnsupportedError: If an operation or type has no source.
+            KernelError: If the compiler refuses the kernel or takes too long.
+        """
+        self._block = block
+        self._launches: dict[str, Launch] = {}
+        self.on(platform)
+
+    def on(self, platform: str) -> Launch:
+        """Return the function that calls the kernel of a platform."""
+        if platform not in self._launches:
+            if platform == "gpu":
+                self._launches[platform] = cuda.compiled(kernel.write_map(self._block, "cuda"))
+            else:
+                self._launches[platform] = native.HostLaunch(kernel.write_map(self._block, "host"))
+        return self._launches[platform]
+
+    def results(self, n: int) -> list[jax.ShapeDtypeStruct]:
+        """Return shapes and types of the results for ``n`` indices."""
+        return [jax.ShapeDtypeStruct((n,), x.dtype) for x in self._block.outputs]
+
+
+def _results(*args: Any, kernels: MapKernels, n: int) -> list[jax.ShapeDtypeStruct]:
+    del args
+    return kernels.results(n)
+
+
+def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[Array]:
+    return kernels.on(platform)(n, np.zeros(1, np.int32), tables, kernels.results(n))
+
+
+map_p = jaxcompat.primitive_by_platform(
+    "crazysim_map", _results, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
+)
+"""Call of a kernel: its tables, to its results for all indices."""
+
+
+def mapped(fn: Function, n: int, tables: Sequence[Array], platform: str | None) -> list[Array]:
+    """Return the results of a function for the indices 0 to ``n - 1``. (n,) each
+
+    It has no derivative. Under ``vmap`` one call follows the other.
+
+    Args:
+        fn: The function.
+        n: Number of indices.
+        tables: The tables that it reads. (n_rows, k) each
+        platform: Platform of the kernel, ``"cpu"`` or ``"gpu"``; None for XLA without a kernel.
+
+    Raises:
+        UnsupportedError: If the engine does not support the function, or its compiler refuses the kernel.
+    """
+    if platform is None:
+        numbers = jnp.arange(n, dtype=np.int32)
+        return list(jax.vmap(lambda i: fn(i, *tables))(numbers))
+    kernels = MapKernels(lower_map(fn, tables), platform)
+
+    def run(tables: list[Array]) -> list[Array]:
+        return list(map_p.bind(*tables, kernels=kernels, n=n))
+
+    def batched(size: int, in_batched: Any, tables: list[Array]) -> Any:
+        full = [x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(tables, *in_batched, strict=True)]
+        return jax.lax.map(run, full), [True] * len(kernels.results(n))
+
+    return jaxcompat.batched_rule(run, batched)(list(tables))
+
+
+def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
+    """Return the block of a function of an index and tables; its inputs are these.
+
+    Args:
+        fn: The function.
+        tables: Tables, or their shapes and types.
+
+    Raises:
+        UnsupportedError: If it has a primitive without a rule.
+    """
+    avals = [jax.ShapeDtypeStruct((max(len(x.shape) and x.shape[0], 2), *x.shape[1:]), x.dtype) for x in tables]
+    lowering = Lowering()
+    index = as_elements([lowering.builder.input(np.int32)], ())
+    rows: list[Any] = [Rows(lowering.builder, x) for x in avals]
+    traced = jax.make_jaxpr(lambda i, *tables: list(fn(i, *tables)))(jax.ShapeDtypeStruct((), np.int32), *avals)
+    return prune(lowering.finish(lowering.lower(traced, [index, *rows])))

@@ -1,0 +1,349 @@
+"""The first geom that a ray meets: a function of one ray, which the engine makes a kernel for all rays.
+
+Geoms that do not move are in a hierarchy of boxes, those of movable bodies and drones in a list with a ball around
+each, for every world.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.typing import DTypeLike
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.lanes import any_lane, compute_where, table_rows
+from crazysim.geometry import Shape
+from crazysim.geometry.bounds import bounding_box, bounding_radius
+from crazysim.geometry.fieldrays import PARALLEL, field_ray
+from crazysim.geometry.points import Components
+from crazysim.geometry.rays import Interval, Sized, first_of, hit_distance
+from crazysim.geometry.shapes import SIZES
+from crazysim.scene import hierarchy
+from crazysim.scene.collision import CollisionGeom, CollisionModel
+
+NOBODY, NO_DRONE = -1, -2
+"""Drone that a ray passes through if it passes through none, and owner of geoms that belong to no drone."""
+
+SLACK = 1e-3
+"""Part of its radius by which a ball is larger, beside ``hierarchy.PADDING``, for rounding."""
+
+Surface = Shape | str
+"""A mesh or height field, or the kind of shapes that their sizes describe."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A geom that rays can meet."""
+
+    geom: CollisionGeom
+    """The geom, in the frame of its body."""
+    carrier: Literal["world", "object", "drone"]
+    """Kind of its body; the world's do not move."""
+    row: int
+    """Row of the body among the objects or drones."""
+    number: int
+    """Number of the body in ``Hits.number``."""
+
+    @property
+    def surface(self) -> Surface:
+        """Kind of the shape, or the shape itself if its size is not enough."""
+        shape = self.geom.shape
+        return shape if shape.kind in ("mesh", "hfield") else shape.kind
+
+    def numbers(self, pos: np.ndarray) -> np.ndarray:
+        """Return position, a zero, rotation by rows, and size in three numbers: a row of the table of geoms. (16,)
+
+        Args:
+            pos: Position, m. (3,)
+        """
+        rot = np.eye(3) if self.geom.rot is None else np.array(self.geom.rot)
+        size = np.zeros(3)
+        if not isinstance(self.surface, Shape):
+            size[: len(self.geom.shape.size)] = self.geom.shape.size
+        return np.concatenate([pos, [0.0], rot.reshape(-1), size])
+
+
+class Tables(NamedTuple):
+    """Everything that rays of all worlds need, as tables in memory."""
+
+    counts: Array
+    """Numbers of nodes, fixed geoms and movable geoms. (1, 3)"""
+    codes: Array
+    """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
+    nodes: Array
+    """Hierarchy of the fixed geoms, one order after the other. (8 * n_nodes, 8)"""
+    fixed: Array
+    """Fixed geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
+    balls: Array
+    """Centre and radius of a ball around each movable geom, m. (n_worlds * n_movable, 4)"""
+    movable: Array
+    """Movable geoms, world frame. (n_worlds * n_movable, 16)"""
+    eyes: Array
+    """Position, and axes by rows, of the cameras. (n_worlds * n_cameras, 12)"""
+    pixels: Array
+    """Direction of the rays in the frame of their camera, and drone that they pass. (n_cameras * n_pixels, 4)"""
+
+
+class Targets:
+    """Geoms that rays can meet, and their tables."""
+
+    def __init__(self, model: CollisionModel, n_drones: int, drones: bool, passed: int = NOBODY):
+        """Sort the geoms of a model.
+
+        Args:
+            model: Model, without bodies whose poses are not part of the data.
+            n_drones: Drones of a world.
+            drones: True for rays to meet drones.
+            passed: Drone that all rays pass through; ``NOBODY`` if there is none.
+        """
+        found = [Target(geom, "world", 0, 0) for geom in model.floor]
+        for number, body in enumerate(model.objects, start=1):
+            carrier = "world" if body.row is None else "object"
+            found += [Target(geom, carrier, body.row or 0, number) for geom in body.geoms]
+        for kind in model.drones if drones else ():
+            for row in range(n_drones) if kind.drones is None else kind.drones:
+                if row != passed:
+                    found += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in kind.geoms]
+        self.fixed = [x for x in found if x.carrier == "world"]
+        """Geoms that do not move."""
+        self.movable = [x for carrier in ("object", "drone") for x in found if x.carrier == carrier]
+        """Geoms of movable objects, then those of drones."""
+        self.all = [*self.fixed, *self.movable]
+        """All of them, in the order of their indices."""
+        self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all))
+        """Surfaces that there are."""
+        self.codes = np.array([self.surfaces.index(x.surface) for x in self.all], np.int32)
+        """Index of the surface of each geom. (n,)"""
+
+    def nodes(self) -> np.ndarray:
+        """Return the hierarchy of the fixed geoms. (8, n_nodes, 8)"""
+        low, high = np.zeros((2, len(self.fixed), 3))
+        for k, target in enumerate(self.fixed):
+            rot = np.eye(3) if target.geom.rot is None else np.array(target.geom.rot)
+            centre, half = bounding_box(target.geom.shape)
+            centre, half = np.array(target.geom.pos) + rot @ centre, np.abs(rot) @ half
+            low[k], high[k] = centre - half, centre + half
+        return hierarchy.build(low, high)
+
+    def fixed_rows(self, dtype: DTypeLike) -> Array:
+        """Return the fixed geoms. (n_fixed, 16)"""
+        rows = [x.numbers(np.array(x.geom.pos)) for x in self.fixed]
+        return jnp.asarray(np.array(rows).reshape(-1, 16), dtype)
+
+    def movable_rows(self, data: SimData) -> tuple[Array, Array]:
+        """Return centres and radii of balls around the movable geoms, and the geoms, world frame.
+
+        Returns:
+            Balls. (n_worlds, n_movable, 4)
+            Geoms. (n_worlds, n_movable, 16)
+        """
+        states, dtype = data.states, data.states.pos.dtype
+        n_worlds = states.pos.shape[0]
+        balls, geoms = [jnp.zeros((n_worlds, 0, 4), dtype)], [jnp.zeros((n_worlds, 0, 16), dtype)]
+        for carrier in ("object", "drone"):
+            some = [x for x in self.movable if x.carrier == carrier]
+            if not some:
+                continue
+            if carrier == "object" and data.objects is not None:
+                poses = data.objects.pos[:, 0], data.objects.quat[:, 0]
+            else:
+                poses = states.pos, states.quat
+            pos, quat = (x[:, np.array([t.row for t in some])] for x in poses)
+            own = np.array([t.numbers(np.array(t.geom.pos)) for t in some])
+            rot = own[:, 4:13].reshape(-1, 3, 3)
+            middles = [r @ bounding_box(t.geom.shape)[0] for r, t in zip(rot, some, strict=True)]
+            radii = np.array([bounding_radius(t.geom.shape) for t in some])
+            centre = pos + rotation.rotate(quat, jnp.asarray(own[:, :3] + np.array(middles), dtype))
+            radius = jnp.broadcast_to(jnp.asarray(radii * (1 + SLACK) + hierarchy.PADDING, dtype), centre.shape[:2])
+            balls.append(jnp.concatenate([centre, radius[..., None]], axis=-1))
+            at = pos + rotation.rotate(quat, jnp.asarray(own[:, :3], dtype))
+            axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
+            size = jnp.broadcast_to(jnp.asarray(own[:, 13:], dtype), (*at.shape[:2], 3))
+            zero = jnp.zeros_like(at[..., :1])
+            geoms.append(jnp.concatenate([at, zero, axes.reshape(*at.shape[:2], 9), size], axis=-1))
+        return jnp.concatenate(balls, axis=1), jnp.concatenate(geoms, axis=1)
+
+    def tables(self, balls: Array, geoms: Array, eyes: Array, pixels: Array) -> Tables:
+        """Return the tables of rays of all worlds.
+
+        Args:
+            balls: From ``movable_rows``.
+            geoms: From ``movable_rows``.
+            eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
+            pixels: Directions in the frame of the camera, and the drone that a ray passes. (n_cameras, n_pixels, 4)
+        """
+        dtype, nodes = eyes.dtype, self.nodes()
+        owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
+        codes = np.stack([self.codes, np.array(owners, np.int32)], axis=1) if self.all else np.zeros((0, 2), np.int32)
+        counts = np.array([[nodes.shape[1], len(self.fixed), len(self.movable)]], np.int32)
+        found = (
+            jnp.asarray(counts), jnp.asarray(codes), jnp.asarray(nodes.reshape(-1, 8), dtype), self.fixed_rows(dtype),
+            balls, geoms, eyes, pixels,
+        )  # fmt: skip
+        # No table is empty, since one of no rows has no memory.
+        flat = [x.reshape(-1, x.shape[-1]) for x in found]
+        return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
+
+
+class Ray(NamedTuple):
+    """A ray in one world."""
+
+    origin: Components
+    """Origin, world frame, m."""
+    direction: Components
+    """Unit direction, world frame."""
+    passes: Array
+    """Drone that it passes through, or ``NOBODY``."""
+
+
+Best = tuple[Array, Array]
+"""Distance to the first geom so far, m, infinite for none, and its index, -1 for none."""
+
+
+def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array) -> Best:
+    """Return the distance to the first geom that a ray meets, and the index of the geom; see ``Targets.all``.
+
+    Of geoms at the same distance it is the one of the lowest index.
+
+    Args:
+        surfaces: Surfaces that there are.
+        n_pixels: Rays of a camera.
+        n_cameras: Cameras of a world.
+        index: Number of the ray: pixels of the first camera of the first world come first. ()
+        *tables: ``Tables``.
+    """
+    t = Tables(*tables)
+    n_nodes, n_fixed, n_movable = table_rows(t.counts, jnp.int32(0))
+    view = lax.div(index, jnp.int32(n_pixels))
+    world = lax.div(view, jnp.int32(n_cameras))
+    camera, pixel = view - world * n_cameras, index - view * n_pixels
+    eye, (*look, passes) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
+    direction = [sum(eye[3 + 3 * k + i] * look[i] for i in range(3)) for k in range(3)]
+    ray = Ray((eye[0], eye[1], eye[2]), (direction[0], direction[1], direction[2]), passes.astype(jnp.int32))
+    best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
+
+    def visit(k: Array, geoms: Array, row: Array, meets: Array, best: Best) -> Best:
+        """Return the nearer of the best hit and that of a geom, which is computed where the ray may meet it."""
+
+        def look_closer(best: Best) -> Best:
+            code, _ = table_rows(t.codes, k)
+            return _nearer(surfaces, code, k, table_rows(geoms, row), ray, best)
+
+        return compute_where(meets, look_closer, best)
+
+    inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in direction]
+    signs = [any_lane(d < 0) for d in direction]
+    start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
+
+    def walk(carry: tuple[Array, Best]) -> tuple[Array, Best]:
+        place, best = carry
+        node = table_rows(t.nodes, start + place)
+        meets = _meets_box(node[:3], node[4:7], ray.origin, inverse, best[0])
+        goes_in, geom = any_lane(meets), node[7].astype(jnp.int32)
+        best = visit(geom, t.fixed, geom, meets & (geom >= 0), best)
+        return jnp.where(goes_in, place + 1, node[3].astype(jnp.int32)), best
+
+    _, best = lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))
+
+    def turn(carry: tuple[Array, Best]) -> tuple[Array, Best]:
+        k, best = carry
+        row = world * n_movable + k
+        _, owner = table_rows(t.codes, n_fixed + k)
+        meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
+        return k + 1, visit(n_fixed + k, t.movable, row, meets, best)
+
+    return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
+
+
+def _larger(a: Array, b: Array) -> Array:
+    return jnp.where(a < b, b, a)
+
+
+def _smaller(a: Array, b: Array) -> Array:
+    return jnp.where(a > b, b, a)
+
+
+def _meets_box(
+    low: Sequence[Array], high: Sequence[Array], origin: Components, inverse: Sequence[Array], best: Array
+) -> Array:
+    """Return True where a ray meets a box before its best hit; ``inverse`` are the inverses of its direction."""
+    ends = [((a - o) * i, (b - o) * i) for a, b, o, i in zip(low, high, origin, inverse, strict=True)]
+    x, y, z = (_smaller(*pair) for pair in ends)
+    near = _larger(_larger(x, y), z)
+    x, y, z = (_larger(*pair) for pair in ends)
+    far = _smaller(_smaller(x, y), z)
+    return (near <= far) & (far >= 0) & (near <= best)
+
+
+def _meets_ball(ball: Sequence[Array], ray: Ray, best: Array) -> Array:
+    """Return True where a ray meets a ball before its best hit."""
+    *centre, radius = ball
+    away = [c - o for c, o in zip(centre, ray.origin, strict=True)]
+    middle = sum(a * d for a, d in zip(away, ray.direction, strict=True))
+    # The point of the line nearest to the centre: differences of squares would cancel far away.
+    aside = [a - middle * d for a, d in zip(away, ray.direction, strict=True)]
+    square = sum(a * a for a in aside)
+    return (square <= radius * radius) & (middle + radius >= 0) & (middle - radius <= best)
+
+
+def _nearer(surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, best: Best) -> Best:
+    """Return the nearer of the best hit and that of geom ``k``, whose row is given."""
+    start, along = in_frame(row, ray.origin, ray.direction)
+    for number, surface in enumerate(surfaces):
+
+        def of_surface(best: Best, surface: Surface = surface) -> Best:
+            far = _distance(surface, row, start, along)
+            closer = (far < best[0]) | ((far == best[0]) & (k < best[1]))
+            return jnp.where(closer, far, best[0]), jnp.where(closer, k, best[1])
+
+        best = compute_where(code == number, of_surface, best) if len(surfaces) > 1 else of_surface(best)
+    return best
+
+
+def in_frame(row: Sequence[Array], origin: Components, direction: Components) -> tuple[Components, Components]:
+    """Return a ray in the frame of a geom, whose row is given."""
+    away = [o - p for o, p in zip(origin, row, strict=False)]
+    start, along = (
+        tuple(sum(row[4 + 3 * i + k] * v[i] for i in range(3)) for k in range(3)) for v in (away, direction)
+    )
+    return start, along  # type: ignore[return-value]
+
+
+def shape_of(surface: Surface, row: Sequence[Array]) -> Shape | Sized:
+    """Return the shape of a geom, whose row is given."""
+    return Sized(surface, row[13 : 13 + SIZES[surface]]) if isinstance(surface, str) else surface
+
+
+def _distance(surface: Surface, row: Sequence[Array], start: Components, along: Components) -> Array:
+    """Return the distance along one ray in the frame of a geom, m. ()"""
+    if isinstance(surface, str):
+        return hit_distance(shape_of(surface, row), start, along)
+    if surface.kind == "hfield":
+        return field_ray(surface, jnp.stack(start), jnp.stack(along))[0]
+    return _first_of_planes(surface, start, along)
+
+
+def _first_of_planes(shape: Shape, origin: Components, direction: Components) -> Array:
+    """Return the distance along one ray to a mesh, in a loop over its planes, as ``hit_distance`` has it, m. ()"""
+    planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
+
+    def turn(k: Array, found: Interval) -> Interval:
+        x, y, z, offset = table_rows(planes, k)
+        below = offset - (x * origin[0] + y * origin[1] + z * origin[2])
+        rises = x * direction[0] + y * direction[1] + z * direction[2]
+        parallel = jnp.abs(rises) < PARALLEL
+        t = below / jnp.where(parallel, 1.0, rises)
+        near, far, meets = found
+        near = jnp.where(~parallel & (rises < 0) & (t > near), t, near)
+        far = jnp.where(~parallel & (rises > 0) & (t < far), t, far)
+        return near, far, meets & ~(parallel & (below < 0))
+
+    infinite = jnp.full_like(origin[0], jnp.inf)
+    near, far, meets = lax.fori_loop(0, len(planes), turn, (-infinite, infinite, infinite > 0))
+    return first_of((near, far, meets & (near <= far)))

@@ -1,0 +1,96 @@
+"""Bounding volume hierarchy of geoms that do not move, as a table that a ray walks without a stack.
+
+Nodes follow each other in the order of a visit, and each has the place behind its subtree, where a ray goes on that
+misses its box. There is an order for each of the eight octants of directions, so that what is nearer comes first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from crazysim.geometry.bounds import UNBOUNDED
+
+N_ORDERS = 8
+"""Orders of the nodes: one for each octant of directions."""
+PADDING = 1e-4
+"""Length by which boxes are larger on all sides, m, so that rounding makes no ray miss the box of what it meets."""
+
+
+@dataclasses.dataclass
+class _Node:
+    low: np.ndarray
+    """Least corner of the box, m. (3,)"""
+    high: np.ndarray
+    """Greatest corner of the box, m. (3,)"""
+    axis: int = 0
+    """Axis along which the children are sorted."""
+    children: tuple[_Node, _Node] | None = None
+    """Subtrees, the one at smaller coordinates first; None for a leaf."""
+    geom: int = -1
+    """Index of the geom of a leaf; -1 for others."""
+
+
+def build(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the nodes of the hierarchy of some boxes, in all orders. (8, n_nodes, 8)
+
+    A row is the least corner of a node's box, the place behind its subtree, the greatest corner, and the index of the
+    geom of a leaf or -1. Bit k of an order's number is set where directions along axis k are negative.
+
+    Args:
+        low: Least corners of the boxes, m. (n, 3)
+        high: Greatest corners, m. (n, 3)
+    """
+    low, high = low - PADDING, high + PADDING
+    bounded = np.all(high - low < UNBOUNDED, axis=1)
+    roots = [_Node(low[k], high[k], geom=int(k)) for k in np.flatnonzero(~bounded)]
+    if bounded.any():
+        roots.append(_tree(low, high, np.flatnonzero(bounded)))
+    return np.array([_ordered(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
+
+
+def _tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
+    """Return the tree of some boxes, split where the surfaces of both parts, times their counts, are least.
+
+    No part has less than an eighth of the boxes, which bounds the depth.
+    """
+    node = _Node(low[geoms].min(axis=0), high[geoms].max(axis=0), geom=int(geoms[0]))
+    n = len(geoms)
+    if n == 1:
+        return node
+    order = np.argsort(low[geoms] + high[geoms], axis=0, kind="stable")  # along each axis
+    a, b = low[geoms][order], high[geoms][order]  # (n, 3, 3): place, axis of the order, component
+
+    def surfaces(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(high - low, -1, 0)
+        return x * y + y * z + z * x
+
+    left = surfaces(np.minimum.accumulate(a), np.maximum.accumulate(b))[:-1]
+    right = surfaces(np.minimum.accumulate(a[::-1]), np.maximum.accumulate(b[::-1]))[::-1][1:]
+    count = np.arange(1, n)[:, None]
+    cost = left * count + right * (n - count)
+    least = n // 8
+    cost = cost[least : n - 1 - least]
+    at, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)
+    halves = np.split(geoms[order[:, axis]], [int(at) + least + 1])
+    node.axis, node.geom = int(axis), -1
+    node.children = _tree(low, high, halves[0]), _tree(low, high, halves[1])
+    return node
+
+
+def _ordered(roots: list[_Node], order: int) -> list[list[float]]:
+    """Return the rows of all nodes, in the order of an octant."""
+    rows: list[list[float]] = []
+
+    def visit(node: _Node) -> None:
+        place = len(rows)
+        rows.append([])
+        if node.children is not None:
+            for child in node.children[:: -1 if order >> node.axis & 1 else 1]:
+                visit(child)
+        rows[place] = [*node.low, len(rows), *node.high, node.geom]
+
+    for root in roots:
+        visit(root)
+    return rows
