@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -27,6 +28,10 @@ MAX_RAYS = 1 << 22
 
 MAX_RAYS_OF_KERNEL = 1 << 28
 """Most rays of a kernel; numbers of rays and places in tables are int32."""
+
+TILE = 4
+"""Height and width of the tiles of pixels, whose rays follow each other: rays side by side in a kernel meet much the
+same geoms."""
 
 Along = Literal["axis", "ray"]
 
@@ -142,9 +147,11 @@ def build(
     for name, n in (("width", width), ("height", height)):
         if type(n) is not int or n < 1:
             raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
+    h, w = (math.gcd(n, TILE) for n in (height, width))
+    order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
     looks = np.zeros((len(cameras), height * width, 4))
     for camera, rays in zip(cameras, looks, strict=True):
-        rays[:, :3] = pixel_directions(camera.fovy, width, height).reshape(-1, 3)
+        rays[:, :3] = pixel_directions(camera.fovy, width, height).reshape(-1, 3)[order]
         rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else NOBODY
     n_rays = len(cameras) * width * height
 
@@ -154,8 +161,13 @@ def build(
         hits = cast_in_worlds(in_data, data, eyes, looks, drones, kernels)
         cosine = jnp.asarray(-looks[..., 2].reshape(-1), eyes.dtype) if along == "axis" else 1.0
         hits = hits.replace(distance=hits.distance * cosine)
-        shape = (eyes.shape[0], len(cameras), height, width)
-        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), hits)
+
+        def picture(x: Array) -> Array:
+            """Return what tiles of rays found as a picture, row by row."""
+            x = x.reshape(x.shape[0], len(cameras), height // h, width // w, h, w, *x.shape[2:])
+            return jnp.moveaxis(x, 4, 3).reshape(*x.shape[:2], height, width, *x.shape[6:])
+
+        return jax.tree.map(picture, hits)
 
     # Their poses become part of the data before the rays are cast.
     in_data = model.without_mocap_bodies()

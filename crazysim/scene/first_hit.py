@@ -229,34 +229,34 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
 
     def visit(k: Array, geoms: Array, row: Array, meets: Array, best: Best) -> Best:
-        """Return the nearer of the best hit and that of a geom, which is computed where the ray may meet it."""
+        """Return the nearer of the best hit and that of a geom, which is computed where a ray may meet it."""
 
         def look_closer(best: Best) -> Best:
             code, _ = table_rows(t.codes, k)
-            return _nearer(surfaces, code, k, table_rows(geoms, row), ray, best)
+            return _nearer(surfaces, code, k, table_rows(geoms, row), ray, meets, best)
 
-        return compute_where(meets, look_closer, best)
+        return compute_where(any_lane(meets) & (k >= 0), look_closer, best)
 
     inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in direction]
+    scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
     signs = [any_lane(d < 0) for d in direction]
     start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
 
     def walk(carry: tuple[Array, Best]) -> tuple[Array, Best]:
         place, best = carry
         node = table_rows(t.nodes, start + place)
-        meets = _meets_box(node[:3], node[4:7], ray.origin, inverse, best[0])
-        goes_in, geom = any_lane(meets), node[7].astype(jnp.int32)
-        best = visit(geom, t.fixed, geom, meets & (geom >= 0), best)
-        return jnp.where(goes_in, place + 1, node[3].astype(jnp.int32)), best
+        meets, geom = _meets_box(node[:3], node[4:7], scaled, inverse, best[0]), node[7].astype(jnp.int32)
+        best = visit(geom, t.fixed, geom, meets, best)
+        return jnp.where(any_lane(meets), place + 1, node[3].astype(jnp.int32)), best
 
     _, best = lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))
 
     def turn(carry: tuple[Array, Best]) -> tuple[Array, Best]:
         k, best = carry
-        row = world * n_movable + k
-        _, owner = table_rows(t.codes, n_fixed + k)
+        row, geom = world * n_movable + k, n_fixed + k
+        _, owner = table_rows(t.codes, geom)
         meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
-        return k + 1, visit(n_fixed + k, t.movable, row, meets, best)
+        return k + 1, visit(geom, t.movable, row, meets, best)
 
     return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
 
@@ -270,10 +270,18 @@ def _smaller(a: Array, b: Array) -> Array:
 
 
 def _meets_box(
-    low: Sequence[Array], high: Sequence[Array], origin: Components, inverse: Sequence[Array], best: Array
+    low: Sequence[Array], high: Sequence[Array], scaled: Sequence[Array], inverse: Sequence[Array], best: Array
 ) -> Array:
-    """Return True where a ray meets a box before its best hit; ``inverse`` are the inverses of its direction."""
-    ends = [((a - o) * i, (b - o) * i) for a, b, o, i in zip(low, high, origin, inverse, strict=True)]
+    """Return True where a ray meets a box before its best hit.
+
+    Args:
+        low: Least corner of the box, m.
+        high: Greatest corner, m.
+        scaled: Origin of the ray times ``inverse``.
+        inverse: Inverses of the components of its direction.
+        best: Distance to its best hit, m.
+    """
+    ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled, inverse, strict=True)]
     x, y, z = (_smaller(*pair) for pair in ends)
     near = _larger(_larger(x, y), z)
     x, y, z = (_larger(*pair) for pair in ends)
@@ -292,14 +300,16 @@ def _meets_ball(ball: Sequence[Array], ray: Ray, best: Array) -> Array:
     return (square <= radius * radius) & (middle + radius >= 0) & (middle - radius <= best)
 
 
-def _nearer(surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, best: Best) -> Best:
-    """Return the nearer of the best hit and that of geom ``k``, whose row is given."""
+def _nearer(
+    surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, meets: Array, best: Best
+) -> Best:
+    """Return the nearer of the best hit and, where a ray may meet it, that of geom ``k``, whose row is given."""
     start, along = in_frame(row, ray.origin, ray.direction)
     for number, surface in enumerate(surfaces):
 
         def of_surface(best: Best, surface: Surface = surface) -> Best:
             far = _distance(surface, row, start, along)
-            closer = (far < best[0]) | ((far == best[0]) & (k < best[1]))
+            closer = meets & ((far < best[0]) | ((far == best[0]) & (k < best[1])))
             return jnp.where(closer, far, best[0]), jnp.where(closer, k, best[1])
 
         best = compute_where(code == number, of_surface, best) if len(surfaces) > 1 else of_surface(best)

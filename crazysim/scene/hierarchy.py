@@ -15,7 +15,8 @@ from crazysim.geometry.bounds import UNBOUNDED
 N_ORDERS = 8
 """Orders of the nodes: one for each octant of directions."""
 PADDING = 1e-4
-"""Length by which boxes are larger on all sides, m, so that rounding makes no ray miss the box of what it meets."""
+"""Length by which boxes are larger on all sides, m, so that rounding makes no ray miss the box of what it meets: more
+than the spacing of numbers in float32 up to 1 km, which is 6e-5 m."""
 
 
 @dataclasses.dataclass

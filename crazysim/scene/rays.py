@@ -218,22 +218,23 @@ def cast_in_worlds(
     start, along = in_frame(row, components(origin), components(direction))
     begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
     code = jnp.asarray(targets.codes)[jnp.maximum(which, 0)]
-    exact, across = jnp.full_like(distance, jnp.inf), jnp.zeros_like(origin)
+    found = []
+    exact = jnp.full_like(distance, jnp.inf)
     for number, surface in enumerate(targets.surfaces):
         mine = (which >= 0) & (code == number)
-        shape = shape_of(surface, row)
-        if isinstance(shape, Shape) and shape.kind == "hfield":
-            far, normal = ray_distance(shape, begin, way)
-        else:
-            far = hit_distance(shape, start, along)
-            normal = hit_normal(shape, begin, way, distance)
+        # A size for geoms of other kinds, so that their slopes are finite.
+        shape = shape_of(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
+        is_field = isinstance(shape, Shape) and shape.kind == "hfield"
+        far, normal = ray_distance(shape, begin, way) if is_field else (hit_distance(shape, start, along), None)
         exact = jnp.where(mine, far, exact)
+        found.append((mine, shape, normal))
+    distance, across = _with_derivative_of(distance, exact), jnp.zeros_like(origin)
+    for mine, shape, normal in found:
+        normal = hit_normal(shape, begin, way, distance) if normal is None else normal
         across = jnp.where(mine[..., None], normal, across)
     normal = jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
     numbers = jnp.asarray([*(target.number for target in targets.all), -1], jnp.int32)
-    return Hits(
-        _with_derivative_of(distance, exact), normal, numbers[which], names(model, data.core.n_drones if drones else 0)
-    )
+    return Hits(distance, normal, numbers[which], names(model, data.core.n_drones if drones else 0))
 
 
 @dataclasses.dataclass

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from crazysim.engine.backends.exchange import Exchange, Registers
-from crazysim.engine.backends.uniform import shared_carry, shared_results
+from crazysim.engine.backends.uniform import is_shared, shared_carry, shared_results
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value, is_constant
@@ -208,7 +208,8 @@ class Writer:
         self.line("for (;;) {", depth)
         (continues,) = self.block(test, carry, depth + 1)
         self.line(f"if (!any({continues})) break;", depth + 1)
-        self._assign(op, name, self.block(body, carry, depth + 1), shared, continues, depth + 1)
+        mask = None if is_shared(test.outputs[0], self.shared) else continues
+        self._assign(op, name, self.block(body, carry, depth + 1), shared, mask, depth + 1)
         self.line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:

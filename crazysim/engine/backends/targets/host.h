@@ -58,6 +58,7 @@ typedef vec<f64>::type f64v;
 typedef vec<i32>::type i32v;
 typedef vec<u32>::type u32v;
 typedef vec<int64_t>::type i64v;
+typedef vec<int8_t>::type i8v;
 struct b1v { i32v m; };  // all bits set where true
 template <> struct vec<b1> { typedef b1v type; };
 
@@ -110,7 +111,12 @@ FN b1v mask(i32v m) { return {m}; }
 FN b1v mask(i64v m) { return {__builtin_convertvector(m, i32v)}; }
 FN b1 any(b1 x) { return x; }
 FN b1 any_lane(b1 x) { return x; }
-FN b1 any(b1v x) { i32 sum = 0; for (int i = 0; i < W; ++i) sum |= x.m[i]; return sum != 0; }
+FN b1 any(b1v x) {
+  const auto bytes = __builtin_convertvector(x.m, i8v);
+  uint64_t parts[(W + 7) / 8] = {};
+  memcpy(parts, &bytes, sizeof(bytes));
+  return W > 8 ? (parts[0] | parts[(W + 7) / 8 - 1]) != 0 : parts[0] != 0;
+}
 FN b1 any_lane(b1v x) { return any(x); }
 
 #define LANES1(A) template <class A, class = only_if_t<is_lanes<A>::value>> FN
