@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from crazysim.geometry.heightfield import height, spacing
@@ -114,7 +115,7 @@ def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     row = jnp.clip(jnp.floor(v + start * dv), 0, n_rows - 2).astype(jnp.int32)
     slack = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
-    def cell(_: int, carry: tuple[Array, Array, Hit]) -> tuple[Array, Array, Hit]:
+    def cell(_: Array, carry: tuple[Array, Array, Hit]) -> tuple[Array, Array, Hit]:
         column, row, hit = carry
         inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
         i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)
@@ -142,5 +143,5 @@ def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
 
     zero = jnp.zeros_like(origin.x)
     none = (zero + jnp.inf, Vector(zero, zero, zero + 1))
-    _, _, (t, n) = lax.fori_loop(0, n_rows + n_columns - 2, cell, (column, row, none))
+    _, _, (t, n) = lax.fori_loop(np.int32(0), np.int32(n_rows + n_columns - 2), cell, (column, row, none))
     return t, unit(n, n)

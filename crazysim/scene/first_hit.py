@@ -76,8 +76,10 @@ class Tables(NamedTuple):
     """Numbers of nodes, fixed geoms and movable geoms. (1, 3)"""
     codes: Array
     """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
-    nodes: Array
-    """Hierarchy of the fixed geoms, one order after the other. (8 * n_nodes, 8)"""
+    boxes: Array
+    """Boxes of the hierarchy of the fixed geoms, one order after the other. (8 * n_nodes, 6)"""
+    links: Array
+    """Place behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
     fixed: Array
     """Fixed geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
     balls: Array
@@ -121,8 +123,8 @@ class Targets:
         self.codes = np.array([self.surfaces.index(x.surface) for x in self.all], np.int32)
         """Index of the surface of each geom. (n,)"""
 
-    def nodes(self) -> np.ndarray:
-        """Return the hierarchy of the fixed geoms. (8, n_nodes, 8)"""
+    def hierarchy(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the hierarchy of the fixed geoms; see ``hierarchy.build``."""
         low, high = np.zeros((2, len(self.fixed), 3))
         for k, target in enumerate(self.fixed):
             rot = np.eye(3) if target.geom.rot is None else np.array(target.geom.rot)
@@ -178,12 +180,12 @@ class Targets:
             eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and the drone that a ray passes. (n_cameras, n_pixels, 4)
         """
-        dtype, nodes = eyes.dtype, self.nodes()
+        dtype, (boxes, links) = eyes.dtype, self.hierarchy()
         owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
         codes = np.stack([self.codes, np.array(owners, np.int32)], axis=1) if self.all else np.zeros((0, 2), np.int32)
-        counts = np.array([[nodes.shape[1], len(self.fixed), len(self.movable)]], np.int32)
+        counts = np.array([[boxes.shape[1], len(self.fixed), len(self.movable)]], np.int32)
         found = (
-            jnp.asarray(counts), jnp.asarray(codes), jnp.asarray(nodes.reshape(-1, 8), dtype), self.fixed_rows(dtype),
+            jnp.asarray(counts), jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), self.fixed_rows(dtype),
             balls, geoms, eyes, pixels,
         )  # fmt: skip
         # No table is empty, since one of no rows has no memory.
@@ -229,13 +231,9 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
 
     def visit(k: Array, geoms: Array, row: Array, meets: Array, best: Best) -> Best:
-        """Return the nearer of the best hit and that of a geom, which is computed where a ray may meet it."""
-
-        def look_closer(best: Best) -> Best:
-            code, _ = table_rows(t.codes, k)
-            return _nearer(surfaces, code, k, table_rows(geoms, row), ray, meets, best)
-
-        return compute_where(any_lane(meets) & (k >= 0), look_closer, best)
+        """Return the nearer of the best hit and, where a ray may meet it, that of geom ``k``, a row of a table."""
+        code, _ = table_rows(t.codes, k)
+        return _nearer(surfaces, code, k, table_rows(geoms, row), ray, meets, best)
 
     inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
@@ -244,10 +242,14 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
 
     def walk(carry: tuple[Array, Best]) -> tuple[Array, Best]:
         place, best = carry
-        node = table_rows(t.nodes, start + place)
-        meets, geom = _meets_box(node[:3], node[4:7], scaled, inverse, best[0]), node[7].astype(jnp.int32)
-        best = visit(geom, t.fixed, geom, meets, best)
-        return jnp.where(any_lane(meets), place + 1, node[3].astype(jnp.int32)), best
+        box, (after, geom) = table_rows(t.boxes, start + place), table_rows(t.links, start + place)
+        meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
+
+        def go_in(carry: tuple[Array, Best]) -> tuple[Array, Best]:
+            _, best = carry
+            return place + 1, compute_where(geom >= 0, lambda best: visit(geom, t.fixed, geom, meets, best), best)
+
+        return compute_where(any_lane(meets), go_in, (after, best))
 
     _, best = lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))
 
@@ -256,7 +258,7 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         row, geom = world * n_movable + k, n_fixed + k
         _, owner = table_rows(t.codes, geom)
         meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
-        return k + 1, visit(geom, t.movable, row, meets, best)
+        return k + 1, compute_where(any_lane(meets), lambda best: visit(geom, t.movable, row, meets, best), best)
 
     return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
 
@@ -355,5 +357,5 @@ def _first_of_planes(shape: Shape, origin: Components, direction: Components) ->
         return near, far, meets & ~(parallel & (below < 0))
 
     infinite = jnp.full_like(origin[0], jnp.inf)
-    near, far, meets = lax.fori_loop(0, len(planes), turn, (-infinite, infinite, infinite > 0))
+    near, far, meets = lax.fori_loop(np.int32(0), np.int32(len(planes)), turn, (-infinite, infinite, infinite > 0))
     return first_of((near, far, meets & (near <= far)))

@@ -33,22 +33,26 @@ class _Node:
     """Index of the geom of a leaf; -1 for others."""
 
 
-def build(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the nodes of the hierarchy of some boxes, in all orders. (8, n_nodes, 8)
+def build(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nodes of the hierarchy of some boxes, in all orders.
 
-    A row is the least corner of a node's box, the place behind its subtree, the greatest corner, and the index of the
-    geom of a leaf or -1. Bit k of an order's number is set where directions along axis k are negative.
+    Bit k of an order's number is set where directions along axis k are negative.
 
     Args:
         low: Least corners of the boxes, m. (n, 3)
         high: Greatest corners, m. (n, 3)
+
+    Returns:
+        Least and greatest corner of the box of each node, m. (8, n_nodes, 6)
+        The place behind its subtree, and the index of the geom of a leaf or -1. (8, n_nodes, 2)
     """
     low, high = low - PADDING, high + PADDING
     bounded = np.all(high - low < UNBOUNDED, axis=1)
     roots = [_Node(low[k], high[k], geom=int(k)) for k in np.flatnonzero(~bounded)]
     if bounded.any():
         roots.append(_tree(low, high, np.flatnonzero(bounded)))
-    return np.array([_ordered(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
+    rows = np.array([_ordered(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
+    return rows[..., :6], rows[..., 6:].astype(np.int32)
 
 
 def _tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
@@ -90,7 +94,7 @@ def _ordered(roots: list[_Node], order: int) -> list[list[float]]:
         if node.children is not None:
             for child in node.children[:: -1 if order >> node.axis & 1 else 1]:
                 visit(child)
-        rows[place] = [*node.low, len(rows), *node.high, node.geom]
+        rows[place] = [*node.low, *node.high, len(rows), node.geom]
 
     for root in roots:
         visit(root)

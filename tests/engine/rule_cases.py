@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from crazysim.core.lanes import any_lane, compute_where
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length
@@ -169,6 +170,20 @@ def loops(g):
     last, each = jax.lax.scan(lambda c, y: (c + y, c * y), g.x[0], g.x)
     back, _ = jax.lax.scan(lambda c, y: (0.5 * c + y, None), g.x[0], g.x, reverse=True)
     return jnp.concatenate([fixed, last[None], each, back[None]])
+
+
+@case
+def walk_together(g):
+    """A walk over pairs of a table that all lanes of a vector take together; what it skips adds nothing."""
+
+    def turn(carry):
+        k, total = carry
+        pair = [g.table[k], g.table[k + 1]]
+        meets = (pair[0] < g.x[0]) | (pair[1] < g.x[0])
+        total = compute_where(any_lane(meets), lambda x: x + sum(jnp.where(t < g.x[0], t, 0.0) for t in pair), total)
+        return k + 2, total
+
+    return jax.lax.while_loop(lambda carry: carry[0] < 8, turn, (0, 0 * g.x[0]))[1]
 
 
 @case

@@ -42,7 +42,7 @@ def test_a_case_gives_what_jax_gives(name):
 @pytest.mark.parametrize("engine", FAST)
 def test_loops_branches_and_random_numbers_run_in_every_engine(engine):
     """One program of the cases whose operations run blocks or have several results: the rest is in test_targets."""
-    names = ["cond", "loops", "loop_until", "nested_calls", "own_gradient", *RANDOM]
+    names = ["cond", "loops", "loop_until", "walk_together", "nested_calls", "own_gradient", *RANDOM]
 
     def all_of_them(g):
         return [function(name)(g) for name in names]

@@ -16,6 +16,7 @@ REFUSED = {
     "integers": "'and' on int32",
     "words": "'shift_left' on uint32",
     "loop_until": "until a condition fails",
+    "walk_together": "until a condition fails",
 }
 OTHER = {"not_finite", "sort_not_finite", "argmin_and_sort", "conversions"}
 """Cases that are given NaN and infinity, which CasADi's simplifications do not keep, or take float32 apart."""

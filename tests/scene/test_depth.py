@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, RangeFinder, Sim, SlungLoad
+from crazysim.errors import EngineWarning
 from crazysim.scene.depth import pixel_directions
 
 WIDTH, HEIGHT, FOVY = 24, 16, 70.0
@@ -281,9 +282,9 @@ def crowd():
 
 
 def one_by_one(sim, own):
-    """Return functions from data and rays to hits: all worlds at once, and each as a stage of one world does it."""
+    """Return functions from data and rays to hits: by a kernel, by XLA, and for each world as a stage of it does it."""
     from crazysim.core.stage import Axes
-    from crazysim.scene.rays import cast
+    from crazysim.scene.rays import RayKernels, cast
 
     model = sim.scene.collision_model
     # Every other geom: compiling the gradients of each world takes long.
@@ -291,6 +292,9 @@ def one_by_one(sim, own):
     model = dataclasses.replace(model, objects=some)
 
     def together(data, origin, direction):
+        return cast(model, data, origin, direction, own, kernels=RayKernels("cpu", strict=True))
+
+    def by_xla(data, origin, direction):
         return cast(model, data, origin, direction, own)
 
     def each(data, origin, direction):
@@ -304,7 +308,7 @@ def one_by_one(sim, own):
         mapped = jax.vmap(of_world, ([over.get(scope) for scope in axes.scopes], 0, 0))
         return mapped(one, origin, direction)
 
-    return together, each
+    return together, by_xla, each
 
 
 def some_rays(rng, n):
@@ -318,7 +322,7 @@ def some_rays(rng, n):
 
 
 def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
-    """The loop over geoms of one kind, and the stage's loop over bodies: hits and gradients are the same."""
+    """The kernel of one ray, the same function in XLA, and the stage's loop over bodies: hits and gradients agree."""
     n = 300
     data = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, crowd.data)
     quat = data.objects.quat / jnp.linalg.norm(data.objects.quat, axis=-1, keepdims=True)
@@ -340,12 +344,16 @@ def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
         args = data.states.pos, data.states.quat, data.objects.pos, origin, direction
         return jax.jit(jax.value_and_grad(weighed, (0, 1, 2, 3, 4), has_aux=True))(*args)
 
-    ((_, together), slopes), ((_, each), expected) = map(answer, one_by_one(crowd, own))
+    by_kernel, by_xla, by_world = one_by_one(crowd, own)
+    ((_, together), slopes), ((_, each), expected) = map(answer, (by_kernel, by_world))
     seen = {together.names[k].partition(":")[0] for k in np.unique(together.number) if k >= 0}
     assert seen == {"floor", "fixed", "moving", "drone"}
     np.testing.assert_array_equal(together.number, each.number)
     np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9)
     np.testing.assert_allclose(together.normal, each.normal, atol=1e-9)
+    unfused = jax.jit(by_xla)(data, origin, direction)
+    for name in ("number", "distance", "normal"):
+        np.testing.assert_allclose(getattr(unfused, name), getattr(together, name), rtol=1e-9, atol=1e-9)
     for slope, known in zip(slopes, expected, strict=True):
         assert np.abs(known).max() > 0.1
         np.testing.assert_allclose(slope, known, rtol=1e-6, atol=1e-8 * np.abs(known).max())
@@ -372,3 +380,71 @@ def test_rays_meet_geoms_of_every_kind_where_c_mujoco_has_them(crowd, rng):
             assert hits.names[hits.number[1, k]] == (crowd.mj_model.body(body).name if body else "floor")
             assert hits.distance[1, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
     assert len(met) == 8
+
+
+@pytest.fixture(scope="module")
+def forest():
+    """A world of many equal geoms, some fixed and some that move, in front of a camera."""
+    sim = Sim(n_drones=2)
+    rng = np.random.default_rng(5)
+    for what, name, count, options in (
+        ("pole", "tree", 60, {"mocap": False}),
+        ("sphere", "ball", 50, {"mocap": False, "radius": 0.3}),
+        ("box", "crate", 30, {"size": (0.4, 0.3, 0.5)}),
+    ):
+        pos, quat = rng.uniform([-6, -6, 0.2], [6, 6, 3], (count, 3)), rng.normal(size=(count, 4))
+        sim.scene.add(what, name, count=count, pos=pos, quat=quat, **options)
+    placed(sim, [[[0, 0, 1.0], [1.5, 0.2, 1.2]]])
+    return sim
+
+
+@pytest.mark.parametrize("platform", [None, "cpu"])
+def test_each_of_many_equal_geoms_is_known_by_name(forest, rng, platform):
+    """The body that C MuJoCo's ray meets: one of 140, so that an index that is off by one shows."""
+    from crazysim.scene.rays import RayKernels, cast
+
+    n, sim = 500, forest
+    origin, direction = rng.uniform([-6, -6, 0.2], [6, 6, 3], (n, 3)), rng.normal(size=(n, 3))
+    direction[:30] = np.eye(3)[rng.integers(0, 3, 30)] * rng.choice([-1, 1], (30, 1))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    rays = [np.float32(x)[None] for x in (origin, direction)]
+    kernels = RayKernels(platform, strict=True)
+    hits = jax.jit(lambda data, *rays: cast(sim.scene.visual_model, data, *rays, drones=False, kernels=kernels))(
+        sim.data, *rays
+    )
+    sim.scene.sync_one(sim.data, 0)
+    geom, group, met = np.zeros(1, np.int32), np.array([1, 1, 0, 0, 0, 0], np.uint8), set()
+    for k in range(n):
+        far = mujoco.mj_ray(sim.mj_model, sim.mj_data, origin[k], direction[k], group, 1, -1, geom, None)
+        if far < 0:
+            assert not np.isfinite(hits.distance[0, k])
+            continue
+        body = sim.mj_model.body(sim.mj_model.body_rootid[sim.mj_model.geom_bodyid[geom[0]]])
+        assert hits.names[hits.number[0, k]] == (body.name if body.id else "floor")
+        assert hits.distance[0, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
+        met.add(body.name)
+    assert len(met) > 50
+    assert kernels.used.startswith("one kernel" if platform else "XLA")
+
+
+def test_explain_says_what_cast_the_rays_of_an_image(forest):
+    forest.depth("fpv_cam", 8, 6)
+    line = forest.explain().splitlines()[-1]
+    assert line.startswith(
+        "depth: one kernel with a lane for each ray; 111 fixed geoms in a hierarchy, 52 movable geoms"
+    )
+
+
+def test_rays_whose_kernel_is_refused_are_cast_by_xla_with_a_warning(monkeypatch):
+    sim = Sim()
+    sim.scene.add("wall", pos=[3, 0, 0], length=20, height=20)
+    placed(sim, [[[0, 0, 1]]])
+    expected = sim.depth("fpv_cam", 13, 9)
+    monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "1e-6")
+    looking = Sim()
+    looking.scene.add("wall", pos=[3, 0, 0], length=20, height=20)
+    placed(looking, [[[0, 0, 1]]])
+    with pytest.warns(EngineWarning, match="rays have no kernel: a kernel of .* lines takes .* longer"):
+        found = looking.depth("fpv_cam", 13, 9)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert "depth: XLA, without a kernel" in looking.explain()

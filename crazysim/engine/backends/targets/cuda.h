@@ -45,7 +45,7 @@ FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
 // Tables: constants, and the entry of one at index + k; where that is a multiple of four, also that and the next three.
 #define TABLE static __device__ const __align__(16)
 struct four { f32 x[4]; };
-template <class T> FN T lookup(const T* p, i32 index, i32 k) { return p[index + k]; }
+template <class T> FN T lookup(const T* p, i32 index, i32 k) { return (p + index)[k]; }
 FN four lookup_four(const f32* p, i32 index, i32 k) {
   const float4 v = __ldg((const float4*)(p + index + k));
   return {{v.x, v.y, v.z, v.w}};

@@ -387,7 +387,7 @@ template <class T> FN typename vec<T>::type load_row(const T* p, int n) {
 // Tables: constants, and the entry of one at index + k; where that is a multiple of four, also that and the next three.
 #define TABLE static const
 template <class V> struct four { V x[4]; };
-template <class T> FN T lookup(const T* p, i32 index, i32 k) { return p[index + k]; }
+template <class T> FN T lookup(const T* p, i32 index, i32 k) { return (p + index)[k]; }
 template <class T> FN typename vec<T>::type lookup(const T* p, i32v index, i32 k) {
   if (!any(ne_(index, index[0]))) return lift(p[index[0] + k]);  // drones that move alike
   typename vec<T>::type x;
