@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from crazysim.geometry.heightfield import height, spacing
@@ -115,7 +114,7 @@ def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     row = jnp.clip(jnp.floor(v + start * dv), 0, n_rows - 2).astype(jnp.int32)
     slack = 1e-5 if origin.x.dtype == jnp.float32 else 1e-10
 
-    def cell(_: Array, carry: tuple[Array, Array, Hit]) -> tuple[Array, Array, Hit]:
+    def cell(carry: tuple[Array, Array, Hit], _: None) -> tuple[tuple[Array, Array, Hit], None]:
         column, row, hit = carry
         inside = (column >= 0) & (column <= n_columns - 2) & (row >= 0) & (row <= n_rows - 2)
         i, j = jnp.clip(row, 0, n_rows - 2), jnp.clip(column, 0, n_columns - 2)
@@ -131,17 +130,18 @@ def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
             on = on & (right * (at_x - at_y) >= -slack) & meets & inside & (t >= 0)
             n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
             hit = _nearer((jnp.where(on, t, jnp.inf), n), hit)
+        step = jnp.int32(1)
         # Continue with the neighbour whose border is nearer.
         right, up = du > 0, dv > 0
         moves_x, moves_y = jnp.abs(du) > PARALLEL, jnp.abs(dv) > PARALLEL
         t_x = jnp.where(moves_x, (jnp.where(right, 1.0, 0.0) - x) / jnp.where(moves_x, du, 1.0), jnp.inf)
         t_y = jnp.where(moves_y, (jnp.where(up, 1.0, 0.0) - y) / jnp.where(moves_y, dv, 1.0), jnp.inf)
         by_x = t_x <= t_y
-        column = jnp.where(inside & by_x, column + jnp.where(right, 1, -1), column)
-        row = jnp.where(inside & ~by_x, row + jnp.where(up, 1, -1), row)
-        return column, row, hit
+        column = jnp.where(inside & by_x, column + jnp.where(right, step, -step), column)
+        row = jnp.where(inside & ~by_x, row + jnp.where(up, step, -step), row)
+        return (column, row, hit), None
 
     zero = jnp.zeros_like(origin.x)
     none = (zero + jnp.inf, Vector(zero, zero, zero + 1))
-    _, _, (t, n) = lax.fori_loop(np.int32(0), np.int32(n_rows + n_columns - 2), cell, (column, row, none))
+    (_, _, (t, n)), _ = lax.scan(cell, (column, row, none), length=n_rows + n_columns - 2)
     return t, unit(n, n)

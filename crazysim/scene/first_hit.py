@@ -184,10 +184,8 @@ class Targets:
         owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
         codes = np.stack([self.codes, np.array(owners, np.int32)], axis=1) if self.all else np.zeros((0, 2), np.int32)
         counts = np.array([[boxes.shape[1], len(self.fixed), len(self.movable)]], np.int32)
-        found = (
-            jnp.asarray(counts), jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), self.fixed_rows(dtype),
-            balls, geoms, eyes, pixels,
-        )  # fmt: skip
+        of_scene = jnp.asarray(counts), jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links)
+        found = (*of_scene, self.fixed_rows(dtype), balls, geoms, eyes, pixels)
         # No table is empty, since one of no rows has no memory.
         flat = [x.reshape(-1, x.shape[-1]) for x in found]
         return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
@@ -345,17 +343,18 @@ def _first_of_planes(shape: Shape, origin: Components, direction: Components) ->
     """Return the distance along one ray to a mesh, in a loop over its planes, as ``hit_distance`` has it, m. ()"""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
-    def turn(k: Array, found: Interval) -> Interval:
+    def turn(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:
+        k, (near, far, meets) = carry
         x, y, z, offset = table_rows(planes, k)
         below = offset - (x * origin[0] + y * origin[1] + z * origin[2])
         rises = x * direction[0] + y * direction[1] + z * direction[2]
         parallel = jnp.abs(rises) < PARALLEL
         t = below / jnp.where(parallel, 1.0, rises)
-        near, far, meets = found
         near = jnp.where(~parallel & (rises < 0) & (t > near), t, near)
         far = jnp.where(~parallel & (rises > 0) & (t < far), t, far)
-        return near, far, meets & ~(parallel & (below < 0))
+        return (k + 1, (near, far, meets & ~(parallel & (below < 0)))), None
 
     infinite = jnp.full_like(origin[0], jnp.inf)
-    near, far, meets = lax.fori_loop(np.int32(0), np.int32(len(planes)), turn, (-infinite, infinite, infinite > 0))
+    begin = jnp.int32(0), (-infinite, infinite, infinite > 0)
+    (_, (near, far, meets)), _ = lax.scan(turn, begin, length=len(planes))
     return first_of((near, far, meets & (near <= far)))
