@@ -60,7 +60,7 @@ def _results(*args: Any, kernels: MapKernels, n: int) -> list[jax.ShapeDtypeStru
 
 
 def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[Array]:
-    return kernels.on(platform)(n, np.zeros(1, np.int32), tables, kernels.results(n))
+    return kernels.on(platform)(n, jnp.zeros(1, np.int32), tables, kernels.results(n))
 
 
 map_p = jaxcompat.primitive_by_platform(

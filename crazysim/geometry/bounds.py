@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from crazysim.geometry.shapes import Shape
@@ -44,5 +46,5 @@ def bounding_radius(shape: Shape) -> float:
         case "capsule":
             return sum(shape.size)
         case "cylinder":
-            return float(np.hypot(*shape.size))
+            return math.hypot(*shape.size)
     return float(np.linalg.norm(bounding_box(shape)[1]))

@@ -224,8 +224,8 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     world = lax.div(view, jnp.int32(n_cameras))
     camera, pixel = view - world * n_cameras, index - view * n_pixels
     eye, (*look, passes) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
-    direction = [sum(eye[3 + 3 * k + i] * look[i] for i in range(3)) for k in range(3)]
-    ray = Ray((eye[0], eye[1], eye[2]), (direction[0], direction[1], direction[2]), passes.astype(jnp.int32))
+    x, y, z = (eye[k] * look[0] + eye[k + 1] * look[1] + eye[k + 2] * look[2] for k in (3, 6, 9))
+    ray = Ray((eye[0], eye[1], eye[2]), (x, y, z), passes.astype(jnp.int32))
     best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
 
     def visit(k: Array, geoms: Array, row: Array, meets: Array, best: Best) -> Best:
@@ -233,9 +233,9 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
         code, _ = table_rows(t.codes, k)
         return _nearer(surfaces, code, k, table_rows(geoms, row), ray, meets, best)
 
-    inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in direction]
+    inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
-    signs = [any_lane(d < 0) for d in direction]
+    signs = [any_lane(d < 0) for d in ray.direction]
     start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
 
     def walk(carry: tuple[Array, Best]) -> tuple[Array, Best]:

@@ -224,8 +224,10 @@ def cast_in_worlds(
         mine = (which >= 0) & (code == number)
         # A size for geoms of other kinds, so that their slopes are finite.
         shape = shape_of(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
-        is_field = isinstance(shape, Shape) and shape.kind == "hfield"
-        far, normal = ray_distance(shape, begin, way) if is_field else (hit_distance(shape, start, along), None)
+        if isinstance(shape, Shape) and shape.kind == "hfield":
+            far, normal = ray_distance(shape, begin, way)
+        else:
+            far, normal = hit_distance(shape, start, along), None
         exact = jnp.where(mine, far, exact)
         found.append((mine, shape, normal))
     distance, across = _with_derivative_of(distance, exact), jnp.zeros_like(origin)
