@@ -51,7 +51,8 @@ def main() -> None:
 
 def processor_seconds(look: Callable[[], Array]) -> float:
     """Return the time that all threads of this process compute for an image, which other work on the machine disturbs
-    less than the time by the clock."""
+    less than the time by the clock.
+    """
     begin = time.process_time()
     jax.block_until_ready(look())
     return time.process_time() - begin

@@ -1,4 +1,4 @@
-"""What a function of one element can do where many elements are computed side by side."""
+"""Branches and tables for functions of one element that engines compute for many elements side by side."""
 
 from __future__ import annotations
 

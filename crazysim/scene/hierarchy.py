@@ -1,6 +1,6 @@
 """Bounding volume hierarchy of geoms that do not move, as a table that a ray walks without a stack.
 
-Nodes follow each other in the order of a visit, and each has the place behind its subtree, where a ray goes on that
+Nodes follow each other in the order of a visit, and each has the place behind its subtree, where a ray continues that
 misses its box. There is an order for each of the eight octants of directions, so that what is nearer comes first.
 """
 
