@@ -23,17 +23,25 @@ Layers = list[tuple[Array, Array]]
 
 
 def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
-    """Return layers with orthogonal weights and zero biases.
+    """Return layers with uniformly distributed weights and zero biases.
+
+    Their variance is that of the entries of orthogonal matrices, scale^2 / max(n_in, n_out), which take longer to trace
+    and compile than one draw of all weights.
 
     Args:
         key: Random key.
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
         last_scale: Scale of the weights of the last layer; small for a policy, so that it starts near the zero action.
+            That of the others is the root of 2.
     """
-    keys = jax.random.split(key, len(sizes) - 1)
-    scales = [np.sqrt(2.0)] * (len(sizes) - 2) + [last_scale]
-    pairs = zip(keys, itertools.pairwise(sizes), scales, strict=True)
-    return [(jax.nn.initializers.orthogonal(scale)(k, pair), jnp.zeros(pair[1])) for k, pair, scale in pairs]
+    pairs = list(itertools.pairwise(sizes))
+    ends = np.cumsum([n_in * n_out for n_in, n_out in pairs])
+    parts = jnp.split(jax.random.uniform(key, (ends[-1],), minval=-1.0, maxval=1.0), ends[:-1])
+    scales = [np.sqrt(2.0)] * (len(pairs) - 1) + [last_scale]
+    return [
+        (scale * np.sqrt(3.0 / max(n_in, n_out)) * x.reshape(n_in, n_out), jnp.zeros(n_out))
+        for x, (n_in, n_out), scale in zip(parts, pairs, scales, strict=True)
+    ]
 
 
 def mlp(layers: Layers, x: Array) -> Array:
