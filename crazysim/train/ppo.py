@@ -14,7 +14,7 @@ from jax import Array
 
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, bare, flatten
-from crazysim.envs.statistics import RunningStats
+from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
@@ -65,11 +65,13 @@ class Learner(PyTree):
     log_std: Array
     """Logarithm of the standard deviation of the actions. (n_actions,)"""
     value: Layers
-    """Network from normalised observations to the expected return."""
+    """Network from normalised observations to the normalised expected return."""
     optimizer: optax.OptState
     """State of the optimiser."""
     stats: RunningStats
     """Mean and variance with which observations are normalised."""
+    returns: RunningStats
+    """Mean and variance of returns, with which the outputs of the value network are scaled. (1,) each"""
     key: Array
     """Random key."""
     env: EnvState
@@ -120,7 +122,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
     optimizer = _optimizer(config).init((policy, log_std, value))
     stats = RunningStats.create(n_obs).update(flatten(state.obs))
-    return Learner(policy, log_std, value, optimizer, stats, key, bare(state), jnp.int32(0))
+    return Learner(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, bare(state), jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
@@ -131,13 +133,15 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     """
     key, k_fly, k_learn = jax.random.split(learner.key, 3)
     state, samples, raw, metrics = _collect(learner, env, config, k_fly)
-    advantages, returns = _advantages(samples, _value(learner.value, learner.stats, state.obs), config)
-    parameters = (learner.policy, learner.log_std, learner.value)
-    parameters, optimizer, losses = _learn(parameters, learner.optimizer, samples, advantages, returns, config, k_learn)
+    advantages, targets = _advantages(samples, _value(learner, learner.stats.normalize(flatten(state.obs))), config)
+    returns = learner.returns.update(targets[..., None])
+    targets = (targets - returns.mean) / _scale(returns)
+    parameters = (learner.policy, learner.log_std, _rescaled(learner.value, learner.returns, returns))
+    parameters, optimizer, losses = _learn(parameters, learner.optimizer, samples, advantages, targets, config, k_learn)
     policy, log_std, value = parameters
     stats = learner.stats.update(raw)
-    finite = all_finite((parameters, optimizer, stats, losses))
-    learner = Learner(policy, log_std, value, optimizer, stats, key, state, learner.iteration + 1)
+    finite = all_finite((parameters, optimizer, stats, returns, losses))
+    learner = Learner(policy, log_std, value, optimizer, stats, returns, key, state, learner.iteration + 1)
     return learner, metrics | losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
 
 
@@ -149,11 +153,11 @@ def _collect(
     def step(state: EnvState, key: Array) -> tuple[EnvState, tuple[Sample, Array, Any]]:
         raw = flatten(state.obs)
         obs = learner.stats.normalize(raw)
-        mean, value = jnp.tanh(mlp(learner.policy, obs)), mlp(learner.value, obs)[..., 0]
+        mean, value = jnp.tanh(mlp(learner.policy, obs)), _value(learner, obs)
         action = mean + jnp.exp(learner.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
         state = env.step(state, action)
         truncated = (state.truncated & ~state.terminated)[:, None]
-        final_value = _value(learner.value, learner.stats, state.info["final_obs"])
+        final_value = _value(learner, learner.stats.normalize(flatten(state.info["final_obs"])))
         reward = state.reward + config.discount * jnp.where(truncated, final_value, 0.0)
         over = jnp.broadcast_to(state.done[:, None], reward.shape)
         sample = Sample(obs, action, _log_prob(mean, learner.log_std, action), value, reward, over)
@@ -187,10 +191,10 @@ def _advantages(samples: Sample, last: Array, config: Config) -> tuple[Array, Ar
 
 
 def _learn(
-    parameters: Any, optimizer: Any, samples: Sample, advantages: Array, returns: Array, config: Config, key: Array
+    parameters: Any, optimizer: Any, samples: Sample, advantages: Array, targets: Array, config: Config, key: Array
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after the updates on a rollout."""
-    data = (samples.obs, samples.action, samples.log_prob, advantages, returns)
+    data = (samples.obs, samples.action, samples.log_prob, advantages, targets)
     data = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), data)
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
@@ -224,8 +228,21 @@ def _optimizer(config: Config) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
 
 
-def _value(layers: Layers, stats: RunningStats, obs: dict[str, Array]) -> Array:
-    return mlp(layers, stats.normalize(flatten(obs)))[..., 0]
+def _value(learner: Learner, obs: Array) -> Array:
+    """Return the expected return for normalised observations. (..., n_obs) -> (...)"""
+    return mlp(learner.value, obs)[..., 0] * _scale(learner.returns) + learner.returns.mean
+
+
+def _scale(returns: RunningStats) -> Array:
+    """Return the standard deviation of returns. (1,)"""
+    return jnp.sqrt(returns.var + EPSILON)
+
+
+def _rescaled(layers: Layers, old: RunningStats, new: RunningStats) -> Layers:
+    """Return the value network whose outputs, scaled by new statistics, are what they were with the old ones."""
+    *hidden, (weight, bias) = layers
+    ratio = _scale(old) / _scale(new)
+    return [*hidden, (weight * ratio, bias * ratio + (old.mean - new.mean) / _scale(new))]
 
 
 def _log_prob(mean: Array, log_std: Array, action: Array) -> Array:

@@ -36,6 +36,8 @@ from crazysim.train.networks import Policy
 CHECKPOINT, POLICY, CURVE = "checkpoint.npz", "policy.npz", "curve.json"
 """Names of the files of a run."""
 
+CHECK = 0xC4EC
+"""Seed of the initial states on which the policy to keep is chosen; see ``HELD_OUT``."""
 Learner = ppo.Learner | apg.Learner
 """State of a training run."""
 
@@ -47,10 +49,11 @@ class TrainResult:
     folder: Path
     """Folder of the files of the run."""
     metrics: dict[str, float]
-    """Metrics of ``evaluate`` on held-out initial states; ``seconds`` in all and ``compile_seconds`` of them, s;
+    """Metrics of ``evaluate`` for the kept policy on held-out initial states; ``round``, iteration that it is of;
+    ``check``, its success on the check set; of the whole run ``seconds``, ``compile_seconds`` of them, s, and
     ``env_steps``, environment steps of all drones."""
     policy: Policy
-    """Trained policy."""
+    """Kept policy: of those that were evaluated, the one with most successes on the check set, the latest of equals."""
     env: DroneEnv
     """Environment of the evaluations, without automatic resets."""
 
@@ -65,6 +68,9 @@ def train(
 ) -> TrainResult:
     """Train a policy and write checkpoint, learning curve and policy into a folder.
 
+    Every evaluation flies two sets of initial states that are not trained on. The success on the check set decides
+    which policy is kept; the held-out set gives the figures, and decides nothing.
+
     An interrupt (Ctrl-C) writes a checkpoint first. A resumed run is bit for bit the same as an uninterrupted one on
     the same machine.
 
@@ -72,7 +78,7 @@ def train(
         config: Configuration of the run.
         folder: Folder of the run.
         resume: True to continue from the checkpoint in the folder.
-        evaluation_worlds: Number of held-out initial states of each evaluation.
+        evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
         progress: True to show a progress bar, if tqdm is installed.
 
@@ -88,6 +94,7 @@ def train(
     evaluation_worlds = positive("evaluation_worlds", evaluation_worlds)
     meta = _meta(config)
     stored, curve, code = _stored(path, config) if resume else ({}, [], meta["code"])
+    check_key = jax.random.key(CHECK)
     if path.exists() and not resume:
         raise ConfigError(
             f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
@@ -102,14 +109,21 @@ def train(
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
     init = jax.jit(algorithm.init, static_argnums=(0, 1))
     shapes = init.eval_shape(env, hyperparameters, key)
+    kept_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     _make_folder(folder)
 
-    def start() -> tuple[Learner, dict[str, float]]:
+    def start() -> tuple[Learner, Policy]:
         if resume:
-            learner = jax.device_put(checkpoint.restore(path, stored, shapes), base.sim.device)
-        else:
-            learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
-        return learner, evaluate(eval_env, learner.as_policy())
+            files = checkpoint.restore(path, stored, {"learner": shapes, "kept": kept_shapes})
+            files = jax.device_put(files, base.sim.device)
+            return files["learner"], files["kept"]
+        learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
+        return learner, learner.as_policy()
+
+    def compile_evaluation() -> dict[str, Any]:
+        zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), kept_shapes)
+        evaluate(eval_env, jax.device_put(zeros, base.sim.device))
+        return describe(base)
 
     def compile_iteration() -> tuple[Any, float]:
         compiling = time.perf_counter()
@@ -117,9 +131,10 @@ def train(
         return compiled, time.perf_counter() - compiling
 
     # Each compiles for seconds, mostly on one core.
-    with announced("compiling the training", "5 to 20 s"), compiling_threads(2) as pool:
-        starting, compiling = pool.submit(start), pool.submit(compile_iteration)
-        (learner, metrics), (iterate, compile_s) = starting.result(), compiling.result()
+    with announced("compiling the training", "5 to 20 s"), compiling_threads(3) as pool:
+        compiling, starting, evaluating = map(pool.submit, (compile_iteration, start, compile_evaluation))
+        (learner, kept), description = starting.result(), evaluating.result()
+        iterate, compile_s = compiling.result()
     done, seconds_before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0
     steps_per_iteration = config.n_worlds * base.sim.n_drones * hyperparameters.n_steps
     log(
@@ -132,32 +147,38 @@ def train(
     if done >= hyperparameters.iterations:
         log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
 
-    def record(learner: Learner, metrics: dict[str, float] | None = None) -> dict[str, float]:
-        """Evaluate the policy, and write policy, learning curve and checkpoint."""
-        iteration = int(learner.iteration)
+    def record(learner: Learner, interrupted: bool = False) -> dict[str, Any]:
+        """Evaluate the policy, keep it if none was better, write policy, curve and checkpoint, and return the point."""
+        nonlocal kept
+        iteration, policy = int(learner.iteration), learner.as_policy()
         require_finite(finite, iteration)
-        metrics = metrics or evaluate(eval_env, learner.as_policy())
+        metrics, check = evaluate(eval_env, policy), evaluate(eval_env, policy, check_key)["success"]
+        curve[:] = [earlier for earlier in curve if earlier["round"] < iteration]
         seconds = seconds_before + time.perf_counter() - started
         point = {"round": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
-        point["compile_seconds"] = compile_s
-        curve[:] = [*(earlier for earlier in curve if earlier["round"] < iteration), point]
-        checkpoint.save(path, learner, meta | {"curve": curve})
-        save_policy(folder / POLICY, learner.as_policy(), base, config)
+        point |= {"compile_seconds": compile_s, "check": check}
+        point["kept"] = not curve or check >= kept_point(curve)["check"]
+        best = policy if point["kept"] else kept
+        checkpoint.save(folder / POLICY, best, meta | description)
         with replacing(folder / CURVE) as file:
-            file.write(json.dumps(curve, indent=1).encode())
+            file.write(json.dumps([*curve, point], indent=1).encode())
+        # A run without the interruption makes no evaluation here, so it decides nothing in the resumed run.
+        kept, point["kept"] = (kept, False) if interrupted else (best, point["kept"])
+        curve.append(point)
+        checkpoint.save(path, {"learner": learner, "kept": kept}, meta | {"curve": curve})
         return point
 
     def require_finite(finite: Array | bool, iteration: int) -> None:
         if not finite:
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
-                f"by {config.algorithm}; {path} and {POLICY} are those of iteration {curve[-1]['round']}. Use a "
-                f"smaller learning_rate or max_grad_norm, with another --out."
+                f"by {config.algorithm}; {path} is that of iteration {curve[-1]['round']}, {POLICY} that of iteration "
+                f"{kept_point(curve)['round']}. Use a smaller learning_rate or max_grad_norm, with another --out."
             )
 
     finite: Array | bool = True
     if not resume:
-        record(learner, metrics)
+        record(learner)
     every = RECIPES.get(config.task, Recipe()).evaluate_every
     try:
         with _bar(hyperparameters.iterations, done, progress) as show:
@@ -170,28 +191,32 @@ def train(
                     show(record(learner), 0)
     except KeyboardInterrupt:
         jax.block_until_ready(learner)
-        record(learner)
+        record(learner, interrupted=True)
         log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
         raise
-    point = record(learner)
+    last = record(learner)
+    best = kept_point(curve)
+    if best is not last:
+        log(f"kept the policy of iteration {best['round']}, which did best on {evaluation_worlds:,} other starts")
+    point = best | {name: last[name] for name in ("env_steps", "seconds", "compile_seconds")}
     log(
         f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
         f"{base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s), "
         f"{outcome(point, base.task.unit)}; "
         f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
     )
-    return TrainResult(folder, point, learner.as_policy(), eval_env)
+    return TrainResult(folder, point, kept, eval_env)
+
+
+def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the point of a learning curve whose policy was kept, the last of them."""
+    return next(point for point in reversed(curve) if point["kept"])
 
 
 def _on_device(shapes: Learner, device: jax.Device) -> Learner:
     """Return the shapes with a device attached."""
     place = jax.sharding.SingleDeviceSharding(device)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
-
-
-def save_policy(path: Path, policy: Policy, env: DroneEnv, config: TrainConfig) -> None:
-    """Write a policy with the description of its inputs and outputs."""
-    checkpoint.save(path, policy, _meta(config) | describe(env))
 
 
 def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, TrainConfig, dict[str, Any]]:

@@ -18,7 +18,7 @@ import crazysim
 from crazysim import ConfigError
 from crazysim.__main__ import main
 from crazysim.envs import AutoReset, DroneEnv, make
-from crazysim.envs.state import bare
+from crazysim.envs.state import bare, flatten
 from crazysim.envs.tasks.hover import Hover
 from crazysim.errors import DamagedFileError, DivergedError, UnknownNameError
 from crazysim.pytree import PyTree
@@ -102,6 +102,27 @@ def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     for name, x in mine.items():
         np.testing.assert_array_equal(x, others[name], err_msg=name)
     assert [p["round"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
+
+
+def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch):
+    """A learning rate that ruins the policy leaves a better one, also for a run that is resumed after an interrupt."""
+    monkeypatch.setitem(configs.RECIPES, "hover", configs.Recipe(evaluate_every=1))
+    config = small_config(
+        options={"seconds": 1.2, "tolerance": 1.5, "hold": 0.1}, config=SMALL | {"iterations": 8, "learning_rate": 1.0}
+    )
+    lines = []
+    result = train(config, tmp_path, evaluation_worlds=64, log=lines.append, progress=False)
+    curve = read_curve(tmp_path)
+    checks = [point["check"] for point in curve]
+    assert max(checks) > checks[-1]
+    best = max(i for i, check in enumerate(checks) if check == max(checks))
+    assert [i for i, point in enumerate(curve) if point["kept"]][-1] == best
+    assert f"kept the policy of iteration {best}, which did best on 64 other starts" in lines
+    assert result.metrics["success"] == curve[best]["success"]
+    assert result.metrics["env_steps"] == curve[-1]["env_steps"]
+    for policy in (result.policy, load_policy(tmp_path)[0]):
+        assert evaluate(result.env, policy, jax.random.key(runs.CHECK))["success"] == max(checks)
+        assert evaluate(result.env, policy)["success"] == result.metrics["success"]
 
 
 def test_iterations_change_the_policy_and_seeds_differ(whole, tmp_path):
@@ -375,13 +396,26 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     n_truncated = 0
     for k in range(4):
         state = step(state, samples.action[k])
-        value = ppo._value(learner.value, learner.stats, state.info["final_obs"])
+        value = ppo._value(learner, learner.stats.normalize(flatten(state.info["final_obs"])))
         truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
         n_truncated += truncated.sum()
         np.testing.assert_allclose(samples.reward[k], state.reward + 0.5 * truncated * value, atol=1e-5)
         assert np.abs(value).min() > 1e-3
         state = bare(state)
     assert n_truncated == 4
+
+
+def test_values_stay_when_the_returns_that_scale_them_change(rng):
+    """The last layer takes the change, so that the network predicts the same returns in other units."""
+    env = AutoReset(make("hover", 4, engine="interpret"))
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, ppo.Config(hidden=(8,)), jax.random.key(0))
+    obs = jnp.asarray(rng.normal(size=(5, learner.stats.mean.shape[0])), jnp.float32)
+    before = ppo._value(learner, obs)
+    returns = learner.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
+    after = learner.replace(value=ppo._rescaled(learner.value, learner.returns, returns), returns=returns)
+    np.testing.assert_allclose(ppo._value(after, obs), before, atol=30 * 1e-6)
+    assert np.abs(ppo._value(learner.replace(returns=returns), obs) - before).min() > 1
+    np.testing.assert_allclose(ppo._scale(returns), 7.0, rtol=0.1)
 
 
 def test_ppo_finds_the_action_that_pays():
