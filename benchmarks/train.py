@@ -1,9 +1,11 @@
 """Training results: several seeds per task, evaluated on held-out initial states, with wall time.
 
     python benchmarks/train.py [--device gpu] [--tasks hover recover track race] [--seeds 0 1 2 3 4] [--out out/train]
+                               [--parallel 1]
 
 Each training runs in its own process, like ``crazysim train``, so its time includes imports, building, compilation and
-evaluation. One JSON line each; ``--plot FILE`` plots all learning curves.
+evaluation. One JSON line each, and one with the success of all seeds of a task and its quantiles; ``--plot FILE`` plots
+all learning curves. ``--parallel 12`` runs twelve trainings at a time, which changes their times alone.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import argparse
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ import numpy as np
 from measure import digits, report
 
 from crazysim.train.show import read_curve
+from crazysim.train.training import kept_point
 
 
 def main() -> None:
@@ -27,16 +31,18 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["hover", "recover", "track", "race"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--out", type=Path, default=Path("out/train"), help="folder of the runs")
+    parser.add_argument("--parallel", type=int, default=1, help="trainings that run at a time")
     parser.add_argument("--plot", type=Path, help="image of the learning curves")
-    parser.add_argument("--only-plot", action="store_true", help="plot existing runs without training")
+    parser.add_argument("--only-plot", action="store_true", help="plot and summarise existing runs without training")
     args = parser.parse_args()
-    curves: dict[str, list[Any]] = {task: [] for task in args.tasks}
+    folders = {(task, seed): args.out / f"{task}-{args.device}-{seed}" for task in args.tasks for seed in args.seeds}
+    if not args.only_plot:
+        with ThreadPoolExecutor(args.parallel) as pool:
+            for run in [pool.submit(train, *key, folder, args.device) for key, folder in folders.items()]:
+                run.result()
+    curves = {task: [read_curve(folders[task, seed]) for seed in args.seeds] for task in args.tasks}
     for task in args.tasks:
-        for seed in args.seeds:
-            folder = args.out / f"{task}-{args.device}-{seed}"
-            if not args.only_plot:
-                train(task, seed, folder, args.device)
-            curves[task].append(read_curve(folder))
+        summary(task, curves[task], args.device, args.parallel)
     if args.plot is not None:
         plot(curves, args.plot)
 
@@ -68,7 +74,7 @@ def train(task: str, seed: int, folder: Path, device: str) -> None:
     if done.returncode:
         raise SystemExit(f"training {task} failed: {done.stderr[-2000:]}")
     curve = read_curve(folder)
-    point = curve[-1]
+    point, last = kept_point(curve), curve[-1]
     solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
     report(
         device,
@@ -78,11 +84,32 @@ def train(task: str, seed: int, folder: Path, device: str) -> None:
         success=round(point["success"], 4),
         crashed=round(point["crashed"], 4),
         error=digits(point["error"]) if point["error"] == point["error"] else None,
-        env_steps=point["env_steps"],
-        seconds=digits(point["seconds"]),
-        compile_seconds=digits(point["compile_seconds"]),
+        kept_iteration=point["round"],
+        env_steps=last["env_steps"],
+        seconds=digits(last["seconds"]),
+        compile_seconds=digits(last["compile_seconds"]),
         seconds_to_95_percent=None if solved is None else digits(solved),
         wall_s=digits(wall_s),
+    )
+
+
+def summary(task: str, curves: list[Any], device: str, parallel: int) -> None:
+    """Print the success of all seeds of a task, sorted, with quantiles, and medians of error and time."""
+    points = [kept_point(curve) for curve in curves]
+    success = sorted(round(point["success"], 4) for point in points)
+    shares = (0, 0.1, 0.25, 0.5, 1)
+    error = np.nanquantile([point["error"] for point in points], shares)
+    report(
+        device,
+        benchmark="train_seeds",
+        task=task,
+        parallel=parallel,
+        success=success,
+        quantiles=shares,
+        success_quantiles=np.quantile(success, shares).round(4).tolist(),
+        error_quantiles=[digits(float(x)) for x in error],
+        seconds=digits(float(np.median([curve[-1]["seconds"] for curve in curves]))),
+        env_steps=curves[0][-1]["env_steps"],
     )
 
 

@@ -217,15 +217,22 @@ def test_every_script_explains_itself(script, run, capsys):
     assert "--device" in capsys.readouterr().out
 
 
-def test_learning_curves_of_several_seeds_are_drawn(run, tmp_path):
+def test_learning_curves_of_several_seeds_are_drawn_and_summarised(run, tmp_path):
+    """The figures are those of the kept policies."""
     plt = pytest.importorskip("matplotlib.pyplot")
     for seed, success in enumerate((0.0, 1.0)):
         folder = tmp_path / f"hover-cpu-{seed}"
         folder.mkdir()
-        curve = [{"seconds": 5.0, "success": 0.0}, {"seconds": 9.0, "success": success}]
+        first = {"seconds": 5.0, "success": 0.5, "error": 0.2, "env_steps": 10, "kept": True}
+        curve = [first, first | {"seconds": 9.0, "success": success, "env_steps": 20, "kept": success > 0.5}]
         (folder / "curve.json").write_text(json.dumps(curve))
     picture = tmp_path / "curves.png"
-    run("train.py", "--only-plot", "--tasks", "hover", "--seeds", "0", "1", "--out", tmp_path, "--plot", picture)
+    (line,) = run(
+        "train.py", "--only-plot", "--tasks", "hover", "--seeds", "0", "1", "--out", tmp_path, "--plot", picture
+    )
+    assert line["success"] == [0.5, 1.0]
+    np.testing.assert_allclose(line["success_quantiles"], [0.5, 0.55, 0.625, 0.75, 1.0])
+    assert line["env_steps"] == 20
     pixels = (plt.imread(picture)[..., :3].reshape(-1, 3) * 255).round()
     for color in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two, a line for each seed; smoothed
         assert (np.abs(pixels - color).max(axis=-1) < 40).sum() > 20, color

@@ -45,9 +45,20 @@ RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80}),
     "recover": Recipe(config={"iterations": 150}),
     "race": Recipe(
-        n_worlds=4096,
-        config={"iterations": 150, "entropy": 0.01, "init_std": 0.7},
+        n_worlds=2048,
+        config={"iterations": 150, "n_steps": 64, "minibatches": 16, "entropy": 0.01, "init_std": 0.7},
         practice={"practice": True},
+    ),
+    "avoid": Recipe(
+        n_worlds=2048,
+        config={
+            "iterations": 150,
+            "n_steps": 64,
+            "minibatches": 16,
+            "hidden": (128, 128),
+            "learning_rate": 2e-3,
+            "discount": 0.998,
+        },
     ),
     "transport": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
     "chase": Recipe(config={"iterations": 200, "discount": 0.99}),

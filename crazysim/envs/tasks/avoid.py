@@ -37,6 +37,9 @@ HEIGHT = 2.0
 """Height of poles and ceiling, m."""
 JITTER = 0.15
 """Largest component of the distance of starts and goals from their places, m."""
+CRUISE = 2.5
+"""Speed above which flying faster costs reward, m/s: from there a drone whose actions tilt it by at most 45 degrees, which
+brakes with g, stops within v^2 / 2 g = 0.32 m, less than half a cell."""
 SPACING = 0.6
 """Distance between the starts, and between the goals, of several drones, m."""
 
@@ -203,12 +206,14 @@ class Avoid(Task):
         return obs
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress and the outcome, and costs of flying close to obstacles, turning and changing actions."""
+        """Return progress and the outcome, and costs of flying close to obstacles or fast, turning, changing actions."""
         own = crossing_of(data)
         gap = rotation.safe_norm(self.seen(data)[..., 0, :])[..., 0]
+        speed = rotation.safe_norm(data.states.vel)[..., 0]
         paid = {
             "progress": 2.0 * (own.to_go_before - self.error(data)),
             "closeness": -0.05 * jnp.exp(-10 * gap),
+            "haste": -0.1 * jnp.maximum(speed - CRUISE, 0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "reached": 10.0 * own.reached,
