@@ -132,7 +132,8 @@ def train(
 
     # Each compiles for seconds, mostly on one core.
     with announced("compiling the training", "5 to 20 s"), compiling_threads(3) as pool:
-        compiling, starting, evaluating = map(pool.submit, (compile_iteration, start, compile_evaluation))
+        compiling, starting = pool.submit(compile_iteration), pool.submit(start)
+        evaluating = pool.submit(compile_evaluation)
         (learner, kept), description = starting.result(), evaluating.result()
         iterate, compile_s = compiling.result()
     done, seconds_before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0

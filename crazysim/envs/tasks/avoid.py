@@ -38,8 +38,8 @@ HEIGHT = 2.0
 JITTER = 0.15
 """Largest component of the distance of starts and goals from their places, m."""
 CRUISE = 2.5
-"""Speed above which flying faster costs reward, m/s: from there a drone whose actions tilt it by at most 45 degrees, which
-brakes with g, stops within v^2 / 2 g = 0.32 m, less than half a cell."""
+"""Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so it brakes with up
+to g, and stops from there within v^2 / 2 g = 0.32 m, less than half a cell."""
 SPACING = 0.6
 """Distance between the starts, and between the goals, of several drones, m."""
 
@@ -206,7 +206,7 @@ class Avoid(Task):
         return obs
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress and the outcome, and costs of flying close to obstacles or fast, turning, changing actions."""
+        """Return progress and the outcome, and costs of flying close, fast, of turning, and of changing actions."""
         own = crossing_of(data)
         gap = rotation.safe_norm(self.seen(data)[..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
