@@ -1,5 +1,6 @@
 """Training runs: they learn, resume bit for bit, and refuse checkpoints of other configurations."""
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -69,33 +70,33 @@ def arrays(folder):
         return {name: file[name] for name in file.files if name != checkpoint.META}
 
 
+@contextlib.contextmanager
+def interrupted_after(iterations, monkeypatch):
+    """Press Ctrl-C after some iterations."""
+    shown = [0]
+
+    @contextlib.contextmanager
+    def bar(*_):
+        def show(*_):
+            shown[0] += 1
+            if shown[0] == iterations:
+                raise KeyboardInterrupt
+
+        yield show
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runs, "_bar", bar)
+        yield
+
+
 def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     """Interrupted after two of four iterations and resumed, a run ends with the arrays of an uninterrupted one."""
-    shown, real = [0], runs._bar
-
-    def interrupting(*args):
-        class Bar:
-            def __enter__(self):
-                return self.show
-
-            def __exit__(self, *_):
-                return False
-
-            def show(self, *_):
-                shown[0] += 1
-                if shown[0] == 2:
-                    raise KeyboardInterrupt
-
-        return Bar()
-
     lines = []
-    monkeypatch.setattr(runs, "_bar", interrupting)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_after(2, monkeypatch), pytest.raises(KeyboardInterrupt):
         train(small_config(), tmp_path, evaluation_worlds=8, log=lines.append, progress=False)
     assert "interrupted after iteration 2" in lines[-1]
     assert str(tmp_path / CHECKPOINT) in lines[-1]
     assert "--resume" in lines[-1]
-    monkeypatch.setattr(runs, "_bar", real)
     trained(tmp_path, small_config(), resume=True)
     mine, others = arrays(tmp_path), arrays(whole.folder)
     assert mine.keys() == others.keys()
@@ -105,10 +106,11 @@ def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
 
 
 def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch):
-    """A learning rate that ruins the policy leaves a better one, also for a run that is resumed after an interrupt."""
+    """A learning rate that ruins the policy leaves a better one. An interrupt writes the best until then, but does not
+    change what an uninterrupted run keeps, which evaluates less often."""
     monkeypatch.setitem(configs.RECIPES, "hover", configs.Recipe(evaluate_every=1))
     config = small_config(
-        options={"seconds": 1.2, "tolerance": 1.5, "hold": 0.1}, config=SMALL | {"iterations": 8, "learning_rate": 1.0}
+        options={"seconds": 1.2, "tolerance": 1.5, "hold": 0.1}, config=SMALL | {"iterations": 8, "learning_rate": 0.03}
     )
     lines = []
     result = train(config, tmp_path, evaluation_worlds=64, log=lines.append, progress=False)
@@ -123,6 +125,17 @@ def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch
     for policy in (result.policy, load_policy(tmp_path)[0]):
         assert evaluate(result.env, policy, jax.random.key(runs.CHECK))["success"] == max(checks)
         assert evaluate(result.env, policy)["success"] == result.metrics["success"]
+    assert 0 < best < 8
+    monkeypatch.setitem(configs.RECIPES, "hover", configs.Recipe(evaluate_every=8))
+    whole, cut = (tmp_path / name for name in ("whole", "cut"))
+    train(config, whole, evaluation_worlds=64, log=quiet, progress=False)
+    with interrupted_after(best, monkeypatch), pytest.raises(KeyboardInterrupt):
+        train(config, cut, evaluation_worlds=64, log=quiet, progress=False)
+    assert evaluate(result.env, load_policy(cut)[0], jax.random.key(runs.CHECK))["success"] == max(checks)
+    train(config, cut, resume=True, evaluation_worlds=64, log=quiet, progress=False)
+    mine, others = arrays(cut), arrays(whole)
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
 
 
 def test_iterations_change_the_policy_and_seeds_differ(whole, tmp_path):
