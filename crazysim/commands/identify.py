@@ -36,7 +36,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
     add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
-    add("--iterations", type=int, default=3000, metavar="N", help="iterations of that training")
+    add("--iterations", type=int, default=1000, metavar="N", help="iterations of that training")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
     add("--columns", nargs="+", default=[], metavar="FIELD=NAMES", help="columns, such as time=s pos=px,py,pz")
 
