@@ -141,7 +141,8 @@ def load(path: str) -> ctypes.CDLL:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
     missing = [name for name in FUNCTIONS if not hasattr(library, name)]
     if missing:
-        raise ConfigError(f"expected the functions {', '.join(FUNCTIONS)} in {path}, got none of {missing}. {remedy}")
+        needed, lacking = ", ".join(FUNCTIONS), ", ".join(missing)
+        raise ConfigError(f"expected the functions {needed} in {path}, got no {lacking}. {remedy}")
     if (version := library.crazysim_version()) != VERSION:
         raise ConfigError(f"expected version {VERSION} of firmware.h in {path}, got {version}. {remedy}")
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t

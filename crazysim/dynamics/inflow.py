@@ -34,9 +34,9 @@ def blade_coefficient(
 
     A rotor that climbs at a velocity u loses thrust, but its induced velocity falls too. In hover, ``T = 2 rho A v^2``
     and ``T = B - b omega (u + v)`` have the slope ``dT/du = -d`` with ``b omega = 2 d y / (y - d)`` and ``y = T / v``:
-    d cannot exceed y, that of blades without limit. For blades of constant chord and pitch ``b = rho A R sigma a / 4``
-    with solidity sigma and lift slope a (the coefficient of inflow in ``C_T = sigma a / 2 (theta / 3 - lambda / 2)``).
-    The result is negative or infinite where there is none.
+    d cannot exceed y, the limit for a lift slope without bound. For blades of constant chord and pitch
+    ``b = rho A R sigma a / 4`` with solidity sigma and lift slope a (the coefficient of inflow in
+    ``C_T = sigma a / 2 (theta / 3 - lambda / 2)``). The result is negative or infinite where there is none.
 
     Args:
         slope: Loss of thrust per axial velocity of the hovering rotor, d, N s/m.

@@ -5,7 +5,7 @@ no simple model predicts them to some percent. A fit of long predictions therefo
 that are far too large, which make the prediction insensitive to its torques. Fast rotation does not have this problem:
 above some hertz the torque of the rotors turns the body. So both sides of the equation of motion are band-passed.
 
-Telemetry of rotor speeds is held, quantised and late, which makes a regression on it too small (errors in variables).
+Telemetry of rotor speeds is held, quantised and late, which biases coefficients towards zero (errors in variables).
 Commands are free of that: where a log has them, they are the instruments of two-stage least squares.
 """
 

@@ -52,7 +52,7 @@ class Flight:
         return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
 
     def lag(self, pos: NDArray) -> float:
-        """Return the delay of the setpoint at which positions, (n, 3), are closest to it horizontally, s."""
+        """Return the lag behind the setpoint at which positions, (n, 3), are closest to it horizontally, s."""
         first, last = self.compared.start, self.compared.stop
 
         def distance(k: int) -> float:
@@ -72,11 +72,11 @@ class Comparison:
     simulated: float
     """The same in the simulation, m."""
     logged_lag: float
-    """Delay behind the setpoint in the log, s."""
+    """Lag behind the setpoint in the log, s."""
     simulated_lag: float
     """The same in the simulation, s."""
     failed: bool
-    """True where the real drone got ``LOST``."""
+    """True if the real drone was farther than ``LOST`` from its setpoint."""
 
     @property
     def ratio(self) -> float:
@@ -93,7 +93,7 @@ def read_flight(path: str | Path) -> Flight:
     path = Path(path)
     with np.load(path, allow_pickle=False) as file:
         if missing := [name for name in COLUMNS if name not in file.files]:
-            raise ConfigError(f"{path.name}: expected columns {', '.join(COLUMNS)}, got none of {', '.join(missing)}")
+            raise ConfigError(f"{path.name}: expected columns {', '.join(COLUMNS)}, got no {', '.join(missing)}")
         t = np.asarray(file["t"], np.float64)
         logged, given = (np.stack([file[k] for k in names]).astype(np.float64) for names in (COLUMNS[1:4], COLUMNS[4:]))
     rest, commanded = logged[2, 0], np.flatnonzero(given[2] > 0)

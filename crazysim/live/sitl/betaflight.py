@@ -18,8 +18,9 @@ N_CHANNELS = 16
 class Betaflight(FirmwareLink):
     """A process ``betaflight_SITL``, which runs in real time.
 
-    Packets are those of ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware follows the
-    simulation's clock while packets keep coming, and answers each packet of the state with at most one of the motors.
+    Packets are those of ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
+    its clock to the simulation's but does not wait for it, and answers each packet of the state with at most one of the
+    motors.
     """
 
     positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))

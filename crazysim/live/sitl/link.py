@@ -1,4 +1,4 @@
-"""Links to the process of a firmware: what is sent, what is received, and how its motors are arranged."""
+"""Links to the process of a firmware: their interface, the arrangement of its motors, and UDP sockets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from crazysim.errors import ConfigError
 from crazysim.live.sitl.measured import Measured
 
 ROUNDING = 1e-6
-"""Time that is no time, s: sums of periods are rounded."""
+"""Tolerance of times for the rounding of sums of periods, s."""
 LARGEST = 65535
 """Longest datagram, bytes."""
 
@@ -54,7 +54,7 @@ class Rate:
         self._period, self._next = 1 / freq, 0.0
 
     def is_due(self, time: float) -> bool:
-        """Return True if it is due at a simulated time, s, and note that it is done."""
+        """Return True if it is due at a simulated time, s, and schedule the next one."""
         if time < self._next - ROUNDING:
             return False
         self._next = max(self._next + self._period, time)

@@ -59,11 +59,14 @@ class SoftwareInTheLoop(Closing):
         self.links = (links,) if isinstance(links, FirmwareLink) else tuple(links)
         freq = sim.freq if freq is None else freq
         if sim.control != Control.rotor_vel:
-            raise ConfigError(f"expected control='rotor_vel', got {sim.control.value!r}: a firmware commands motors")
+            raise ConfigError(
+                f"expected control='rotor_vel', got {sim.control.value!r}. Use Sim(control='rotor_vel'), as a firmware "
+                f"commands motors."
+            )
         if len(self.links) != sim.n_worlds * sim.n_drones:
             raise ConfigError(
                 f"expected a link for each of {sim.n_worlds * sim.n_drones} drones, got {len(self.links)}. "
-                f"Pass as many links."
+                f"Pass one for each drone."
             )
         if motors not in ("speed", "thrust"):
             raise ConfigError(f"expected motors as 'speed' or 'thrust', got {motors!r}")

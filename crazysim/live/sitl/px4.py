@@ -32,8 +32,8 @@ class Px4(FirmwareLink):
     """A process of PX4 that was started without a simulator of its own, as ``make px4_sitl none_iris``.
 
     PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
-    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. It takes a sensor that always measures the same
-    for a broken one, so give the simulation an ``IMU`` with noise.
+    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. It treats a sensor whose measurements never
+    change as broken, so give the simulation an ``IMU`` with noise.
     """
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))

@@ -65,10 +65,9 @@ class Randomize(Plugin):
     """Drones that differ from their airframe, in another way in every episode; needs rotors.
 
     Each setting is a range (low, high), for all drones, (2,), or for each, (n_worlds, n_drones, 2), from which a number
-    is drawn uniformly for every drone in the first step of an episode; a single number is fixed,
-    None changes nothing. Controllers keep the
-    airframe's numbers. The numbers drawn do not depend on the other settings. ``Randomize.crazyflie()`` and
-    ``Randomize.generic()`` have ranges with sources.
+    is drawn uniformly for every drone in the first step of an episode; a single number is fixed, None changes nothing.
+    Controllers keep the airframe's numbers. The numbers drawn do not depend on the other settings.
+    ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges with sources.
     """
 
     mass: ArrayLike | None = parameter(default=None, positive=True)
@@ -116,7 +115,7 @@ class Randomize(Plugin):
 
     @classmethod
     def generic(cls, **changes: ArrayLike | None) -> Randomize:
-        """Return 30 % either way in all factors of an airframe, the widest of Ferede et al. 2025 (arXiv 2504.21586).
+        """Return ranges of 30 % either way for the factors, the widest of Ferede et al. 2025 (arXiv 2504.21586).
 
         Args:
             changes: Other settings, by name.

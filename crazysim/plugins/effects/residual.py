@@ -1,4 +1,4 @@
-"""Identified forces and torques that the model lacks: terms of flights, and a small network."""
+"""Forces and torques that the model lacks, identified from flights: linear terms and a small network."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ResidualData(PyTree):
 
 
 class Residual(Plugin):
-    """Force and torque that flights showed beyond the model: linear terms and an optional network; needs rotors.
+    """Identified force and torque that the model lacks: linear terms and an optional network; needs rotors.
 
     They depend on the velocity over ground, so that wind does not change them. Coefficients are for all drones, as
     given here, or for each, with (n_worlds, n_drones) in front; without them they are those of the airframe's table

@@ -87,7 +87,7 @@ class RotorAerodynamics(Plugin):
         if not np.all((blade > 0) & np.isfinite(blade)):
             most = np.min(np.sqrt(thrust * disc) / speed)
             raise ConfigError(
-                f"expected inflow below {most:.3g} N s^2/(m rad), the slope of blades without limit at this propeller "
+                f"expected inflow below {most:.3g} N s^2/(m rad), the limit of momentum theory at this propeller "
                 f"radius and air density, got {np.max(inflow):.3g}. Use RotorAerodynamics(inflow=...) with a "
                 f"smaller number."
             )
@@ -108,8 +108,8 @@ class RotorAerodynamics(Plugin):
             given = drag[..., None] if drag.ndim else drag
             if not np.all(given > 0):
                 raise ConfigError(
-                    f"expected {name} of the rotors, as drone {sim.airframes[0].name!r} has no linear drag that it "
-                    f"follows from. Use RotorAerodynamics({name}=...); RotorPy has drag 1.0e-6 and inflow 7.6e-7 "
+                    f"expected {name}, got none, and drone {sim.airframes[0].name!r} has no linear drag from which it "
+                    f"would follow. Use RotorAerodynamics({name}=...); RotorPy has drag 1.0e-6 and inflow 7.6e-7 "
                     f"N s^2/(m rad) for the Crazyflie 2.0."
                 )
         return check_parameter(sim, name, given, positive=True)

@@ -89,7 +89,10 @@ class Complementary(Estimator):
         """Return the filter before its first step."""
         self.check_sensors(sim)
         if not self.aids or len({type(sensor) for sensor in self.aids}) < len(self.aids):
-            raise ConfigError(f"expected a Barometer, a TimeOfFlight or one of each for {self.name!r}")
+            got = [type(sensor).__name__ for sensor in self.aids]
+            raise ConfigError(
+                f"expected a Barometer, a TimeOfFlight or one of each among the sensors of {self.name!r}, got {got}"
+            )
         if self.control and sim.data.controls.mode == Control.state:
             raise ConfigError(
                 f"expected control at the level 'attitude' or below with {self.name!r}, which estimates no position, "

@@ -25,7 +25,7 @@ class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
     A subclass defines ``kinds``, ``record``, ``filter_stages`` and ``estimated_states``. With ``control`` controllers
-    see the estimate in place of the state, as do policies of tasks that observe measurements.
+    use the estimate in place of the state, as do policies of tasks that observe measurements.
     """
 
     sensors: Sequence[Sensor]
@@ -68,7 +68,7 @@ class Estimator(Plugin):
         return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages of the filter, and the controllers that see its estimate."""
+        """Return the stages of the filter, and the controllers that use its estimate."""
         placements = [
             Placement(stage, before="increment_steps", name=f"{self.name}_{name}" if name else self.name)
             for name, stage in self.filter_stages(sim.data.core.freq)
@@ -103,13 +103,16 @@ class Estimator(Plugin):
         """
         names = ", ".join(kind.__name__ for kind in self.kinds)
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
-            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}")
+            got = [type(sensor).__name__ for sensor in self.sensors]
+            raise ConfigError(f"expected one IMU among the sensors of {self.name!r}, and any of {names}, got {got}")
         for sensor in self.aids:
             if type(sensor) not in self.kinds:
                 raise ConfigError(f"expected sensors of the kinds {names} and an IMU, got {type(sensor).__name__}")
         for sensor in self.sensors:
             if sensor.name not in sim.data.plugins:
-                raise ConfigError(f"expected sensor {sensor.name!r} in the simulation; add it before {self.name!r}")
+                raise ConfigError(
+                    f"expected sensor {sensor.name!r} in the simulation, got none; add it before {self.name!r}"
+                )
 
     def _blind(self, controller: Stage) -> Stage:
         """Return a controller that reads the estimate in place of the state."""
@@ -121,7 +124,7 @@ class Estimator(Plugin):
 
 
 def at_the_start(data: SimData) -> Any:
-    """Return true in the first step of a world."""
+    """Return True in the first step of a world."""
     return data.core.steps == 0
 
 
