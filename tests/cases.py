@@ -14,7 +14,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from crazysim import Sim, load_airframe
+from crazysim import Sim, load_airframe, reduce_over_others, stage
 from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
@@ -192,14 +192,34 @@ def as_numbers(x):
     return np.asarray(jax.random.key_data(x) if is_key else x)
 
 
+@stage("drone")
+def repulsion(data):
+    """Push a drone away from the others of its world."""
+    pos = data.states.pos
+
+    def push(other, is_self):
+        offset = pos - other
+        return jnp.where(is_self, 0.0, 1e-3 * offset / (jnp.dot(offset, offset) + 0.01))
+
+    force = reduce_over_others(push, values=pos, reduce="sum")
+    return data.replace(states=data.states.replace(force=force))
+
+
+@stage("world")
+def centre(data):
+    """Pull the drones of a world to their centre."""
+    pos = data.states.pos
+    return data.replace(states=data.states.replace(force=1e-2 * (jnp.mean(pos, axis=0) - pos)))
+
+
 def by_stages(sim):
     """Return a step without an engine: the stages as they are written, whose derivative compiles fastest."""
     stages = as_stages(sim.step_pipeline)
 
     def step(data, n_steps):
         def once(data, _):
-            for stage in stages:
-                data = stage(data)
+            for one in stages:
+                data = one(data)
             return data, None
 
         data, _ = jax.lax.scan(once, data, length=n_steps)

@@ -297,3 +297,9 @@ def test_first_results_are_measured_without_and_with_a_cache(run):
     lines = run("first_results.py", "--repeat", 1, "--cases", "step")
     assert [line["cache"] for line in lines] == ["off", "on"]
     assert all(line["cpu_s"] > 0 for line in lines)
+
+
+def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
+    (line,) = run("gradient.py", "--worlds", "4", "--controls", "rotor_vel", "--steps", "3", "--repeats", "1")
+    assert line["steps_per_s"] == pytest.approx(12 / line["gradient_s"], rel=0.01)
+    assert line["forward_passes"] == pytest.approx(line["gradient_s"] / line["forward_s"], rel=0.01)

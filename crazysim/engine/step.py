@@ -20,7 +20,7 @@ from crazysim.core.stage import Axes, as_stages, with_leaves
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
-from crazysim.engine.ir.program import Zeros
+from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.plan import ENGINES, Plan, Planner
 from crazysim.errors import ConfigError
 from crazysim.pytree import check_axes, lazy
@@ -185,6 +185,11 @@ class Step:
         flat = self.flatten(data, None, n_steps)
         step = flat.plan.static if isinstance(n_steps, int) else flat.plan.dynamic
         return step.lower(flat.inputs(), n_steps)
+
+    @property
+    def programs(self) -> list[Program]:
+        """Programs that it has been planned with so far, for data of any structure."""
+        return [program for plan in self._plans.values() for program in plan.programs]
 
     @property
     def engines(self) -> list[str]:

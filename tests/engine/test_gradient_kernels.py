@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import needs_compiler
+from cases import PAIRS, centre, needs_compiler, repulsion, shared_sim
 
 from crazysim import Sim, reduce_over_others, stage
 from crazysim.core import functional as F
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.engine import Step, explain
-from crazysim.engine.backends import reverse, xla
+from crazysim.engine.backends import cuda, native, reverse, xla
+from crazysim.engine.backends.kernel import Kernel
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.transpose import transposed
 from crazysim.errors import EngineWarning
@@ -54,7 +55,7 @@ OPERATIONS = {
     "products": lambda x, y: x * y / (1.0 + y * y) - x,
     "functions": lambda x, y: jnp.sin(x) * jnp.exp(-y) + jnp.sqrt(x * x + 1.0) + jnp.arctan2(x, y),
     "selections": lambda x, y: jnp.where(x > y, x * y, jnp.maximum(x, 2.0 * y)) + jnp.clip(x, -0.5, 0.5) + jnp.abs(y),
-    "loop": lambda x, y: jax.lax.fori_loop(0, 5, lambda _, z: jnp.cos(z) * y, x),
+    "loop": lambda x, y: jax.lax.fori_loop(0, 50, lambda _, z: jnp.cos(z) * y, x),  # in several parts
     "own derivative": lambda x, y: jax.nn.relu(x) * jax.nn.softplus(y) + jax.nn.silu(x * y),
     "unused": lambda x, y: jnp.floor(x) + jax.lax.stop_gradient(y) * x,
 }
@@ -82,26 +83,13 @@ def test_a_kernel_goes_back(x64, monkeypatch):
     for a, b in zip(found, of_kernel(at), strict=True):
         np.testing.assert_array_equal(a, b)
 
-    monkeypatch.setattr(reverse, "KEPT", 0)
+    monkeypatch.setattr(native, "KEPT", 0)
     ((in_intervals, step, data), (plain, *_)), at = functions(n_steps=10)
     assert_same(gradient(in_intervals)(at), gradient(plain)(at))
     assert "gradient: one kernel" in explain(step, data)
 
     many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), at)
     assert_same(jax.vmap(gradient(in_intervals))(many), jax.vmap(gradient(plain))(many))
-
-
-@stage("drone")
-def repulsion(data):
-    """Push a drone away from the others of its world."""
-    pos = data.states.pos
-
-    def push(other, is_self):
-        offset = pos - other
-        return jnp.where(is_self, 0.0, 1e-3 * offset / (jnp.dot(offset, offset) + 0.01))
-
-    force = reduce_over_others(push, values=pos, reduce="sum")
-    return data.replace(states=data.states.replace(force=force))
 
 
 @stage("drone")
@@ -112,13 +100,6 @@ def gap(data):
         lambda other, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min"
     )
     return data.replace(states=data.states.replace(force=jnp.zeros(3).at[2].set(1e-3 * near)))
-
-
-@stage("world")
-def centre(data):
-    """Pull the drones of a world to their centre."""
-    pos = data.states.pos
-    return data.replace(states=data.states.replace(force=1e-2 * (jnp.mean(pos, axis=0) - pos)))
 
 
 @needs_compiler
@@ -136,6 +117,58 @@ def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
         found = gradient(fast)(at)
     assert_same(found, gradient(plain)(at))
     assert "the smallest or largest over other drones has no derivative in a kernel" in explain(step, data)
+
+
+@pytest.mark.parametrize(("dynamics", "control"), PAIRS)
+def test_the_gradient_of_every_pipeline_compiles_for_a_gpu(dynamics, control):
+    """With respect to all that a drone has of its own."""
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    sim = shared_sim(n_worlds=2, n_drones=3, dynamics=dynamics, control=control)
+    program = Step(sim.step_pipeline, "fused", "gpu").plan(sim.data).program
+    back = reverse.reverse(program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"])
+    text = cuda.ptx(reverse.write(back, "cuda"), cuda.DEFAULT_ARCHITECTURE)
+    stored = sum(program.leaves[i].size for i in back.perturbed) + len(back.carried)
+    assert text.count("st.global") >= stored
+
+
+def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
+    """A kernel there, or lanes; a kernel of the CPU has up to 8 drones that act on each other."""
+    if cuda.nvrtc() is None:
+        pytest.skip("no NVRTC here; CI has it")
+    for n_drones, planned_for in ((1, "cpu"), (1, "gpu"), (9, "gpu")):
+        sim = Sim(2, n_drones, control="rotor_vel")
+        insert_fn_before(sim.step_pipeline, "integration", repulsion)
+        step = Step(sim.step_pipeline, "fused", planned_for)
+
+        def loss(vel, step=step, data=sim.data):
+            return jnp.sum(step(data.replace(states=data.states.replace(vel=vel)), 2).states.pos ** 2)
+
+        traced = jax.jit(jax.grad(loss)).trace(sim.data.states.vel)
+        ways = []
+        for platform in ("cuda", "cpu"):
+            text = traced.lower(lowering_platforms=(platform,)).as_text()
+            ways.append([text.count(name) for name in (cuda.TARGET, "crazysim_advance")])
+        forward_and_back, kernels_of_cpu = 2, 2 if n_drones == 1 else 1
+        assert ways == [[forward_and_back, 0], [0, kernels_of_cpu]]
+        ran = [line for line in explain(step, sim.data).splitlines() if line.startswith("gradient: ")]
+        assert ran[0].startswith("gradient: one kernel, compiled for compute_90")
+        assert ran[1].startswith("gradient: one kernel, compiled by" if n_drones == 1 else "gradient: on lanes (")
+
+
+@pytest.mark.parametrize(
+    ("n_lanes", "n_steps", "n_blocks", "interval"),
+    [(100, 10, 2, 10), (2**20, 100, 2**14 // 2, 100), (2**20, 1000, 2**14 // 2, 32), (100, 0, 2, 1)],
+)
+def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, interval):
+    """24 numbers of 2**20 lanes at once, as 100 and as 32 + 32 states, would take 10 and 6 GB."""
+    kernel = Kernel("", (), (), kept=24 * 4)
+    blocks, count, (memory,) = cuda._with_memory(kernel, n_lanes, n_steps)
+    assert blocks * kernel.lanes * -(-n_lanes // (blocks * kernel.lanes)) >= n_lanes
+    assert count.tolist() == [n_steps, interval]
+    n_states = interval + max(-(-n_steps // interval), 1)
+    assert memory.shape == (blocks, n_states * 24 * kernel.threads)
+    assert memory.size * 4 <= cuda.KEPT
 
 
 @needs_compiler

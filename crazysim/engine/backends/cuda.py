@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.kernel import Kernel, interval
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
@@ -34,6 +34,12 @@ OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false"
 
 THREADS_AT_ONCE = (512, 384)
 """Numbers of threads of a multiprocessor to try, the most first: they leave 128 or 168 registers to each thread."""
+
+KEPT = 2**30
+"""Most memory for what the steps begin with that a gradient goes back through at once, bytes."""
+
+LANES = 2**16
+"""Lanes that a gradient has memory for at once, if there are as many: as a GPU of 132 multiprocessors runs at most."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""
@@ -63,11 +69,14 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
     kernel = kernel if device is None else fitted(kernel, device)
     text = ptx(kernel, architecture(device))
 
-    def launch(n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        grid = {"grid_x": -(-n_lanes // kernel.lanes), "grid_y": 1, "grid_z": 1}
+    def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+        n_blocks, memory = -(-n_lanes // kernel.lanes), []
+        if kernel.kept:
+            n_blocks, count, memory = _with_memory(kernel, n_lanes, int(count[0]))
+        grid = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1}
         block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
-        run = jax.ffi.ffi_call(TARGET, list(outputs), input_output_aliases=kernel.aliases())
-        return list(
+        run = jax.ffi.ffi_call(TARGET, [*outputs, *memory], input_output_aliases=kernel.aliases())
+        written = list(
             run(
                 np.asarray([n_lanes], np.int32),
                 count,
@@ -79,8 +88,23 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
                 **{name: np.int32(size) for name, size in (grid | block).items()},
             )
         )
+        return written[: len(outputs)]
 
     return launch
+
+
+def _with_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
+    """Return how many blocks of a kernel that keeps numbers run, its numbers of steps, and the memory that it needs.
+
+    Where that would exceed ``KEPT``, there are fewer blocks, each for several blocks of lanes, one after the other.
+    """
+    here = interval(n_steps, min(n_lanes, LANES) * kernel.kept, KEPT)
+    n_states = here + max(-(-n_steps // here), 1)
+    size = n_states * kernel.kept * kernel.threads
+    n_blocks = -(-n_lanes // kernel.lanes)
+    turns = -(-n_blocks // max(KEPT // size, 1))
+    n_blocks = -(-n_blocks // turns)
+    return n_blocks, np.asarray([n_steps, here], np.int32), [jax.ShapeDtypeStruct((n_blocks, size // 4), np.uint32)]
 
 
 def weakest(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
@@ -113,7 +137,8 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
     candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         least, *found = pool.map(lambda c: resources(c, device), candidates)
-    bearable = 16 if least.registers <= 224 else 256  # measured on an H200: docs/concepts/engine.md
+    # Measured on an H200: docs/concepts/engine.md. Gradients are slower with 168 registers and 248 bytes than with 255.
+    bearable = 16 if least.registers <= 224 or kernel.kept else 256
     suitable = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
     return next(suitable, kernel)
 

@@ -22,6 +22,7 @@ from crazysim.core.stage import with_leaves
 from crazysim.engine.backends import Run, cuda, gradient, kernel, lanes, native
 from crazysim.engine.backends.gradient import Gradients
 from crazysim.engine.backends.native import Launch
+from crazysim.engine.backends.platforms import TARGETS, compiled, described
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.errors import ConfigError
@@ -65,9 +66,7 @@ class Kernels:
         return self._launches[platform]
 
     def _compiled(self, location: Location) -> Launch:
-        if location.platform == "gpu":
-            return cuda.compiled(kernel.write(self.program, "cuda"), location.devices)
-        return native.HostLaunch(kernel.write(self.program, "host"))
+        return compiled(kernel.write(self.program, TARGETS[location.platform]), location)
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return shapes and types of what the kernel writes: leaves, and flags of drones if it checks."""
@@ -121,14 +120,10 @@ def build(program: Program, location: Location) -> FusedRun:
         UnsupportedError: If an operation or type has no source.
         KernelError: If the compiler refuses a kernel or takes too long.
     """
-
-    def compiled(part: Program) -> Kernels:
-        return Kernels(part, location)
-
-    kernels = compiled(program) if program.fused else None
-    run = _split(program, compiled) if kernels is None else _one_kernel(kernels)
+    kernels = Kernels(program, location) if program.fused else None
+    run = _split(program, location) if kernels is None else _one_kernel(kernels)
     on_lanes = lanes.build(program, location)
-    gradients = GRADIENTS[program] = Gradients(program, location, on_lanes, launch_p.bind)
+    gradients = GRADIENTS[program] = Gradients(program, location, on_lanes)
     return FusedRun(differentiable(_over_batches(program, run), on_lanes, gradients), kernels)
 
 
@@ -174,23 +169,14 @@ def differentiable(run: CountedRun, on_lanes: Run, gradients: Gradients) -> Run:
 
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
     """Return the compiler of the kernels of a program, or on a GPU the registers that each takes, in lines."""
+    sources = [kernel.write(part, TARGETS[platform]) for part in _parts(program) if part.fused]
+    return [f"kernel: {described(source, platform, devices)}" for source in sources]
+
+
+def describe_gradients(program: Program) -> list[str]:
+    """Return the ways in which gradients through a program were computed so far, in lines."""
     gradients = GRADIENTS.get(program)
-    used = [] if gradients is None else list(gradients.used)
-    return [*_described(program, platform, devices), *used]
-
-
-def _described(program: Program, platform: str, devices: Sequence[jax.Device] | None) -> list[str]:
-    if platform != "gpu":
-        return [f"kernel: compiled by {native.compiler()}"]
-    device = cuda.weakest(devices)
-    if device is None:
-        return [f"kernel: compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"]
-    sources = [kernel.write(part, "cuda") for part in _parts(program) if part.fused]
-    used = [cuda.resources(cuda.fitted(source, device), device) for source in sources]
-    return [
-        f"kernel: {source.threads} threads a block, {x.registers} registers, {x.spilled} bytes spilled"
-        for source, x in zip(sources, used, strict=True)
-    ]
+    return [] if gradients is None else [f"gradient: {line}" for line in gradients.used]
 
 
 def _over_batches(program: Program, run: CountedRun) -> CountedRun:
@@ -239,11 +225,11 @@ def _parts(program: Program) -> list[Program]:
     return [program] if program.fused else list(program.parts())
 
 
-def _split(program: Program, compiled: Callable[[Program], Kernels]) -> CountedRun:
+def _split(program: Program, location: Location) -> CountedRun:
     """Return the same for a step that unfused stages split: a kernel for the stages between them."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
-        runs = list(pool.map(lambda part: _one_kernel(compiled(part)) if part.fused else None, parts))
+        runs = list(pool.map(lambda part: _one_kernel(Kernels(part, location)) if part.fused else None, parts))
     written = program.written
 
     def turn(leaves: list[Any]) -> list[Any]:

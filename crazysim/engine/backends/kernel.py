@@ -7,6 +7,7 @@ the last.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from importlib import resources
 
@@ -38,6 +39,9 @@ class Kernel:
     """Threads of a block on a GPU."""
     lanes: int = BLOCK
     """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
+    kept: int = 0
+    """Memory of the numbers of a lane that it keeps for each step of an interval, bytes; 0 for a kernel that only goes
+    ahead. The other takes the number of steps of an interval behind that of all steps."""
 
     def aliases(self) -> dict[int, int]:
         """Return the result that each operand in place is, by number; two numbers precede the operands."""
@@ -46,6 +50,19 @@ class Kernel:
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
         return dataclasses.replace(self, text=self.text.replace(UNBOUNDED, f"{n}"))
+
+
+def interval(n_steps: int, size: int, memory: int) -> int:
+    """Return how many steps a gradient goes back at once: all, if there is memory for what they begin with.
+
+    Otherwise it is the root of their number, which takes the least memory, as it also keeps what intervals begin with.
+
+    Args:
+        n_steps: Number of steps.
+        size: Memory of what a step begins with, bytes.
+        memory: Memory that there is, bytes.
+    """
+    return max(n_steps, 1) if n_steps * size <= memory else math.isqrt(n_steps - 1) + 1
 
 
 def preamble(target: str) -> str:
@@ -186,13 +203,13 @@ class Body:
             outputs: Leaves that it writes.
             in_place: Leaves that it updates in place.
             blocks: Blocks of a step, whose operations are counted.
-            kept: Numbers of a drone that it keeps for each step of an interval; None for a kernel that goes ahead.
+            kept: Numbers of a lane that it keeps for each step of an interval; None for a kernel that only goes ahead.
         """
         program, target = self.program, self.target
         threads, lanes = lanes_of_block(program.group)
         shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
         if target == "cuda":
-            frame = _cuda(pointers, "\n".join(shared + code), threads, lanes)
+            frame = _cuda(pointers, "\n".join(shared), "\n".join(code), threads, lanes, kept is not None)
         else:
             frame = _host(pointers, "\n".join(shared), "\n".join(code), self.exchange.depth > 0, kept is not None)
         widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
@@ -202,7 +219,7 @@ class Body:
         if kept is not None:
             declared = f"#define N_KEPT {kept}\n{preamble(target + '_kept')}{declared}"
         text = defines + preamble(target) + declared + frame + epilogue(target)
-        return Kernel(text, inputs, outputs, in_place, threads, lanes)
+        return Kernel(text, inputs, outputs, in_place, threads, lanes, (kept or 0) * widest)
 
     def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
         """Return the numbers that the stages write, and all that the kernel uses."""
@@ -250,7 +267,8 @@ def write_map(block: Block, target: str) -> Kernel:
         write_results(writer, f"q{k}", kind, 1, [x], 2)
     threads, lanes = lanes_of_block(1)
     body = "\n".join(writer.lines)
-    frame = _cuda(pointers, body, threads, lanes) if target == "cuda" else _host(pointers, "", body, False, False)
+    frame = (_cuda(pointers, "", body, threads, lanes, False) if target == "cuda"
+             else _host(pointers, "", body, False, False))  # fmt: skip
     text = (
         f"#define WIDEST {8 if 'f64' in (*inputs, *outputs) else 4}\n#define GROUP 1\n#define BLOCK_THREADS {threads}\n"
     )
@@ -414,19 +432,28 @@ def _drones(program: Program, leaf: int) -> int:
     return program.n_drones if program.leaves[leaf].scope == "world" else 1
 
 
-def _cuda(pointers: Sequence[str], body: str, threads: int, lanes: int) -> str:
+def _cuda(pointers: Sequence[str], shared: str, body: str, threads: int, lanes: int, keeps: bool) -> str:
+    """Return the kernel of a thread: it computes what all share once, and the rest for its lane, or where it keeps
+    numbers for one lane after the other, as there is memory for a part of them at once.
+    """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers])
+    arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])
+    each = f"for (int first = blockIdx.x * {lanes}; first < n_lanes; first += gridDim.x * {lanes})"
+    interval, each = (", interval = count[1]", each) if keeps else ("", f"const int first = blockIdx.x * {lanes};")
     return f"""
 extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({arguments}) {{
-  const int n_lanes = sizes[0], n_steps = count[0];
+  const int n_lanes = sizes[0], n_steps = count[0]{interval};
+  const int nothing = n_steps >> 31;
   const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
-  const int wanted = blockIdx.x * {lanes} + place;
+{shared}
+  {each} {{
+  const int wanted = first + place;
   const bool active = thread < LANES && wanted < n_lanes;
   const int lane = wanted < n_lanes ? wanted : n_lanes - 1;
   const int own = lane % GROUP;
   const int world = active ? place / GROUP * GROUP : 0;
 {body}
+  }}
 }}
 """
 

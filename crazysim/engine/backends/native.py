@@ -25,7 +25,7 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.engine.backends import kernel_cache
-from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.kernel import Kernel, interval
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError
@@ -61,8 +61,15 @@ this process ends, however it ends, it kills the command with all its children."
 CPU_INFO = Path("/proc/cpuinfo")
 """File in which Linux lists the features of the CPU."""
 
-Launch = Callable[[int, Array, Sequence[Array], Sequence[Any]], list[Array]]
-"""Number of lanes, number of steps (1,), inputs, and shapes and types of outputs, to outputs."""
+KEPT = 256 * 1024
+"""Memory of what the steps begin with that a core goes back through at once, bytes: as much as is near to it."""
+
+VECTOR = 64
+"""Size of the widest vector, bytes."""
+
+Launch = Callable[[int, Any, Sequence[Array], Sequence[Any]], list[Array]]
+"""Number of lanes, number of steps (1,), inputs, and shapes and types of outputs, to outputs. For a kernel that keeps
+numbers the number of steps is an array of NumPy."""
 
 
 class HostLaunch:
@@ -74,10 +81,13 @@ class HostLaunch:
         Raises:
             KernelError: If the compiler refuses it or takes too long, with its message.
         """
-        self._name, self._aliases = target(kernel), kernel.aliases()
+        self._name, self._aliases, self._kept = target(kernel), kernel.aliases(), kernel.kept
 
-    def __call__(self, n_lanes: int, count: Array, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+    def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
         """Return what the kernel writes."""
+        if self._kept:
+            lanes_of_vector = VECTOR // 4
+            count = np.append(count, np.int32(interval(int(count[0]), self._kept * lanes_of_vector, KEPT)))
         run = jax.ffi.ffi_call(self._name, list(outputs), input_output_aliases=self._aliases)
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 

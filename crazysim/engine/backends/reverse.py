@@ -9,7 +9,6 @@ leaves that drones share.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -22,9 +21,6 @@ from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
 from crazysim.engine.lowering.transpose import active, transposed
-
-KEPT = 256 * 1024
-"""Memory of the beginnings of steps that a core of the host goes back through, bytes: as much as is near to it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,6 +39,8 @@ class Reverse:
     """The same for what is computed once before the steps."""
     carried: tuple[Slot, ...]
     """Numbers that a step begins with, and that steps change."""
+    read_back: frozenset[Slot]
+    """Those of them that the way back through a step needs."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -96,7 +94,15 @@ def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
     changing = program.changing()
     if len(each) == 1 and each[0].scope == "drone":
         read = set(each[0].reads)
-    return Reverse(extended, n, perturbed, back, back_hoisted, tuple(sorted(read & changing)))
+    carried = tuple(sorted(read & changing))
+    used = {slot for s in (*(back[s] for s in each), *each[:-1]) for slot in _used(extended, s)}
+    return Reverse(extended, n, perturbed, back, back_hoisted, carried, frozenset(used.intersection(carried)))
+
+
+def _used(program: Program, s: Segment) -> list[Slot]:
+    """Return the places of the inputs that a segment uses."""
+    used, slots = s.block.uses(), program.per_drone(s, s.reads)
+    return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]
 
 
 def _float_of(block: Block) -> np.dtype:
@@ -215,35 +221,32 @@ def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int]
     return Segment("drone", s.stages, "each", block, (*reads, *places, *targets), targets)
 
 
-def interval(reverse: Reverse, n_steps: int) -> int:
-    """Return the number of steps whose beginnings are kept at once: all, as long as they fit near to a core."""
-    if n_steps * len(reverse.carried) * 64 <= KEPT:
-        return max(n_steps, 1)
-    return math.isqrt(n_steps - 1) + 1
-
-
 def needed(reverse: Reverse) -> tuple[int, ...]:
     """Return the leaves that the kernel reads; behind them come the cotangents of ``seeds``."""
     return kernel.needed(reverse.program)
 
 
-def write(reverse: Reverse) -> Kernel:
-    """Return the source of the kernel that goes back, on the host.
+def write(reverse: Reverse, target: str) -> Kernel:
+    """Return the source of the kernel that goes back.
 
-    It takes two numbers, those of steps and of the steps of an interval; then the leaves that the program needs and the
-    cotangents of the leaves it writes. It returns a cotangent of each perturbed leaf for every drone.
+    Its inputs are the leaves that the program needs, then the cotangents of the leaves it writes; its outputs are a
+    cotangent of each perturbed leaf for every drone.
+
+    Args:
+        reverse: The transposed derivatives.
+        target: ``"cuda"`` or ``"host"``.
 
     Raises:
         UnsupportedError: If there is no source for an operation or a type.
     """
     program, n = reverse.program, reverse.n_leaves
-    if program.group > MAX_IN_VECTOR:
+    if target == "host" and program.group > MAX_IN_VECTOR:
         raise LimitError(
             f"gradients of worlds of more than {MAX_IN_VECTOR} drones that act on each other have no kernel"
         )
     checked = dataclasses.replace(program, segments=(*program.segments, *reverse.back.values()))
     kernel.require_source(checked)
-    body = Body(program, "host")
+    body = Body(program, target)
     writer, rank = body.writer, program.ranks
     constants = body.write_loads()
     names = body.names
@@ -268,9 +271,10 @@ def write(reverse: Reverse) -> Kernel:
     carried = reverse.carried
     types = [type_name(program.leaves[i].number) for i, _ in carried]
 
-    def keep(state: str, depth: int) -> None:
+    def keep(state: str, slots: Collection[Slot], depth: int) -> None:
         for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
-            writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
+            if slot in slots:
+                writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
 
     last, each, first = program.of("last"), program.of("each"), program.of("first")
     writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
@@ -278,14 +282,11 @@ def write(reverse: Reverse) -> Kernel:
     writer.line("const bool back = turn >= n_intervals - 1;", 2)
     writer.line("const int part = back ? 2 * (n_intervals - 1) - turn : turn;", 2)
     writer.line("const int n_here = n_steps - part * interval < interval ? n_steps - part * interval : interval;", 2)
-    writer.line("if (turn >= n_intervals) {", 2)
-    for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
-        writer.line(f"{names[slot]} = KEPT({t}, interval + part, {k});", 3)
-    writer.line("} else {", 2)
-    keep("interval + part", 3)
+    writer.line("if (turn < n_intervals) {", 2)
+    keep("interval + part", carried, 3)
     writer.line("}", 2)
     writer.line("for (int step = 0; step < n_here; ++step) {", 2)
-    keep("step", 3)
+    keep("step", reverse.read_back, 3)
     if not last:  # nothing needs what comes after the last step
         writer.line("if (back && step == n_here - 1) break;", 3)
     for segment, fixed in zip(each, constants, strict=True):
@@ -299,10 +300,15 @@ def write(reverse: Reverse) -> Kernel:
     writer.line("for (int step = n_here - 1; step >= 0; --step) {", 2)
     here = dict(names)
     for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+        if slot not in reverse.read_back:
+            continue
         here[slot] = writer.new("b")
         writer.line(f"const auto {here[slot]} = KEPT({t}, step, {k});", 3)
     _write_back(body, reverse, each, constants, here, 3)
     writer.line("}", 2)
+    writer.line("const int before = interval + (part > 0 ? part - 1 : 0);", 2)
+    for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
+        writer.line(f"{names[slot]} = KEPT({t}, before, {k});", 2)
     writer.line("}", 1)
     for s in each:
         if s in reverse.back_hoisted:

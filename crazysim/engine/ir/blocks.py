@@ -8,7 +8,7 @@ is in ``ops``.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -212,6 +212,7 @@ def _prune(block: Block, needed: set[Value]) -> Block:
         if op.name == "barrier":
             kept.append(op)
         elif not needed.isdisjoint(op.results):
+            op = _narrowed(op, needed) if op.name == "when" else op
             needed.update(x for x in op.args if isinstance(x, Value))
             if op.blocks:
                 blocks = tuple([_prune(inner, needed) for inner in op.blocks])
@@ -219,6 +220,17 @@ def _prune(block: Block, needed: set[Value]) -> Block:
             else:
                 kept.append(op)
     return dataclasses.replace(block, operations=tuple(kept[::-1]))
+
+
+def _narrowed(op: Operation, needed: Collection[Value]) -> Operation:
+    """Return a ``when`` with those of its results that are needed."""
+    (mask, *old), (block,) = op.args, op.blocks
+    kept = [k for k, x in enumerate(op.results) if x in needed]
+    if len(kept) == len(op.results):
+        return op
+    inner = dataclasses.replace(block, outputs=tuple([block.outputs[k] for k in kept]))
+    args, results = (mask, *(old[k] for k in kept)), tuple([op.results[k] for k in kept])
+    return op._replace(args=args, results=results, blocks=(inner,))
 
 
 def substitute(block: Block, new: Mapping[Value, Element]) -> Block:

@@ -200,6 +200,8 @@ def _rows() -> list[Row]:
             source="to_{type}({0})"),
         Row(name="bitcast_convert_type", operands="*", results="*", numpy=forms.bitcast, exact=True,
             source="bits_{type}({0})"),
+        Row(name="again", operands="T", cost=0, numpy=lambda x, **_: x, xla=lambda x, **_: x,
+            source="AGAIN({0})"),
     ]  # fmt: skip
     structured = [
         Row(name="barrier", operands="", results="", cost=0, structured=True),
@@ -228,7 +230,8 @@ where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)``
 has a derivative of its own. ``over_others(*published, reduce=, n_members=)`` runs its block for each drone of the
 world: the block's inputs are what that drone published, and whether it is the drone itself; ``reduce`` names the
 operation that combines its outputs. It stands in no inner block. ``threefry2x32`` is the cipher of JAX's random
-numbers.
+numbers. ``again(x, part=)`` is x, which compilers of kernels may take for another number in each part: what is computed
+from it is computed once more.
 ``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
 int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
 ``any_lane`` is true at least where its operand is: a target may give all lanes of a vector what is true of any.

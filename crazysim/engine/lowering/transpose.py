@@ -1,8 +1,8 @@
 """Reverse mode on blocks: from the cotangents of a block's outputs to those of its inputs.
 
 An operation has the derivative that JAX gives it: its rule is traced once for each operation and types, and lowered
-like any other function. What the derivative needs of the block's own results is computed in the same block again, and
-what both compute is computed once.
+like any other function. What the derivative needs of the block's own results is computed in the same block again: the
+block is computed once, from its beginning to its end, and then part by part on the way back.
 """
 
 from __future__ import annotations
@@ -47,15 +47,46 @@ def transposed(block: Block, wanted: Sequence[Value]) -> Block:
     on_path = active(block, wanted)
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
-    inline(builder, block, values)
+    parts = _parts(block)
+    for part in parts:
+        inline(builder, part, values)
     cotangents: Cotangents = {}
     for x in block.outputs:
         if x.dtype.kind == "f":
             ct = builder.input(x.dtype)
             if isinstance(x, Value) and x in on_path:
                 _accumulate(builder, cotangents, x, ct)
-    _pull(builder, block, values, on_path, cotangents)
+    for k, part in reversed(list(enumerate(parts))):
+        here = values if k == len(parts) - 1 else _again(builder, part, k, values, on_path)
+        _pull(builder, part, here, on_path, cotangents)
     return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
+
+
+SPAN = 60
+"""Operations of a part of a block. Of 60, 100, 150, 250 and all, 60 and 100 left the most numbers in registers."""
+
+
+def _parts(block: Block) -> list[Block]:
+    """Return the operations of a block in parts, one after the other."""
+    operations = [op for op in block.operations if op.name != "barrier"]
+    return [Block((), tuple(operations[k : k + SPAN])) for k in range(0, len(operations), SPAN)]
+
+
+def _again(
+    builder: Builder, part: Block, number: int, values: dict[Value, Element], on_path: set[Value]
+) -> dict[Value, Element]:
+    """Compute a part of a block once more from what it uses, and return the elements that its values are then.
+
+    Otherwise all that is computed on the way ahead would take registers until the way back needs it. Reductions over
+    other drones are not computed again.
+    """
+    repeated = [op for op in part.operations if op.name != "over_others"]
+    own, used = {x for op in repeated for x in op.results}, part.uses()
+    before = [x for x in values if x in used and x in on_path and x not in own and isinstance(values[x], Value)]
+    fresh = {x: builder.add("again", (values[x],), x.dtype, (("part", number),)) for x in before}
+    here = values | fresh
+    inline(builder, Block((), tuple(repeated)), here)
+    return here
 
 
 def active(block: Block, wanted: Collection[Value]) -> set[Value]:

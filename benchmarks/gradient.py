@@ -1,0 +1,88 @@
+"""Gradients beside the steps they go through: one JSON line for each command level and number of worlds.
+
+    python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
+
+The gradient is that of the squared distances from the start after ``--steps`` steps, with respect to the commands.
+``forward_s`` is the time of the distances alone. Calls alternate; on a GPU those of a batch are queued.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from measure import COMMANDS, digits, hovering, medians, report
+
+from crazysim import Sim, __version__
+from crazysim.core import functional
+
+BATCH = {"cpu": 1, "gpu": 10}
+"""Calls of a batch."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
+    parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
+    parser.add_argument("--steps", type=int, nargs="+", default=[100], help="steps that the gradient goes through")
+    parser.add_argument("--repeats", type=int, default=7)
+    args = parser.parse_args()
+    for case in itertools.product(args.controls, args.worlds, args.steps):
+        measure(args, *case)
+
+
+def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int) -> None:
+    """Print the line of one case."""
+    sim = Sim(n_worlds, control=control, controller="crazyflow", device=args.device, engine=args.engine)
+    hovering(sim, control)
+    step, start = sim.build_step_fn(), sim.data
+    send, zeros = getattr(functional, f"{control}_control"), sim.step_fn.zeros(sim.data)
+    hover = jnp.asarray(COMMANDS[control](0.0434 * 9.81, 15864.0), jnp.float32)
+    cmd = jax.device_put(jnp.broadcast_to(1.01 * hover, (n_worlds, 1, hover.size)), sim.device)
+
+    def distance(cmd: jax.Array) -> jax.Array:
+        end = step(send(start, cmd), n_steps, zeros)
+        return jnp.sum((end.states.pos - start.states.pos) ** 2)
+
+    forward, gradient = jax.jit(distance), jax.jit(jax.grad(distance))
+    first_s = {name: seconds(fn, cmd, 1) for name, fn in (("forward", forward), ("gradient", gradient))}
+    batch = BATCH["cpu" if args.device == "cpu" else "gpu"]
+    taken = medians(
+        {"forward": lambda: seconds(forward, cmd, batch), "gradient": lambda: seconds(gradient, cmd, batch)},
+        args.repeats,
+    )
+    slope = gradient(cmd)
+    if not (jnp.all(jnp.isfinite(slope)) and jnp.any(slope != 0)):
+        raise SystemExit("the gradient is zero or not finite; no figure")
+    report(
+        args.device,
+        benchmark="gradient",
+        control=control,
+        n_worlds=n_worlds,
+        n_steps=n_steps,
+        ran=sim.explain().splitlines()[-1],
+        compile_s=digits(first_s["gradient"] - taken["gradient"]),
+        forward_s=digits(taken["forward"]),
+        gradient_s=digits(taken["gradient"]),
+        forward_passes=digits(taken["gradient"] / taken["forward"]),
+        steps_per_s=digits(n_worlds * n_steps / taken["gradient"]),
+        crazysim=__version__,
+    )
+
+
+def seconds(fn: Callable[[jax.Array], Any], cmd: jax.Array, n_calls: int) -> float:
+    """Return the time of a call in a batch, s."""
+    begin = time.perf_counter()
+    jax.block_until_ready([fn(cmd) for _ in range(n_calls)])
+    return (time.perf_counter() - begin) / n_calls
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""Kernels of the platforms that have any: GPUs of NVIDIA, and CPUs with a C++ compiler."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+
+from crazysim.core.sharding import Location
+from crazysim.engine.backends import cuda, native
+from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.native import Launch
+
+TARGETS = {"cpu": "host", "gpu": "cuda"}
+"""Targets of kernels by platform."""
+
+
+def compiled(kernel: Kernel, location: Location) -> Launch:
+    """Compile a kernel for some devices, and return the function that calls it.
+
+    Args:
+        kernel: The kernel, written for the target of the platform.
+        location: The devices.
+
+    Raises:
+        KernelError: If the compiler is missing, refuses the kernel or takes too long.
+    """
+    return cuda.compiled(kernel, location.devices) if location.platform == "gpu" else native.HostLaunch(kernel)
+
+
+def described(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | None) -> str:
+    """Return the compiler of a kernel, or on a GPU the registers that it takes."""
+    if platform != "gpu":
+        return f"compiled by {native.compiler()}"
+    device = cuda.weakest(devices)
+    if device is None:
+        return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
+    used = cuda.resources(cuda.fitted(kernel, device), device)
+    return f"{kernel.threads} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
