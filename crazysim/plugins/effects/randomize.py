@@ -111,7 +111,8 @@ class Randomize(Plugin):
             "drag": (0.5, 1.6),
             "charge": (0.1, 1.0),
         }
-        return cls(**(ranges | changes))
+        ranges.update(changes)
+        return cls(**ranges)
 
     @classmethod
     def generic(cls, **changes: ArrayLike | None) -> Randomize:
@@ -121,8 +122,8 @@ class Randomize(Plugin):
             changes: Other settings, by name.
         """
         ranges: dict[str, Any] = dict.fromkeys((*FACTORS, "thrust"), (0.7, 1.3))
-        ranges |= {"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)}
-        return cls(**(ranges | changes))
+        ranges.update({"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)} | changes)
+        return cls(**ranges)
 
     def record(self, sim: Simulation) -> RandomizeData:
         """Return factors of one and no wind, until the first step of an episode."""
