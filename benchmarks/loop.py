@@ -2,8 +2,9 @@
 
     python benchmarks/loop.py [--device gpu] [--worlds 1 64 1024 16384] [--controls state attitude]
 
-One JSON line for each command level and number of worlds, with the median time of an iteration and the shortest. The
-last line is the same for C MuJoCo and one free box: set its force, take 5 steps with ``mj_step``, read its position.
+One JSON line for each command level and number of worlds, with the median time of an iteration and the shortest. Then
+JAX's share: the sum of as many positions and one, compiled, read into NumPy. The last line is the loop of C MuJoCo and
+one free box: set its force, take 5 steps with ``mj_step``, read its position.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import itertools
 import time
 from collections.abc import Callable
 
+import jax
 import mujoco
 import numpy as np
 from measure import hovering, report, still_flies
@@ -51,6 +53,13 @@ def main() -> None:
             raise RuntimeError("the drones crashed; a crashed drone costs less to simulate")
         realtime = STEPS / sim.freq * n_worlds / times["iteration_s"]
         report(args.device, benchmark="loop", control=control, n_worlds=n_worlds, **times, realtime=realtime)
+    for n_worlds in args.worlds:
+        report(
+            args.device,
+            benchmark="loop/jax",
+            n_worlds=n_worlds,
+            **measured(*sum_with_one(args.device, n_worlds), args.repeats),
+        )
     report("cpu", benchmark="loop/mj_step", n_worlds=1, **measured(*free_box(), args.repeats))
 
 
@@ -66,6 +75,17 @@ def measured(begin: Callable[[], None], iterate: Callable[[], None], repeats: in
             iterate()
             times.append(time.perf_counter() - now)
     return {"iteration_s": float(np.median(times)), "shortest_s": min(times)}
+
+
+def sum_with_one(device: str, n_worlds: int) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Return the start and the iteration of a loop that computes next to nothing, and reads as many positions."""
+    positions = jax.device_put(np.zeros((n_worlds, 1, 3), np.float32), jax.devices(device)[0])
+    plus_one = jax.jit(lambda x: x + 1.0)
+
+    def iterate() -> None:
+        np.asarray(plus_one(positions))
+
+    return iterate, iterate
 
 
 def free_box() -> tuple[Callable[[], None], Callable[[], None]]:
