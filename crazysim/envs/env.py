@@ -229,6 +229,7 @@ class DroneEnv(Env):
             (lambda data, default: reset_all(data, default, worlds)) if self.batched_reset else reset_world
         )
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
+        self._plugins = tuple(sim.plugins.values())
         self.zeros = self._step.zeros(sim.data)
         self._default = default = compact(sim.default_data)
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, numbered(default))), strict=True)
@@ -304,7 +305,19 @@ class DroneEnv(Env):
         return "episodes begin from different data in different worlds" if self.default_varies else None
 
     def initial_data(self, key: Array) -> SimData:
-        """Return the data of all worlds before their first episode. The key is that of ``reset``. ()"""
+        """Return the data of all worlds before their first episode. The key is that of ``reset``. ()
+
+        Raises:
+            ConfigError: If the simulation has other plugins than those with which the environment was made.
+        """
+        now = tuple(self._sim.plugins.values())
+        if [*map(id, now)] != [*map(id, self._plugins)]:
+            known = ", ".join(plugin.name for plugin in self._plugins)
+            raise ConfigError(
+                f"expected the plugins with which the environment was made ({known or 'none'}), got "
+                f"{', '.join(plugin.name for plugin in now) or 'none'}: an environment does not follow its simulation. "
+                f"Use make(..., effects=[...]), or a new environment."
+            )
         data, mesh = spread(self._default, self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=data.core.replace(rng_key=key))
         if mesh is not None:

@@ -97,8 +97,8 @@ def make(
         actions: Meaning of an action; None for the usual one of the command level.
         sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Empty for the
             true states, or for those that ``estimator``, a setting of ``Sim``, estimates.
-        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. What ``env.sim.add`` adds later is
-            not part of the environment.
+        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. ``reset`` refuses those that
+            ``env.sim.add`` adds later.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, Sim, Wind
 from crazysim.core.stage import over_worlds
-from crazysim.envs import DroneEnv, Task, draw, uniform
+from crazysim.envs import DroneEnv, Task, draw, make, uniform
 from crazysim.envs.random import between, episode_key, within
 from crazysim.envs.task import total
 from crazysim.envs.tasks.hover import Hover
@@ -212,3 +212,10 @@ def test_law_09_missing_methods_are_named(two_drones):
         NotImplementedError, match=r"task 'half': expected class Half to define observe\(data\); see docs"
     ):
         Half().observe(two_drones.data)
+
+
+def test_plugins_that_are_added_to_the_simulation_of_an_environment_are_refused():
+    env = make("hover", 2)
+    env.sim.add(Wind((1.0, 0.0, 0.0)))
+    with pytest.raises(ConfigError, match=r"was made \(.*\), got .*wind.*Use make\(\.\.\., effects="):
+        env.reset(jax.random.key(0))
