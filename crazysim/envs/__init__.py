@@ -26,7 +26,7 @@ from crazysim.envs.wrappers import (
     Normalize,
     ObservationNoise,
     Observe,
-    RandomizeData,
+    RandomizeWith,
     RewardTerms,
     Wrapper,
 )
@@ -55,7 +55,7 @@ __all__ = [
     "Normalize",
     "ObservationNoise",
     "Observe",
-    "RandomizeData",
+    "RandomizeWith",
     "RewardTerms",
     "Task",
     "Wrapper",

@@ -70,7 +70,7 @@ CASES = {
     ),
     "hover, next step": (
         lambda: envs.FrameStack(
-            envs.ActionDelay(envs.RandomizeData(envs.make("hover", N, seconds=0.3), lopsided, ("J", "J_inv")), 1), 2
+            envs.ActionDelay(envs.RandomizeWith(envs.make("hover", N, seconds=0.3), lopsided, ("J", "J_inv")), 1), 2
         ),
         "NextStep",
     ),

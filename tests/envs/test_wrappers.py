@@ -18,7 +18,7 @@ from crazysim.envs import (
     Normalize,
     ObservationNoise,
     Observe,
-    RandomizeData,
+    RandomizeWith,
     RewardTerms,
     Wrapper,
     make,
@@ -52,7 +52,7 @@ def steps(env, state, n, seed=0):
 
 def test_nothing_goes_around_automatic_resets(env):
     auto = AutoReset(env)
-    same = lambda e: RandomizeData(e, lambda d, k: d)  # noqa: E731
+    same = lambda e: RandomizeWith(e, lambda d, k: d)  # noqa: E731
     for around in (EpisodeStatistics, AutoReset, lambda e: FrameStack(e, 2), same):
         with pytest.raises(ConfigError, match="without AutoReset, which is the outermost wrapper"):
             around(auto)
@@ -155,12 +155,12 @@ def test_the_terms_of_a_reward_add_up_to_it(env):
 
 
 def test_randomised_episodes_are_observed_through_other_wrappers(env):
-    """RandomizeData may stand anywhere: episodes are randomised before they are observed."""
+    """RandomizeWith may stand anywhere: episodes are randomised before they are observed."""
 
     def lifted(data, key):
         return data.replace(states=data.states.replace(pos=data.states.pos + jnp.array([0.0, 0.0, 0.5])))
 
-    inside, outside = FrameStack(RandomizeData(env, lifted), 2), RandomizeData(FrameStack(env, 2), lifted)
+    inside, outside = FrameStack(RandomizeWith(env, lifted), 2), RandomizeWith(FrameStack(env, 2), lifted)
     a, b = (wrapped.reset(jax.random.key(0)) for wrapped in (inside, outside))
     assert trees_equal(a.obs, b.obs)
     plain = env.reset(jax.random.key(0))
@@ -333,7 +333,7 @@ def heavier(data, key):
 
 @pytest.fixture(scope="module")
 def randomized(env):
-    return RandomizeData(env.env, heavier, params=("mass",))
+    return RandomizeWith(env.env, heavier, params=("mass",))
 
 
 @pytest.fixture(scope="module")
@@ -358,12 +358,12 @@ def test_only_worlds_that_begin_anew_are_randomised_anew(randomized, heavy):
 
 def test_randomisation_does_not_depend_on_the_number_of_worlds(heavy):
     """Law 10."""
-    two = jax.jit(RandomizeData(make("hover", 2), heavier, params=("mass",)).reset)(jax.random.key(0))
+    two = jax.jit(RandomizeWith(make("hover", 2), heavier, params=("mass",)).reset)(jax.random.key(0))
     np.testing.assert_allclose(two.data.params.mass, heavy.data.params.mass[:2], rtol=1e-6)
 
 
 def test_what_cannot_be_randomised_is_refused(env):
     with pytest.raises(ConfigError, match=r"expected parameters of first_principles, mass.* got colour"):
-        RandomizeData(env.env, heavier, params=("mass", "colour"))
+        RandomizeWith(env.env, heavier, params=("mass", "colour"))
     with pytest.raises(ConfigError, match=r"params.mass cannot be randomised: all worlds share it.*params="):
-        jax.eval_shape(RandomizeData(env.env, heavier).reset, jax.random.key(0))
+        jax.eval_shape(RandomizeWith(env.env, heavier).reset, jax.random.key(0))

@@ -5,7 +5,7 @@ from crazysim.envs.wrappers.action import ActionDelay
 from crazysim.envs.wrappers.autoreset import AutoReset
 from crazysim.envs.wrappers.base import Wrapper
 from crazysim.envs.wrappers.observation import FrameStack, Normalize, ObservationNoise, Observe
-from crazysim.envs.wrappers.randomize import RandomizeData
+from crazysim.envs.wrappers.randomize import RandomizeWith
 from crazysim.envs.wrappers.rewards import EpisodeStatistics, RewardTerms
 
 __all__ = [
@@ -17,7 +17,7 @@ __all__ = [
     "Normalize",
     "ObservationNoise",
     "Observe",
-    "RandomizeData",
+    "RandomizeWith",
     "ResetPolicy",
     "RewardTerms",
     "Wrapper",

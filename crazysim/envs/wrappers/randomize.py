@@ -1,4 +1,4 @@
-"""Wrapper that randomises the simulation."""
+"""Wrapper that randomises the simulation with a function."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
 
 
-class RandomizeData(Wrapper):
+class RandomizeWith(Wrapper):
     """Begin every episode with other data: masses, motors, or whatever a function changes.
 
     ``fn(data, key) -> data`` receives one world and its key of the episode. Parameters that it changes are one per
@@ -61,6 +61,6 @@ class RandomizeData(Wrapper):
         if shared:
             raise ConfigError(
                 f"{', '.join(shared)} cannot be randomised: all worlds share it. Name parameters that should be one "
-                f"per drone in params=, as in RandomizeData(env, fn, params=('mass',))."
+                f"per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
             )
         return drawn
