@@ -126,6 +126,20 @@ def of_case(name, scope="drone"):
     return read
 
 
+def sum_of(names, scope="drone"):
+    """Return a stage that needs the results of all cases."""
+
+    @stage(scope)
+    def total(data):
+        tables = data.plugins["tables"]
+        summed = 0.0
+        for n, name in enumerate(names):
+            summed = summed + of_case(name, scope).fn(data).plugins["tables"].out * 0.9**n
+        return data.replace(plugins={"tables": tables.replace(out=summed)})
+
+    return total
+
+
 def pipeline(names, scope="drone"):
     return {name: of_case(name, scope) for name in names}
 
@@ -150,17 +164,9 @@ def test_every_engine_reads_what_plain_reads(engine, scope):
             np.testing.assert_array_equal(out, expected, err_msg=name)
         return
 
-    @stage(scope)
-    def total(data):
-        tables = data.plugins["tables"]
-        summed = 0.0
-        for n, name in enumerate(chosen):
-            after = of_case(name, scope).fn(data).plugins["tables"].out
-            summed = summed + after * 0.9**n
-        return data.replace(plugins={"tables": tables.replace(out=summed)})
-
-    expected = Step({"total": total}, "plain")(data(), jnp.int32(1)).plugins["tables"].out
-    found = Step({"total": total}, engine)(data(), jnp.int32(1)).plugins["tables"].out
+    total = {"total": sum_of(chosen, scope)}
+    expected = Step(total, "plain")(data(), jnp.int32(1)).plugins["tables"].out
+    found = Step(total, engine)(data(), jnp.int32(1)).plugins["tables"].out
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)
 
 
@@ -181,7 +187,7 @@ def test_a_table_is_read_where_it_is_and_never_selected_from():
 
 def test_the_source_for_gpus_is_well_formed():
     """All cases in one kernel, compiled by NVRTC where there is one."""
-    program = optimise(lower_stages(as_stages(pipeline(IN_KERNELS)), data()))
+    program = optimise(lower_stages(as_stages({"total": sum_of(IN_KERNELS)}), data()))
     text = kernel.write(program, "cuda").text
     assert "TABLE f32 t" in text
     assert text.count("lookup(p") > 20

@@ -1,6 +1,7 @@
 """Law 1: physics and control are written for one drone, and accept any leading axes: ``f(batch)[i] == f(batch[i])``."""
 
 import ast
+import functools
 import importlib
 import inspect
 from pathlib import Path
@@ -15,11 +16,11 @@ import crazysim
 from crazysim import Dynamics, Sim, load_airframe
 from crazysim.control import AllocationParams, AttitudeParams, StateParams, allocation, attitude, state
 from crazysim.control.controllers import CONTROLLERS
-from crazysim.dynamics import drag, first_principles, fitted, rigid_body, rotor
+from crazysim.dynamics import drag, first_principles, fitted, inflow, rigid_body, rotor
 
 BATCH = (3, 2)
 AIRFRAME = load_airframe("cf21B_500")
-MODULES = (rigid_body, rotor, drag, first_principles, fitted, allocation, attitude, state)
+MODULES = (rigid_body, rotor, inflow, drag, first_principles, fitted, allocation, attitude, state)
 
 
 def functions_of(module):
@@ -75,6 +76,19 @@ def arguments(module, function, model, rng, per_drone):
         "thrust": lambda: rng.uniform(0, 0.2, (*BATCH, 4)),
         "drag_torque": lambda: rng.uniform(0, 1e-3, (*BATCH, 4)),
     }
+    if module is inflow:
+        ranges = {
+            "static_thrust": (0, 0.2),
+            "ang_vel": (0, 2500),
+            "axial": (-5, 5),
+            "in_plane_square": (0, 25),
+            "blade": (1e-6, 1e-5),
+            "radius": (0.02, 0.03),
+            "air_density": (1.0, 1.3),
+            "ceiling": (1.0, 1.5),
+            "gap": (0, 0.2),
+        }
+        drawn = {name: functools.partial(rng.uniform, *ends, (*BATCH, 4)) for name, ends in ranges.items()}
     batched, common = {}, {}
     for name in inspect.signature(function).parameters:
         if name == "ctrl_freq":
@@ -148,7 +162,9 @@ def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
 
 
 def test_the_cases_cover_dynamics_and_control():
-    """No module of physics or control that computes arrays is missing: ``parameters`` only loads them.
+    """No module of physics or control that computes arrays is missing.
+
+    ``parameters`` only loads them, and in ``firmware`` a library computes, which ``test_c_firmware`` compares.
 
     Laws of controllers are covered by the controllers that use them.
     """
@@ -156,7 +172,7 @@ def test_the_cases_cover_dynamics_and_control():
     for place in CONTROLLERS.values():
         module = importlib.import_module(place.partition(":")[0])
         covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
-    names = ("__init__", "levels", "models", "parameters", "protocol", "controllers", "setpoint", "switch")
+    names = ("__init__", "levels", "models", "parameters", "protocol", "controllers", "setpoint", "switch", "firmware")
     for path in sources():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
         assert name in covered or path.stem in names, name

@@ -43,7 +43,7 @@ HALF_CONE = 0.5 * 15 * math.pi / 180
 REVERSION = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
-_UPPER = np.triu_indices(N)
+_UPPER = tuple([places.astype(np.int32) for places in np.triu_indices(N)])
 _PLACE = np.zeros((N, N), int)
 _PLACE[_UPPER] = np.arange(N_COV)
 _PLACE = np.maximum(_PLACE, _PLACE.T)
