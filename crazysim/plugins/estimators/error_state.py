@@ -43,8 +43,9 @@ HALF_CONE = 0.5 * 15 * math.pi / 180
 REVERSION = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
-_UPPER = tuple([places.astype(np.int32) for places in np.triu_indices(N)])
-_PLACE = np.zeros((N, N), int)
+# Unsigned: to signed indices JAX 0.10 adds sizes of the precision in which it indexed first, float32 or float64.
+_UPPER = tuple([places.astype(np.uint32) for places in np.triu_indices(N)])
+_PLACE = np.zeros((N, N), np.uint32)
 _PLACE[_UPPER] = np.arange(N_COV)
 _PLACE = np.maximum(_PLACE, _PLACE.T)
 
