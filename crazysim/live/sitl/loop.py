@@ -75,7 +75,7 @@ class SoftwareInTheLoop(Closing):
         self._n_steps = sim.freq // freq
         airframes = [*as_airframes(sim.airframes, sim.n_drones)] * sim.n_worlds
         self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]
-        self._airframes = airframes
+        self._airframes, self._fastest = airframes, [airframe.rotor_vel_limits[1] for airframe in airframes]
         self._sensors: dict[type, Any] = {
             kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None)
             for kind in (IMU, Barometer, Magnetometer, GPS)
@@ -119,7 +119,7 @@ class SoftwareInTheLoop(Closing):
                     f"firmware, or set timeout."
                 )
             if command is not None:
-                self._rotor_vel[k, self._orders[k]] = self._speeds(k, command)
+                self._rotor_vel[k] = self._speeds(k, command)
         self._exchanges += 1
         sim = self.sim
         sim.rotor_vel_control(self._rotor_vel.reshape(sim.n_worlds, sim.n_drones, 4))
@@ -166,12 +166,13 @@ class SoftwareInTheLoop(Closing):
             link.close()
 
     def _speeds(self, k: int, command: NDArray) -> NDArray:
-        """Return the rotor speeds of a drone for its motor commands, rpm. (4,)"""
-        airframe = self._airframes[k]
+        """Return the speeds of the rotors of a drone for the motor commands of its firmware, rpm. (4,)"""
+        of_rotors, airframe = np.zeros(4), self._airframes[k]
+        of_rotors[self._orders[k]] = command
         if self.motors == "speed":
-            return command * airframe.rotor_vel_limits[1]
-        speeds = airframe.rotor_vel(command * float(airframe.value("rotors.thrust_max")))
-        return np.where(command > 0, speeds, 0.0)
+            return of_rotors * self._fastest[k]
+        speeds = airframe.rotor_vel(of_rotors * float(airframe.value("rotors.thrust_max")))
+        return np.where(of_rotors > 0, speeds, 0.0)
 
 
 def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) -> NDArray:
