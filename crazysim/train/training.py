@@ -101,9 +101,7 @@ def train(
             f"with --out"
         )
     algorithm, hyperparameters = ALGORITHMS[config.algorithm], config.algorithm_config()
-    # A gradient runs on lanes in any case; a kernel for the forward pass would take longer to compile than it saves.
-    engine = {"engine": "lanes"} if algorithm is apg else {}
-    base = config.make_env(config.n_worlds, **engine | config.practice_options())
+    base = config.make_env(config.n_worlds, **config.practice_options())
     env = base if algorithm is apg else AutoReset(base)
     eval_env = config.make_env(evaluation_worlds)
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
