@@ -30,10 +30,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("identify", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
-    add("logs", type=Path, nargs="+", metavar="LOG", help="logs to fit: .csv, .npz, PX4's .ulg, or of a micro-SD card")
+    add(
+        "logs",
+        type=Path,
+        nargs="+",
+        metavar="LOG",
+        help="logs to fit: .csv, .npz, .ulg of PX4, ROS bags, or of a micro-SD card",
+    )
     add("--airframe", default="cf21B_500", help="airframe to start from: a name or a TOML file")
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
     add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
+    add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
     add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
     add("--iterations", type=int, default=1000, metavar="N", help="iterations of that training")
@@ -46,7 +53,16 @@ def run(options: argparse.Namespace) -> None:
     if options.out.suffix != ".toml" or not options.out.parent.is_dir() or options.out.exists():
         raise ValueError(f"expected a new .toml file in an existing folder, got {str(options.out)!r}")
     columns = _columns(options.columns) if options.columns else None
-    logs, held_out = ([read_log(path, columns) for path in paths] for paths in (options.logs, options.test))
+    paths = [*options.logs, *options.test]
+    if options.motion and len(options.motion) != len(paths):
+        raise ValueError(
+            f"expected motion capture of each of {len(paths)} logs, got {len(options.motion)} files. "
+            "Name them in the order of the logs, then of those of --test."
+        )
+    every = [
+        read_log(*x) for x in zip(paths, [columns] * len(paths), options.motion or [None] * len(paths), strict=True)
+    ]
+    logs, held_out = every[: len(options.logs)], every[len(options.logs) :]
     for log in logs + held_out:
         for repair in log.repairs:
             print(f"{log.name}: {repair}")
@@ -84,5 +100,6 @@ def _columns(texts: Sequence[str]) -> Columns:
     unknown = sorted(set(fields) - set(Columns.__dataclass_fields__))
     if unknown:
         raise ValueError(f"expected fields of {', '.join(Columns.__dataclass_fields__)}, got {unknown[0]!r}")
-    convert: dict[str, Callable[[str], Any]] = {"time": str, "rpm_per_unit": float, "rad_per_unit": float}
-    return Columns(**{k: convert.get(k, lambda x: tuple(x.split(",")))(x) for k, x in fields.items()})
+    convert: dict[str, Callable[[str], Any]] = {name: float for name in Columns.__dataclass_fields__ if "_per_" in name}
+    convert["time"] = str
+    return Columns(**{k: convert.get(k, lambda x: tuple(filter(None, x.split(","))))(x) for k, x in fields.items()})

@@ -67,7 +67,7 @@ def fit_residual(
     if n_hidden < 0 or min(iterations, batch_size) < 1:
         raise ConfigError(
             f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "
-            f"and {batch_size}"
+            f"and {batch_size}. Leave them out for the defaults."
         )
     data, dt, params = windows(logs, DURATION, STRIDE), logs[0].dt, model.params
     held_out = windows(validation, DURATION, 4 * STRIDE) if validation else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
@@ -15,6 +15,10 @@ from crazysim.errors import ConfigError
 
 LONGEST_HOLD = 3.0
 """Intervals of a stream, after which its interpolated values count as a gap."""
+QUAT = ("qx", "qy", "qz", "qw")
+"""Names of the columns of an attitude, body to world."""
+LARGEST_RATE = 250.0
+"""Rate to which faster logs are averaged, Hz: above some 50 Hz nothing is identified."""
 
 
 class Stream(NamedTuple):
@@ -26,7 +30,9 @@ class Stream(NamedTuple):
     """Values by name. (n,) each"""
 
 
-def at_equal_times(name: str, streams: Mapping[str, Stream], repairs: list[str]) -> dict[str, NDArray]:
+def at_equal_times(
+    name: str, streams: Mapping[str, Stream], repairs: list[str], quat: Sequence[str] = QUAT
+) -> dict[str, NDArray]:
     """Return the columns of all streams, interpolated linearly at the times of the fastest; ``t`` begins at zero.
 
     Where a stream pauses for over three of its intervals the samples are left out, which leaves a gap.
@@ -35,6 +41,7 @@ def at_equal_times(name: str, streams: Mapping[str, Stream], repairs: list[str])
         name: Name of the file, for messages.
         streams: Streams by name.
         repairs: List that descriptions of repairs are appended to.
+        quat: Names of the columns of the attitude, whose signs are made continuous first.
 
     Raises:
         ConfigError: If no two streams overlap, or a stream has fewer than two samples.
@@ -46,7 +53,13 @@ def at_equal_times(name: str, streams: Mapping[str, Stream], repairs: list[str])
             repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples repeat a time")
         if len(order) < 2:
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
-        sorted_streams[key] = Stream(stream.t[order], {c: x[order] for c, x in stream.columns.items()})
+        columns = {c: x[order] for c, x in stream.columns.items()}
+        if quat and all(c in columns for c in quat):
+            turned = np.stack([columns[c] for c in quat], axis=-1)
+            # A quaternion and its negative are one attitude, and interpolation needs neighbours of one sign.
+            sign = np.cumprod(np.r_[1.0, np.where(np.sum(turned[1:] * turned[:-1], axis=-1) < 0, -1.0, 1.0)])
+            columns |= {c: sign * columns[c] for c in quat}
+        sorted_streams[key] = Stream(stream.t[order], columns)
     steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
     start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
     dt = min(steps.values())
@@ -59,6 +72,21 @@ def at_equal_times(name: str, streams: Mapping[str, Stream], repairs: list[str])
         before = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
         keep &= s.t[before + 1] - s.t[before] <= LONGEST_HOLD * steps[key]
     return {"t": (t - start)[keep]} | {c: x[keep] for c, x in table.items()}
+
+
+def decimated(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
+    """Return the table with means over as many samples as bring it to ``LARGEST_RATE`` or just below.
+
+    Args:
+        table: Columns by name, with the time ``t``, s.
+        repairs: List that descriptions of repairs are appended to.
+    """
+    step = float(np.median(np.diff(table["t"]))) if len(table["t"]) > 1 else 0.0
+    if not step > 0 or (size := int(np.ceil(1 / (LARGEST_RATE * step) - 1e-6))) < 2:
+        return table
+    n = len(table["t"]) // size * size
+    repairs.append(f"averaged {size} samples each of a log at {1 / step:.0f} Hz")
+    return {key: x[:n].reshape(-1, size).mean(axis=1) for key, x in table.items()}
 
 
 def read_crazyflie(path: Path, repairs: list[str]) -> dict[str, NDArray]:
@@ -75,10 +103,16 @@ def read_crazyflie(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     """
     data = path.read_bytes()
     if len(data) < 9 or data[0] != 0xBC:
-        raise ConfigError(f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC")
+        raise ConfigError(
+            f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
+            "Tables need the ending .csv or .npz."
+        )
     version, n_kinds = struct.unpack_from("<HH", data, 1)
     if version not in (1, 2):
-        raise ConfigError(f"{path.name}: expected version 1 or 2 of the format, got {version}")
+        raise ConfigError(
+            f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
+            "firmware's tools/usdlog."
+        )
     end = len(data) - 4
     if crc32(data[:end]) != struct.unpack_from("<I", data, end)[0]:
         repairs.append("the checksum does not match: read up to the last whole record")
@@ -86,7 +120,9 @@ def read_crazyflie(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     try:
         kinds, at = _kinds(data, n_kinds)
     except (struct.error, ValueError) as error:
-        raise ConfigError(f"{path.name}: expected names of log variables in the header, got {error}") from error
+        raise ConfigError(
+            f"{path.name}: expected names of log variables in the header, got {error}. Copy the file again."
+        ) from error
     head = struct.Struct("<HI" if version == 1 else "<HQ")
     unit = 1e-3 if version == 1 else 1e-6
     rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in kinds}
@@ -104,7 +140,7 @@ def read_crazyflie(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             table = np.array(rows[key], np.float64)
             streams[name] = Stream(table[:, 0], dict(zip(variables, table.T[1:], strict=True)))
     if not streams:
-        raise ConfigError(f"{path.name}: expected records, got none")
+        raise ConfigError(f"{path.name}: expected records, got none. Start the log before the flight.")
     return at_equal_times(path.name, streams, repairs)
 
 
@@ -156,7 +192,10 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     found = {d.name: d.data for d in log.data_list if d.multi_id == 0}
     needed = ("vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity", "esc_status")
     if missing := [key for key in needed if key not in found]:
-        raise ConfigError(f"{path.name}: expected messages {', '.join(missing)}, got {', '.join(sorted(found))}")
+        raise ConfigError(
+            f"{path.name}: expected messages {', '.join(missing)}, got {', '.join(sorted(found))}. "
+            "Add them to PX4's logged topics; esc_status needs ESCs with telemetry."
+        )
     place, turn, rates, escs = (found[key] for key in needed)
     n_rotors = int(np.max(escs["esc_count"])) if "esc_count" in escs else 4
     columns = {
@@ -169,9 +208,7 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         "vehicle_angular_velocity": {"wx": rates["xyz[0]"], "wy": -rates["xyz[1]"], "wz": -rates["xyz[2]"]},
         "esc_status": {f"rpm{k + 1}": np.abs(escs[f"esc[{k}].esc_rpm"]) for k in range(n_rotors)},
     }  # fmt: skip
-    turned = np.stack(list(columns["vehicle_attitude"].values()), axis=-1)
-    # A quaternion and its negative are one attitude, and interpolation needs neighbours of one sign.
-    sign = np.cumprod(np.r_[1.0, np.where(np.sum(turned[1:] * turned[:-1], axis=-1) < 0, -1.0, 1.0)])
-    columns["vehicle_attitude"] = {key: sign * x for key, x in columns["vehicle_attitude"].items()}
-    streams = {key: Stream(found[key]["timestamp"] * 1e-6, columns[key]) for key in needed}
+    if "battery_status" in found:
+        columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}
+    streams = {key: Stream(found[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}
     return at_equal_times(path.name, streams, repairs)

@@ -1,4 +1,4 @@
-"""Files of flight controllers, written here byte by byte, are read; damaged ones are repaired or refused."""
+"""Files of flight controllers and robots, written here, are read; damaged ones are repaired or refused."""
 
 import struct
 from zlib import crc32
@@ -137,3 +137,208 @@ def test_ulogs_without_rotor_speeds_are_refused(tmp_path):
     pytest.importorskip("pyulog")
     with pytest.raises(ConfigError, match="esc_status"):
         read_log(ulog(tmp_path / "flight.ulg", leave_out=["esc_status"]))
+
+
+FAST = np.arange(5.0, 5.0 + 0.01 * N, 0.001)
+"""Times of the blackbox, s."""
+
+
+def swing(t):
+    """Return roll, rad, and its rate, rad/s, of a swing that does not repeat itself."""
+    return 0.3 * np.sin(t) + 0.1 * np.sin(2.7 * t), 0.3 * np.cos(t) + 0.27 * np.cos(2.7 * t)
+
+
+def blackbox(path, explorer=False, damaged=0, leave_out=()):
+    """Write a log at 1 kHz as blackbox_decode or the Blackbox Explorer (12 poles, high resolution) does."""
+    names = ["loopIteration", "time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(4))]
+    names += [*(f"eRPM[{k}]" for k in range(4)), "vbatLatest", "flightModeFlags"]
+    _, rate = swing(FAST)
+    scale = 10 if explorer else 1
+    cells = [np.arange(len(FAST)), np.round(1e6 * FAST), np.degrees(rate) * scale, 0 * FAST, 0 * FAST]
+    cells += [np.full(len(FAST), 1000.0 + k) for k in range(4)] + [np.full(len(FAST), 60.0 + k) for k in range(4)]
+    cells += [np.full(len(FAST), 1610.0 if explorer else 16.1)]
+    keep = [k for k, name in enumerate(names) if name not in leave_out]
+    unit = {} if explorer else {"time": " (us)", "vbatLatest": " (V)", "flightModeFlags": " (flags)"}
+    header = [names[k] + unit.get(names[k], "") for k in keep]
+    lines = ['"Product","Blackbox flight data recorder"', '"motor_poles",12', '"blackbox_high_resolution","1"']
+    lines = [*lines, ",".join(f'"{x}"' for x in header)] if explorer else [", ".join(header)]
+    rows = [
+        [*(f"{c:.6g}" if k > 1 else f"{c:.0f}" for k, c in enumerate(row)), "ANGLE_MODE|ARM"]
+        for row in zip(*cells, strict=True)
+    ]
+    lines += [",".join(row[k] for k in keep) if i >= damaged else "1,2" for i, row in enumerate(rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def mocap(offset=0.0, reverse=False):
+    """Return motion capture of the same swing at 100 Hz, on a clock that is behind by an offset, s."""
+    angle, _ = swing(T)
+    if reverse:
+        angle = np.cumsum(np.random.default_rng(0).normal(size=N)) * 0.03
+    columns = {
+        "x": T,
+        "y": 2 * T,
+        "z": T**2 / 2,
+        "qx": np.sin(angle / 2),
+        "qy": 0 * T,
+        "qz": 0 * T,
+        "qw": np.cos(angle / 2),
+    }
+    return columns | {"t": T - offset}
+
+
+@pytest.mark.parametrize("explorer", [False, True])
+def test_blackbox_logs_are_joined_with_motion_capture(tmp_path, explorer):
+    log = read_log(blackbox(tmp_path / "LOG00001.csv", explorer), motion=mocap(offset=1234.56))
+    assert log.dt == pytest.approx(0.004)
+    angle, rate = swing(log.t - log.t[0] + 5.0015)  # times are means of four samples
+    np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=2e-3)
+    # The clocks agree to a fraction of the 0.005 s of the search.
+    np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]), angle, atol=3e-3)
+    np.testing.assert_allclose(log.vel[20:-20, 1], 2, atol=1e-3)  # differentiated
+    np.testing.assert_allclose(log.vel[20:-20, 2], log.pos[20:-20, 0], atol=5e-3)
+    poles = 12 if explorer else 14
+    np.testing.assert_allclose(log.rotor_vel[0], np.arange(60, 64) * 200 / poles)
+    np.testing.assert_allclose(log.command[0], np.arange(1000, 1004))
+    np.testing.assert_allclose(log.voltage, 16.1)
+    assert any("clock" in x for x in log.repairs)
+
+
+def test_bad_blackbox_logs_are_repaired_or_refused(tmp_path):
+    path = tmp_path / "LOG00001.csv"
+    assert "dropped 50 rows" in read_log(blackbox(path, damaged=50), motion=mocap()).repairs[0]
+    with pytest.raises(ConfigError, match="Decode the log again"):
+        read_log(blackbox(path, damaged=2000), motion=mocap())
+    with pytest.raises(ConfigError, match="--motion"):
+        read_log(blackbox(path))
+    with pytest.raises(ConfigError, match="one flight"):
+        read_log(blackbox(path), motion=mocap(reverse=True))
+    with pytest.raises(ConfigError, match=r"gyroADC\[1\]"):
+        read_log(blackbox(path, leave_out=["gyroADC[1]"]), motion=mocap())
+    with pytest.raises(ConfigError, match="degrees per second"):
+        read_log(blackbox(path, explorer=True), Columns(rad_per_unit=60.0), motion=mocap())
+
+
+def bag(path, leave_out=(), odometry=True):
+    """Write a bag of ROS 2: pose or odometry and rotor speeds at 100 Hz, gyroscope at 200 Hz, all with headers."""
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(
+        get_types_from_msg(
+            "std_msgs/Header header\nfloat64[] position\nfloat64[] velocity\nfloat64[] normalized",
+            "actuator_msgs/msg/Actuators",
+        )
+    )
+    m = store.types
+
+    def make(kind, **fields):
+        return m[kind](**fields)
+
+    def header(t):
+        stamp = make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
+        return make("std_msgs/msg/Header", stamp=stamp, frame_id="world")
+
+    def vector(kind, *x):
+        return make(f"geometry_msgs/msg/{kind}", **dict(zip("xyzw", map(float, x), strict=False)))
+
+    with Writer(path, version=9) as writer:
+        pose_kind = "nav_msgs/msg/Odometry" if odometry else "geometry_msgs/msg/PoseStamped"
+        kinds = {
+            "/drone/pose": pose_kind,
+            "/drone/imu": "sensor_msgs/msg/Imu",
+            "/motors": "actuator_msgs/msg/Actuators",
+        }
+        kinds = {topic: kind for topic, kind in kinds.items() if topic not in leave_out}
+        topics = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+
+        def write(topic, t, message):
+            if topic in topics:
+                # The bag's own time is late; that of the header counts.
+                writer.write(topics[topic], round(1e9 * (t + 0.3)), store.serialize_cdr(message, kinds[topic]))
+
+        for k, t in enumerate(np.arange(5.0, 9.0, 0.005)):
+            angle, rate = swing(t)
+            quat = np.array([np.sin(angle / 2), 0, 0, np.cos(angle / 2)]) * (-1 if k % 4 else 1)
+            gyro = make(
+                "sensor_msgs/msg/Imu", header=header(t), orientation=vector("Quaternion", 0, 0, 0, 1),
+                orientation_covariance=np.zeros(9), angular_velocity=vector("Vector3", rate, 0, 0),
+                angular_velocity_covariance=np.zeros(9), linear_acceleration=vector("Vector3", 0, 0, 0),
+                linear_acceleration_covariance=np.zeros(9),
+            )  # fmt: skip
+            write("/drone/imu", t, gyro)
+            if k % 2:
+                continue
+            pose = make(
+                "geometry_msgs/msg/Pose", position=vector("Point", 1, t, 3), orientation=vector("Quaternion", *quat)
+            )
+            if odometry:
+                # 1 m/s along world y, in the frame of the body.
+                twist = make(
+                    "geometry_msgs/msg/Twist",
+                    linear=vector("Vector3", 0, np.cos(angle), -np.sin(angle)), angular=vector("Vector3", 9, 9, 9),
+                )  # fmt: skip
+                message = make(
+                    pose_kind, header=header(t), child_frame_id="body",
+                    pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+                    twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+                )  # fmt: skip
+            else:
+                message = make(pose_kind, header=header(t), pose=pose)
+            write("/drone/pose", t, message)
+            speeds = np.array([100.0, -200.0, 300.0, -400.0])
+            empty = np.zeros(0)
+            write(
+                "/motors",
+                t,
+                make(
+                    kinds.get("/motors", "actuator_msgs/msg/Actuators"),
+                    header=header(t),
+                    position=empty,
+                    velocity=speeds,
+                    normalized=empty,
+                ),
+            )
+    return path
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_ros_bags_are_read_by_the_types_of_their_topics(tmp_path, odometry):
+    pytest.importorskip("rosbags")
+    log = read_log(bag(tmp_path / "flight", odometry=odometry))
+    assert log.dt == pytest.approx(0.005)
+    angle, rate = swing(log.t + 5.0)
+    np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]) * np.sign(log.quat[0, 3]), angle, atol=1e-3)
+    np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=1e-6)
+    np.testing.assert_allclose(log.vel, [[0, 1, 0]] * len(log.t), atol=2e-3)  # linear interpolation of the twist
+    np.testing.assert_allclose(log.rotor_vel[7], np.arange(100, 500, 100) * 60 / (2 * np.pi))
+
+
+def test_ros_bags_are_read_by_a_map_of_topics(tmp_path):
+    pytest.importorskip("rosbags")
+    columns = Columns(
+        pos=tuple(f"/drone/pose/pose/position/{k}" for k in "xyz"),
+        quat=tuple(f"/drone/pose/pose/orientation/{k}" for k in "xyzw"),
+        ang_vel=tuple(f"/drone/imu/angular_velocity/{k}" for k in "xyz"),
+        rotor_vel=("/motors/velocity[0]", "-/motors/velocity[1]", "/motors/velocity[2]", "-/motors/velocity[3]"),
+        rpm_per_unit=60 / (2 * np.pi),
+    )
+    path = bag(tmp_path / "flight", odometry=False)
+    log, same = read_log(path, columns), read_log(path)
+    for key in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
+        np.testing.assert_allclose(getattr(log, key), getattr(same, key), err_msg=key)
+
+
+def test_ros_bags_without_a_topic_or_a_field_are_refused(tmp_path):
+    pytest.importorskip("rosbags")
+    with pytest.raises(ConfigError, match=r"expected a topic of nav_msgs.*/motors"):
+        read_log(bag(tmp_path / "a", leave_out=["/drone/pose"]))
+    with pytest.raises(ConfigError, match=r"expected a topic and a field.*/drone/pose \(nav_msgs"):
+        read_log(bag(tmp_path / "b"), Columns(voltage=("/battery/voltage",)))
+    with pytest.raises(ConfigError, match="ros2 interface show"):
+        read_log(tmp_path / "b", Columns(voltage=("/drone/imu/voltage",)))
+    (tmp_path / "c.bag").write_bytes(b"no bag")
+    with pytest.raises(ConfigError, match="expected a bag"):
+        read_log(tmp_path / "c.bag")
