@@ -34,6 +34,7 @@ __all__ = [
     "Literal",
     "Parameters",
     "as_function",
+    "batched_as",
     "batched_primitive",
     "batched_rule",
     "bind",
@@ -48,7 +49,6 @@ __all__ = [
     "is_key",
     "is_symbolic_zero",
     "jaxpr_as_fun",
-    "linear_primitive",
     "n_compilations",
     "primitive_by_platform",
     "put_own",
@@ -181,22 +181,80 @@ def simple_primitive(name: str, fn: Callable[..., list[Any]], batched: Callable[
 
 
 def primitive_by_platform(
-    name: str, results: Callable[..., Sequence[Any]], on: Mapping[str, Callable[..., Any]]
+    name: str,
+    results: Callable[..., Sequence[Any]],
+    on: Mapping[str, Callable[..., Any]],
+    *,
+    derivative: Callable[..., Sequence[Any]] | None = None,
+    transposed: Callable[..., Sequence[Any]] | None = None,
+    batched: Callable[..., Sequence[Any]] | None = None,
 ) -> Primitive:
     """Return a primitive that is lowered, only then, as the function of the platform that it is compiled for.
 
+    Functions of it take operands, and parameters, which are hashable, as keywords.
+
     Args:
         name: Its name.
-        results: From operands and parameters, which are hashable, to the shapes and types of its results.
-        on: Functions of operands and parameters to a list of results, by platform: ``"cpu"``, ``"cuda"``, ...
+        results: To the shapes and types of its results.
+        on: To a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all others.
+        derivative: The same, written so that JAX can differentiate it.
+        transposed: For a function that is linear in all operands but the first ``n_fixed``, a parameter: from these
+            operands and cotangents of all results to the cotangents of the others.
+        batched: Rule for ``vmap``: from the primitive, the size of the axis, the operands, whose batched axis is the
+            first, and whether each has one, to results that all have one.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(lambda *args, **params: _compiled_primitive(primitive, **params)(*args))
     primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
     for platform, fn in on.items():
-        mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True), platform=platform)
+        mlir.register_lowering(primitive, mlir.lower_fun(fn, multiple_results=True), platform=platform or None)
+    if derivative is not None:
+        ad.primitive_jvps[primitive] = functools.partial(_derivative_of, derivative)
+    if transposed is not None:
+        ad.primitive_transposes[primitive] = functools.partial(_transposed_by, transposed)
+    if batched is not None:
+        batching.primitive_batchers[primitive] = functools.partial(_batched_by, batched, primitive)
     return primitive
+
+
+def _derivative_of(fn: Callable[..., Any], primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
+    changing = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
+
+    def of(*some: Any) -> Any:
+        args = list(primals)
+        for i, x in zip(changing, some, strict=True):
+            args[i] = x
+        return list(fn(*args, **params))
+
+    return jax.jvp(of, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
+
+
+def _transposed_by(
+    fn: Callable[..., Any], cotangents: Sequence[Any], *args: Any, n_fixed: int, **params: Any
+) -> list[Any]:
+    fixed, linear = args[:n_fixed], args[n_fixed:]
+    found = fn(fixed, [ad.instantiate_zeros(x) for x in cotangents], n_fixed=n_fixed, **params)
+    own = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(found, linear, strict=True)]
+    return [*(None for _ in fixed), *own]
+
+
+def _batched_by(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: Any, **params: Any) -> Any:
+    batched = [d is not batching.not_mapped for d in dims]
+    moved = [jax.numpy.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
+    n = next(x.shape[0] for x, b in zip(moved, batched, strict=True) if b)
+    out = list(fn(primitive, n, moved, batched, **params))
+    return out, [0] * len(out)
+
+
+def batched_as(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the rule for ``vmap`` of a primitive that takes what a function makes of its operands."""
+
+    def rule(primitive: Primitive, n: int, args: Sequence[Any], batched: Sequence[bool], **params: Any) -> Any:
+        del primitive, n
+        return jax.vmap(functools.partial(fn, **params), tuple([0 if b else None for b in batched]))(*args)
+
+    return rule
 
 
 @functools.lru_cache(maxsize=64)
@@ -288,66 +346,6 @@ def batched_rule(fn: Callable[..., Any], rule: Callable[..., Any]) -> Callable[.
 def is_symbolic_zero(tangent: Any) -> bool:
     """Return whether the tangent that a rule of ``defjvp(symbolic_zeros=True)`` was given is zero by construction."""
     return tangent is None or isinstance(tangent, SymbolicZero)
-
-
-def linear_primitive(
-    name: str,
-    results: Callable[..., Sequence[Any]],
-    forward: Callable[..., Sequence[Any]],
-    backward: Callable[..., Sequence[Any]] | None = None,
-    derivative: Callable[..., Sequence[Any]] | None = None,
-) -> Primitive:
-    """Return a primitive for a function that is linear in some operands, with a transpose of its own.
-
-    Its first ``n_fixed`` operands, a parameter, are those that it is not linear in. Any other transformation is that
-    of ``forward``.
-
-    Args:
-        name: Its name.
-        results: From operands and parameters, which are hashable, to the shapes and types of its results.
-        forward: The function, from operands and parameters to results.
-        backward: From the first operands, cotangents of all results and parameters to the cotangents of the others;
-            None for a function that is not linear.
-        derivative: The same function, written so that JAX can differentiate it; None for ``forward``.
-    """
-    primitive = Primitive(name)
-    primitive.multiple_results = True
-
-    def impl(*args: Any, **params: Any) -> Any:
-        return jax.jit(functools.partial(forward, **params))(*args)
-
-    def jvp(primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
-        changing = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
-
-        def of(*some: Any) -> Any:
-            args = list(primals)
-            for i, x in zip(changing, some, strict=True):
-                args[i] = x
-            return list((derivative or forward)(*args, **params))
-
-        return jax.jvp(of, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
-
-    def transposed(cotangents: Sequence[Any], *args: Any, n_fixed: int, **params: Any) -> list[Any]:
-        fixed, linear = args[:n_fixed], args[n_fixed:]
-        seeds = [ad.instantiate_zeros(x) for x in cotangents]
-        if backward is None:
-            raise NotImplementedError(f"{name} is not linear, so it has no transpose")
-        found = backward(fixed, seeds, n_fixed=n_fixed, **params)
-        own = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(found, linear, strict=True)]
-        return [*(None for _ in fixed), *own]
-
-    def batched(args: Sequence[Any], dims: Sequence[Any], **params: Any) -> Any:
-        out = list(jax.vmap(functools.partial(forward, **params), tuple(dims))(*args))
-        return out, [0] * len(out)
-
-    primitive.def_impl(impl)
-    primitive.def_abstract_eval(lambda *args, **params: list(map(jax.typeof, results(*args, **params))))
-    mlir.register_lowering(primitive, mlir.lower_fun(forward, multiple_results=True))
-    ad.primitive_jvps[primitive] = jvp
-    if backward is not None:
-        ad.primitive_transposes[primitive] = transposed
-    batching.primitive_batchers[primitive] = batched
-    return primitive
 
 
 # Compilation ----------------------------------------------------------------------------------------------------

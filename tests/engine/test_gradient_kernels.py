@@ -10,9 +10,11 @@ from crazysim import Sim, reduce_over_others, stage
 from crazysim.core import functional as F
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.engine import Step, explain
-from crazysim.engine.backends import cuda, native, reverse, xla
+from crazysim.engine.backends import cuda, kernel, native, reverse, xla
 from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.ir.verify import verify, verify_block
 from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.tangents import block_with_tangents, with_tangents
 from crazysim.engine.lowering.transpose import transposed
 from crazysim.errors import EngineWarning
 
@@ -30,9 +32,10 @@ def functions(n_worlds=3, n_drones=1, stages=(), n_steps=7, **options):
         start = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos + jnp.sin(apart)))
         step = Step(sim.step_pipeline, engine)
 
-        def losses(x, step=step, start=start):
+        def losses(x, step=step, start=start, mass=sim.data.params.mass):
             cmd, vel = x
-            data = start.replace(states=start.states.replace(vel=vel))
+            params = start.params.replace(mass=mass)
+            data = start.replace(states=start.states.replace(vel=vel), params=params)
             s = step(F.attitude_control(data, cmd), n_steps).states
             return jnp.sum(s.pos * jnp.array([1.0, -2.0, 3.0]) + 0.5 * s.vel**2 + s.quat[..., :3], (1, 2))
 
@@ -59,6 +62,25 @@ OPERATIONS = {
     "own derivative": lambda x, y: jax.nn.relu(x) * jax.nn.softplus(y) + jax.nn.silu(x * y),
     "unused": lambda x, y: jnp.floor(x) + jax.lax.stop_gradient(y) * x,
 }
+
+
+def branching(x, y):
+    """Only what forward mode takes: a number of turns that depends on the numbers, and a loop that changes nothing."""
+    z = jax.lax.while_loop(lambda c: c[0] < 3.0, lambda c: (c[0] + 1.0 + y * y, jnp.sin(c[1]) * y), (jnp.abs(x), x))[1]
+    return z + jax.lax.fori_loop(0, 5, lambda i, n: n + i, jnp.int32(0)) * x
+
+
+@pytest.mark.parametrize("fn", [*OPERATIONS.values(), branching], ids=[*OPERATIONS, "branching"])
+def test_a_block_with_tangents_is_what_jax_makes_of_the_function(fn, x64):
+    """With respect to both operands, and to the second alone."""
+    block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
+    x, y, dx, dy = map(jnp.asarray, np.random.default_rng(1).normal(size=(4, 16)))
+    for some, way in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
+        made = block_with_tangents(block, [block.inputs[k] for k in some])
+        verify_block(made)
+        found = xla.run(made, [x, y, *(way[k] for k in some)], (16,))
+        for a, b in zip(found, jax.jvp(jax.vmap(fn), (x, y), way), strict=True):
+            np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
@@ -89,7 +111,40 @@ def test_a_kernel_goes_back(x64, monkeypatch):
     assert "gradient: one kernel" in explain(step, data)
 
     many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), at)
-    assert_same(jax.vmap(gradient(in_intervals))(many), jax.vmap(gradient(plain))(many))
+    expected = jax.vmap(gradient(plain))(many)
+    assert_same(jax.vmap(gradient(in_intervals))(many), expected)
+    assert_same(gradient(jax.vmap(in_intervals))(many), expected)
+    assert "lanes" not in explain(step, data)
+
+
+@needs_compiler
+def test_a_kernel_takes_tangents_along(x64):
+    """Of one direction and of many, with respect to what drones have and to what they share; twice as well."""
+    ((fast, step, data), (plain, *_)), at = functions(n_steps=3, n_drones=2)
+    of = lambda losses: jax.jit(jax.jacfwd(lambda x, mass: losses(x, mass=mass), (0, 1)))  # noqa: E731
+    mass = data.params.mass
+    expected = of(plain)(at, mass)
+    assert_same(of(fast)(at, mass), expected)
+    slope = jax.jit(lambda mass, way: jax.jvp(lambda mass: fast(at, mass=mass), (mass,), (way,))[1])
+    assert_same(slope(mass, 3.0 * mass), 3.0 * expected[1] @ mass)
+    ran = [line for line in explain(step, data).splitlines() if "jvp" in line]
+    assert ran
+    assert all(line.startswith("jvp: one kernel") for line in ran)
+    _, tangent = jax.linearize(lambda vel: fast((at[0], vel)), at[1])
+    assert_same(jax.jit(tangent)(at[1]), jnp.einsum("wvdi,vdi->w", expected[0][1], at[1]))
+
+
+@needs_compiler
+def test_second_derivatives_are_those_of_lanes(x64):
+    """Forward over forward, and forward over reverse."""
+    pairs, (cmd, vel) = functions(n_worlds=1, n_steps=1, dynamics="so_rpy")
+
+    def twice(losses):
+        loss = lambda x: jnp.sum(losses((cmd, x)))  # noqa: E731
+        forward = lambda x: jax.jvp(loss, (x,), (vel,))[1]  # noqa: E731
+        return jax.jit(lambda x: [jax.jvp(fn, (x,), (vel,))[1] for fn in (forward, jax.grad(loss))])(vel)
+
+    assert_same(*(twice(losses) for losses, *_ in pairs))
 
 
 @stage("drone")
@@ -107,20 +162,29 @@ def gap(data):
 def test_drones_that_act_on_each_other_are_differentiated_in_the_kernel(one, x64):
     ((fast, step, data), (plain, *_)), at = functions(n_drones=3, stages=[one], n_steps=4)
     assert_same(gradient(fast)(at), gradient(plain)(at))
-    assert "gradient: one kernel" in explain(step, data)
+    along = jax.tree.map(jnp.sin, at)
+    slope = [jax.jit(lambda x, losses=losses: jax.jvp(losses, (x,), (along,)))(at) for losses in (fast, plain)]
+    assert_same(*slope)
+    assert [line.split(",")[0] for line in explain(step, data).splitlines()[-2:]] == [
+        "gradient: one kernel",
+        "jvp: one kernel",
+    ]
 
 
 @needs_compiler
 def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
-    ((fast, step, data), (plain, *_)), at = functions(n_drones=3, stages=[gap], n_steps=2)
+    ((fast, step, data), (plain, *_)), at = functions(n_drones=2, stages=[gap], n_steps=1, dynamics="so_rpy")
     with pytest.warns(EngineWarning, match="the gradient of the step runs on 'lanes'"):
         found = gradient(fast)(at)
     assert_same(found, gradient(plain)(at))
+    with pytest.warns(EngineWarning, match="the jvp of the step runs on 'lanes'"):
+        found = jax.jit(lambda x: jax.jvp(fast, (x,), (x,)))(at)
+    assert_same(found, jax.jit(lambda x: jax.jvp(plain, (x,), (x,)))(at))
     assert "the smallest or largest over other drones has no derivative in a kernel" in explain(step, data)
 
 
 @pytest.mark.parametrize(("dynamics", "control"), PAIRS)
-def test_the_gradient_of_every_pipeline_compiles_for_a_gpu(dynamics, control):
+def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
     """With respect to all that a drone has of its own."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
@@ -130,6 +194,10 @@ def test_the_gradient_of_every_pipeline_compiles_for_a_gpu(dynamics, control):
     text = cuda.ptx(reverse.write(back, "cuda"), cuda.DEFAULT_ARCHITECTURE)
     stored = sum(program.leaves[i].size for i in back.perturbed) + len(back.carried)
     assert text.count("st.global") >= stored
+    ahead = with_tangents(program, back.perturbed)
+    verify(ahead)
+    assert all(ahead.leaves[i].name.startswith("tangent of ") for i in ahead.written)
+    assert "st.global" in cuda.ptx(kernel.write(ahead, "cuda"), cuda.DEFAULT_ARCHITECTURE)
 
 
 def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():

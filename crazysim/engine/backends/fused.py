@@ -6,7 +6,7 @@ A call of a kernel is a primitive of its own, which becomes the kernel of the pl
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -16,19 +16,16 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.cache import announce
 from crazysim.core.sharding import Location
 from crazysim.core.stage import with_leaves
-from crazysim.engine.backends import Run, cuda, gradient, kernel, lanes, native
-from crazysim.engine.backends.gradient import Gradients
+from crazysim.engine.backends import Run, cuda, kernel, lanes, native
+from crazysim.engine.backends.derivative_kernels import DerivativeKernels
+from crazysim.engine.backends.derivatives import CountedRun, differentiable
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.backends.platforms import TARGETS, compiled, described
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.errors import ConfigError
-
-CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
-"""A ``Run`` whose number of steps is an array."""
 
 
 class Kernels:
@@ -123,48 +120,12 @@ def build(program: Program, location: Location) -> FusedRun:
     kernels = Kernels(program, location) if program.fused else None
     run = _split(program, location) if kernels is None else _one_kernel(kernels)
     on_lanes = lanes.build(program, location)
-    gradients = GRADIENTS[program] = Gradients(program, location, on_lanes)
-    return FusedRun(differentiable(_over_batches(program, run), on_lanes, gradients), kernels)
+    derivatives = DERIVATIVES[program] = DerivativeKernels(program, location, on_lanes)
+    return FusedRun(differentiable(_over_batches(program, run), on_lanes, derivatives), kernels)
 
 
-GRADIENTS: weakref.WeakKeyDictionary[Program, Gradients] = weakref.WeakKeyDictionary()
+DERIVATIVES: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
 """Derivatives of the programs that were built."""
-
-
-def differentiable(run: CountedRun, on_lanes: Run, gradients: Gradients) -> Run:
-    """Return a function that runs a program, with its derivatives.
-
-    For a number of steps that is an array they are those of the same program on lanes.
-    """
-
-    def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
-        @jax.custom_jvp
-        def forward(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-            return run(leaves, count)
-
-        def derivative(primals: Any, tangents: Any) -> Any:
-            (values, count), (slopes, _) = primals, tangents
-            changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
-            if isinstance(n_steps, int) and changing:
-                written, flagged = gradient.advance(gradients, run, values, n_steps)
-                some = gradient.tangents(gradients, values, [slopes[i] for i in changing], changing, n_steps)
-                found = dict(zip(gradients.floats, some, strict=True))
-                numbers = gradients.program.written
-                rest = [found[i] if i in found else gradient.float0(x) for i, x in zip(numbers, written, strict=True)]
-                return (written, flagged), (rest, gradient.float0(flagged))
-
-            announce("compiling a gradient through the steps on lanes", "10 to 40 s")
-            known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
-
-            def of(some: list[Any]) -> Any:
-                return on_lanes(with_leaves(values, changing, some), known)
-
-            return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
-
-        forward.defjvp(derivative, symbolic_zeros=True)  # constant leaves have no derivative to be computed
-        return forward(leaves, jnp.asarray(n_steps, jnp.int32))
-
-    return steps
 
 
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
@@ -173,10 +134,10 @@ def describe(program: Program, platform: str, devices: Sequence[jax.Device] | No
     return [f"kernel: {described(source, platform, devices)}" for source in sources]
 
 
-def describe_gradients(program: Program) -> list[str]:
-    """Return the ways in which gradients through a program were computed so far, in lines."""
-    gradients = GRADIENTS.get(program)
-    return [] if gradients is None else [f"gradient: {line}" for line in gradients.used]
+def describe_derivatives(program: Program) -> list[str]:
+    """Return the ways in which derivatives of a program were computed so far, in lines."""
+    derivatives = DERIVATIVES.get(program)
+    return [] if derivatives is None else list(derivatives.used)
 
 
 def _over_batches(program: Program, run: CountedRun) -> CountedRun:

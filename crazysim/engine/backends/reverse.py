@@ -17,10 +17,11 @@ from crazysim.engine.backends import kernel
 from crazysim.engine.backends.exchange import MAX_IN_VECTOR
 from crazysim.engine.backends.kernel import Body, Kernel
 from crazysim.engine.backends.source import type_name
-from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.transpose import active, transposed
+from crazysim.engine.lowering.activity import changed, differentiable
+from crazysim.engine.lowering.transpose import transposed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,16 +68,8 @@ def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program = dataclasses.replace(program, check=None)
-    if not program.fused:
-        raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
-    if program.rows:
-        raise LimitError("rows of packed leaves have no gradient in a kernel")
+    program, perturbed = differentiable(program, perturbed)
     n = len(program.leaves)
-    perturbed = tuple(sorted(i for i in perturbed if program.leaves[i].number.kind == "f" and i in program.ranks))
-    if tables := program.tables.intersection(perturbed):
-        names = ", ".join(program.leaves[i].name for i in sorted(tables))
-        raise UnsupportedError(f"{names} is read as a table, which has no derivative in a kernel")
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number) for x in program.leaves]
     each = [s for s in program.fused_segments if s.phase == "each"]
     hoisted = [
@@ -84,7 +77,7 @@ def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
         for s in each
     ]
     extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
-    found, constants = _changed(program, perturbed)
+    found, constants = changed(program, perturbed)
     back = {}
     for s in program.fused_segments:
         where = 2 * n + each.index(s) if s in each else -1
@@ -108,37 +101,6 @@ def _used(program: Program, s: Segment) -> list[Slot]:
 def _float_of(block: Block) -> np.dtype:
     """Return the type of the floats of a block; a program has one."""
     return next((x.dtype for x in block.outputs if x.dtype.kind == "f"), np.dtype(np.float32))
-
-
-def _changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
-    """Return the numbers that depend differentiably on the perturbed leaves, and the hoisted ones that do."""
-    found = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
-    constants: dict[Segment, tuple[int, ...]] = {}
-
-    def of(block: Block, slots: Sequence[Slot], more: Sequence[int] = ()) -> list[int]:
-        wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in found and x.dtype.kind == "f"]
-        wanted += [block.inputs[len(slots) + k] for k in more]
-        on_path = active(block, wanted)
-        return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
-
-    def run(s: Segment) -> None:
-        places = program.per_drone(s, s.writes)
-        reads = program.per_drone(s, s.reads)
-        found.update(places[k] for k in of(s.block, reads, constants.get(s, ())))
-
-    for s in program.of("first"):
-        run(s)
-    for s in program.of("each"):
-        constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
-    while True:  # a number that one step changes may change more in the next
-        before = len(found)
-        for s in program.of("each"):
-            run(s)
-        if len(found) == before:
-            break
-    for s in program.of("last"):
-        run(s)
-    return found, constants
 
 
 def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:

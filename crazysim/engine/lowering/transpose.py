@@ -8,16 +8,16 @@ block is computed once, from its beginning to its end, and then part by part on 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax import lax
 
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
+from crazysim.engine.lowering.activity import active, applied
 from crazysim.engine.lowering.jaxprs import lower_function
 
 MAX_UNROLLED = 4096
@@ -89,33 +89,6 @@ def _again(
     return here
 
 
-def active(block: Block, wanted: Collection[Value]) -> set[Value]:
-    """Return the values of a block, those of inner blocks included, that some of its inputs change differentiably."""
-    found = set(wanted)
-    _spread(block, found)
-    return found
-
-
-def _spread(block: Block, found: set[Value]) -> None:
-    for op in block.operations:
-        if op.name == "over_others":
-            (body,) = op.blocks
-            found.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in found)
-        if op.name in ("loop", "while"):  # what changes in one turn may change all that the next one computes
-            changed = any(x in found for x in (*op.args, *op.blocks[-1].uses()))
-            if changed:
-                found.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
-        if op.name == "custom_jvp":
-            if any(isinstance(x, Value) and x in found for x in op.args):
-                found.update(x for x in op.results if x.dtype.kind == "f")
-            continue
-        for inner in op.blocks:
-            _spread(inner, found)
-        sources = (*op.args, *(x for inner in op.blocks for x in inner.outputs))
-        if any(isinstance(x, Value) and x in found for x in sources):
-            found.update(x for x in op.results if x.dtype.kind == "f")
-
-
 def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents) -> None:
     """Go through a block backwards, from the cotangents of its results to those of what it uses.
 
@@ -166,18 +139,11 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
             every = list(operands)
             for k, x in zip(floats, some, strict=True):
                 every[k] = x
-            return _applied(name, every, dtype, params)
+            return applied(name, every, dtype, params)
 
         return jax.vjp(of, [operands[k] for k in floats])[1](ct)[0]
 
     return lower_function(pull, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, dtype)])
-
-
-def _applied(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:
-    if name in ("convert_element_type", "bitcast_convert_type"):
-        return getattr(lax, name)(args[0], dtype)
-    fn = ops.TABLE[name].xla or name
-    return (getattr(lax, fn) if isinstance(fn, str) else fn)(*args, **dict(params))
 
 
 Found = Sequence[Element | None]
@@ -237,7 +203,8 @@ def _over_others(
     if any(name != "add" for name in names):
         raise UnsupportedError("the smallest or largest over other drones has no derivative in a kernel", op.name)
     (body,) = op.blocks
-    own = [x for x in body.uses() if x in values and not x.size and isinstance(values[x], Value)]
+    uses = body.uses()
+    own = [x for x in values if x in uses and not x.size and isinstance(values[x], Value)]  # in the same order always
     published = [values.get(x, x) for x in op.args]
 
     def backwards(inputs: Sequence[Value], mine: dict, wanted: Sequence[Value], shared: Sequence[Element]) -> None:

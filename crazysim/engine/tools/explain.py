@@ -42,7 +42,7 @@ def explain(step: Step, data: SimData, measure: bool = False) -> str:
         lines += dict.fromkeys(line for program in plan.programs for line in fused.describe(program, *where))
         how = "sim.step calls it without XLA" if plan.host_call is not None else "sim.step is one compiled call"
         lines[-1] += f"; {how}, and reads make only the fields that are read"
-        lines += dict.fromkeys(line for program in step.programs for line in fused.describe_gradients(program))
+        lines += dict.fromkeys(line for program in step.programs for line in fused.describe_derivatives(program))
     return "\n".join(lines)
 
 

@@ -1,0 +1,167 @@
+"""Kernels of the derivatives of a program: tangents, which go ahead with the steps, and cotangents, which go back."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.cache import announce, announced
+from crazysim.core.sharding import Location
+from crazysim.engine.backends import Run, kernel, lanes, reverse
+from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.native import Launch
+from crazysim.engine.backends.platforms import TARGETS, compiled, described
+from crazysim.engine.backends.reverse import Reverse
+from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.ir.program import Program
+from crazysim.engine.lowering.tangents import with_tangents
+from crazysim.errors import EngineWarning
+
+Leaves = dict[int, Any]
+"""Arrays by leaf."""
+
+
+class DerivativeKernels:
+    """Kernels of the derivatives of one program, each compiled when it is first used."""
+
+    def __init__(self, program: Program, location: Location, on_lanes: Run):
+        """Compile nothing yet.
+
+        Args:
+            program: The program.
+            location: Devices that it is planned for.
+            on_lanes: The program on lanes, for what has no kernel.
+        """
+        self.program, self.location, self.on_lanes = program, location, on_lanes
+        self.used: dict[str, None] = {}
+        """Ways in which derivatives were computed so far, for ``explain``."""
+        self.floats = tuple(i for i in program.written if program.leaves[i].number.kind == "f")
+        """Leaves that are written and have derivatives."""
+        self._programs: dict[Any, Any] = {}
+        self._launches: dict[Any, Launch | None] = {}
+
+    def is_own(self, leaf: int) -> bool:
+        """Return True if each drone or world has numbers of its own of a leaf."""
+        return self.program.leaves[leaf].scope in ("drone", "world")
+
+    def forward(self, changing: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
+        """Return the kernel that takes the tangents of some leaves along; None where there is none.
+
+        It takes all leaves, tangents by leaf, the number of steps, the number of batches, and shapes and types of the
+        tangents after the steps, which it returns.
+        """
+        found = self._compiled("jvp", with_tangents, kernel.write, changing, platform)
+        return None if found is None else partial(_forward, self, *found)
+
+    def reverse(self, changing: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
+        """Return the kernel that computes the cotangents of some leaves; None where there is none.
+
+        It takes all leaves, cotangents of the floats that are written, the number of steps and the number of batches,
+        and returns cotangents by leaf, of a leaf that drones share one for each batch.
+        """
+        found = self._compiled("gradient", reverse.reverse, reverse.write, changing, platform)
+        return None if found is None else partial(_reverse, self, *found)
+
+    def _compiled(
+        self,
+        kind: str,
+        transformed: Callable[[Program, Sequence[int]], Any],
+        write: Callable[[Any, str], Kernel],
+        changing: tuple[int, ...],
+        platform: str,
+    ) -> tuple[Any, Launch] | None:
+        """Return the transformed program and the function that calls its kernel; None where there is none."""
+        key, place = (kind, changing), (kind, changing, platform)
+        try:
+            if key not in self._programs:
+                self._programs[key] = None
+                self._programs[key] = transformed(self.program, changing)
+            made = self._programs[key]
+            if made is not None and place not in self._launches:
+                self._launches[place] = None
+                source = write(made, TARGETS[platform])
+                location = self.location if platform == self.location.platform else Location(platform)
+                with announced("compiling a derivative of the steps", "5 to 20 s"):
+                    self._launches[place] = compiled(source, location)
+                self.used[f"{kind}: one kernel, {described(source, platform, location.devices)}"] = None
+        except UnsupportedError as error:
+            announce("compiling a derivative of the steps on lanes", "10 to 40 s")
+            self.used[f"{kind}: on lanes ({error})"] = None
+            if not isinstance(error, LimitError):
+                warnings.warn(f"the {kind} of the step runs on 'lanes': {error}", EngineWarning, stacklevel=2)
+        launch = self._launches.get(place)
+        return None if launch is None else (self._programs[key], launch)
+
+
+def _inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
+    """Return the leaves that a kernel reads; random keys as their 32-bit integers."""
+    some = [values[i] for i in leaves]
+    return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in some]
+
+
+def _forward(
+    own: DerivativeKernels,
+    program: Program,
+    launch: Launch,
+    values: Sequence[Any],
+    tangents: Leaves,
+    n_steps: int,
+    size: int,
+    results: Sequence[jax.ShapeDtypeStruct],
+) -> list[Array]:
+    n = len(own.program.leaves)
+    n_worlds, n_drones = lanes.batch(own.program, list(values))
+
+    def of_worlds(i: int, x: Array) -> Array:
+        """Return the tangent of a leaf, of one that all drones share for each world."""
+        if own.is_own(i):
+            return x
+        return jnp.broadcast_to(x[:, None, None], (size, n_worlds // size, 1, *x.shape[1:])).reshape(
+            n_worlds, 1, *x.shape[1:]
+        )
+
+    every = [*values, *(of_worlds(i, tangents[i]) if i in tangents else None for i in range(n))]
+    inputs = _inputs(every, kernel.needed(program))
+    outputs = [lanes.shape_of(program, i, n_worlds) for i in program.written]
+    found = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
+    by_leaf = dict(zip(program.written, found, strict=True))
+    return [by_leaf[n + i] if n + i in by_leaf else jnp.zeros(x.shape, x.dtype)
+            for i, x in zip(own.floats, results, strict=True)]  # fmt: skip
+
+
+def _reverse(
+    own: DerivativeKernels,
+    going_back: Reverse,
+    launch: Launch,
+    values: Sequence[Any],
+    cotangents: Leaves,
+    n_steps: int,
+    size: int,
+) -> Leaves:
+    program = own.program
+    n_worlds, n_drones = lanes.batch(program, list(values))
+
+    def seed(i: int) -> Array:
+        x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
+        return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
+
+    inputs = [*_inputs(values, reverse.needed(going_back)), *map(seed, own.floats)]
+    leaves = [program.leaves[i] for i in going_back.perturbed]
+    outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number) for x in leaves]
+    found = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
+
+    def of_leaf(i: int, x: Array) -> Array:
+        """Return the cotangent of a leaf: of one that drones share the sum over them."""
+        if program.leaves[i].scope == "world":
+            return jnp.sum(x, axis=1)
+        return x if own.is_own(i) else jnp.sum(x.reshape(size, n_worlds * n_drones // size, -1), axis=1)
+
+    return {i: of_leaf(i, x) for i, x in zip(going_back.perturbed, found, strict=True)}

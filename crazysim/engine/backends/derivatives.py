@@ -1,0 +1,255 @@
+"""Derivatives of the steps of a kernel as JAX sees them: primitives with rules for derivatives, transposes and vmap.
+
+The tangents after some steps are a primitive that is linear in the tangents before them, and its transpose is another
+one. Either becomes a kernel of the platform that JAX lowers it for, or the same program on lanes where it has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import jaxcompat
+from crazysim.cache import announce
+from crazysim.core.stage import with_leaves
+from crazysim.engine.backends import Run, lanes
+from crazysim.engine.backends.derivative_kernels import DerivativeKernels
+
+CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
+"""A ``Run`` whose number of steps is an array."""
+
+
+def differentiable(run: CountedRun, on_lanes: Run, kernels: DerivativeKernels) -> Run:
+    """Return a function that runs a program, with its derivatives.
+
+    For a number of steps that is an array they are those of the same program on lanes.
+    """
+
+    def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        @jax.custom_jvp
+        def forward(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
+            return run(leaves, count)
+
+        def derivative(primals: Any, tangents: Any) -> Any:
+            (values, count), (slopes, _) = primals, tangents
+            changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
+            if isinstance(n_steps, int) and changing:
+                present = tuple([i for i, x in enumerate(values) if x is not None])
+                case = Case(kernels, n_steps, present, tuple(changing), len(values))
+                fixed = [values[i] for i in present]
+                *written, flagged = advance_p.bind(*fixed, run=run, case=case)
+                given = [slopes[i] if kernels.is_own(i) else slopes[i][None] for i in changing]
+                some = tangent_p.bind(*fixed, *given, case=case, n_fixed=len(fixed))
+                found = dict(zip(kernels.floats, some, strict=True))
+                numbers = kernels.program.written
+                rest = [found[i] if i in found else _float0(x) for i, x in zip(numbers, written, strict=True)]
+                return (written, flagged), (rest, _float0(flagged))
+
+            announce("compiling a derivative of the steps on lanes", "10 to 40 s")
+            known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
+
+            def of(some: list[Any]) -> Any:
+                return on_lanes(with_leaves(values, changing, some), known)
+
+            return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
+
+        forward.defjvp(derivative, symbolic_zeros=True)  # constant leaves have no derivative to be computed
+        return forward(leaves, jnp.asarray(n_steps, jnp.int32))
+
+    return steps
+
+
+def _float0(x: Any) -> np.ndarray:
+    """Return the tangent of an array that has none."""
+    return np.zeros(x.shape, jax.dtypes.float0)
+
+
+class Case(NamedTuple):
+    """Derivative of a program: static parameters of the primitives.
+
+    The operands are the leaves that are given, then the tangents of ``changing``, or the cotangents of the floats that
+    are written. Under ``vmap`` several batches of worlds follow each other in what each drone or world has of its own;
+    tangents and cotangents of other leaves have an axis for them in front. (size, ...)
+    """
+
+    kernels: DerivativeKernels
+    """Kernels of the derivatives."""
+    n_steps: int
+    """Number of steps."""
+    present: tuple[int, ...]
+    """Leaves that are given."""
+    changing: tuple[int, ...]
+    """Leaves whose tangents are given, or whose cotangents are computed."""
+    n_leaves: int
+    """Number of all leaves."""
+    size: int = 1
+    """Number of batches."""
+
+    def values(self, args: Sequence[Any]) -> list[Any]:
+        """Return all leaves from the operands; None for one that is not given."""
+        return with_leaves([None] * self.n_leaves, self.present, args[: len(self.present)])
+
+    def linear(self, args: Sequence[Any]) -> list[Any]:
+        """Return the operands in which the derivative is linear."""
+        return list(args[len(self.present) :])
+
+    def is_own(self, leaves: Sequence[int]) -> list[bool]:
+        """Return True for leaves of which each drone or world has numbers of its own."""
+        return list(map(self.kernels.is_own, leaves))
+
+    def over_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear: Sequence[int],
+                     results: Sequence[int]) -> list[Array]:  # fmt: skip
+        """Return what a function of the leaves and of the linear operands of one batch gives for all batches."""
+        fixed, own = self.is_own(self.present), self.is_own(linear)
+
+        def split(x: Any) -> Any:
+            return x.reshape(self.size, -1, *x.shape[1:])
+
+        def whole(values: Sequence[Any], some: Sequence[Any]) -> list[Array]:
+            return fn(self.values(values), list(some))
+
+        if self.size == 1:
+            some = [x if o else x[0] for x, o in zip(self.linear(args), own, strict=True)]
+            found = whole(args, some)
+            return [x if o else x[None] for x, o in zip(found, self.is_own(results), strict=True)]
+        values = [split(x) if o else x for x, o in zip(args, fixed, strict=False)]
+        some = [split(x) if o else x for x, o in zip(self.linear(args), own, strict=True)]
+        found = jax.vmap(whole, ([0 if o else None for o in fixed], 0))(values, some)
+        return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(found, self.is_own(results), strict=True)]
+
+
+# Tangents ----------------------------------------------------------------------------------------------------------
+
+
+def _written(*args: Any, case: Case, **params: Any) -> list[jax.ShapeDtypeStruct]:
+    del params
+    program = case.kernels.program
+    n_worlds, _ = lanes.batch(program, case.values(args))
+    return [lanes.shape_of(program, i, n_worlds) for i in case.kernels.floats]
+
+
+def _tangents_on_lanes(*args: Any, case: Case, **params: Any) -> list[Array]:
+    del params
+
+    def tangents(values: list[Any], slopes: list[Any]) -> list[Array]:
+        of = partial(_floats_after, case, values)
+        return jax.jvp(of, ([values[i] for i in case.changing],), (slopes,))[1]
+
+    return case.over_batches(tangents, args, case.changing, case.kernels.floats)
+
+
+def _tangents(platform: str, *args: Any, case: Case, **params: Any) -> list[Array]:
+    del params
+    kernel = case.kernels.forward(case.changing, platform)
+    if kernel is None:
+        return _tangents_on_lanes(*args, case=case)
+    given = dict(zip(case.changing, case.linear(args), strict=True))
+    return kernel(case.values(args), given, case.n_steps, case.size, _written(*args, case=case))
+
+
+# Cotangents --------------------------------------------------------------------------------------------------------
+
+
+def _before(*args: Any, case: Case) -> list[jax.ShapeDtypeStruct]:
+    like = [case.values(args)[i] for i in case.changing]
+    shapes = [x.shape if own else (case.size, *x.shape)
+              for x, own in zip(like, case.is_own(case.changing), strict=True)]  # fmt: skip
+    return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, like, strict=True)]
+
+
+def _cotangents_on_lanes(*args: Any, case: Case) -> list[Array]:
+    def cotangents(values: list[Any], seeds: list[Any]) -> list[Array]:
+        return jax.vjp(partial(_floats_after, case, values), [values[i] for i in case.changing])[1](seeds)[0]
+
+    return case.over_batches(cotangents, args, case.kernels.floats, case.changing)
+
+
+def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
+    kernel = case.kernels.reverse(case.changing, platform)
+    if kernel is None:
+        return _cotangents_on_lanes(*args, case=case)
+    given = dict(zip(case.kernels.floats, case.linear(args), strict=True))
+    found = kernel(case.values(args), given, case.n_steps, case.size)
+    return [found[i].reshape(x.shape) if i in found else jnp.zeros(x.shape, x.dtype)
+            for i, x in zip(case.changing, _before(*args, case=case), strict=True)]  # fmt: skip
+
+
+def _transposed(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
+    del params
+    if not case.kernels.program.fused:  # its stages may have effects, such as printing, that a primitive has not
+        return _cotangents_on_lanes(*fixed, *seeds, case=case)
+    return cotangent_p.bind(*fixed, *seeds, case=case)
+
+
+def _floats_after(case: Case, values: Sequence[Any], some: Sequence[Any]) -> list[Array]:
+    kernels = case.kernels
+    written, _ = kernels.on_lanes(with_leaves(values, case.changing, some), case.n_steps)
+    return [x for i, x in zip(kernels.program.written, written, strict=True) if i in kernels.floats]
+
+
+def _batched(primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], case: Case, **params: Any) -> Any:
+    """Return the results of a primitive for ``n`` batches, which are one call for more worlds."""
+    n_fixed = len(case.present)
+    own = [*case.is_own(case.present), *(True for _ in args[n_fixed:])]
+    if any(b and not o for b, o in zip(batched, own, strict=True)):  # parameters that differ: one after the other
+        full = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
+        return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), full)
+
+    def joined(x: Any, b: bool) -> Any:
+        x = x if b else jnp.broadcast_to(x, (n, *x.shape))
+        return x.reshape(-1, *x.shape[2:])
+
+    some = [joined(x, b) if o else x for x, b, o in zip(args, batched, own, strict=True)]
+    found = primitive.bind(*some, case=case._replace(size=n * case.size), **params)
+    return [x.reshape(n, -1, *x.shape[1:]) for x in found]
+
+
+cotangent_p = jaxcompat.primitive_by_platform(
+    "crazysim_cotangents",
+    _before,
+    {"cpu": partial(_cotangents, "cpu"), "cuda": partial(_cotangents, "gpu")},
+    derivative=_cotangents_on_lanes,
+    batched=_batched,
+)
+"""Cotangents before some steps, from those of the floats after them."""
+
+tangent_p = jaxcompat.primitive_by_platform(
+    "crazysim_tangents",
+    _written,
+    {"cpu": partial(_tangents, "cpu"), "cuda": partial(_tangents, "gpu")},
+    derivative=_tangents_on_lanes,
+    transposed=_transposed,
+    batched=_batched,
+)
+"""Tangents of the floats after some steps, from those before them."""
+
+
+# The steps in a derivative -----------------------------------------------------------------------------------------
+
+
+def _advanced(*args: Any, run: CountedRun, case: Case) -> list[Any]:
+    written, flagged = run(case.values(args), jnp.asarray(case.n_steps, jnp.int32))
+    return [*written, flagged]
+
+
+def _advanced_on_lanes(*args: Any, run: CountedRun, case: Case) -> list[Any]:
+    del run
+    written, flagged = case.kernels.on_lanes(case.values(args), case.n_steps)
+    return [*written, flagged]
+
+
+def _shapes(*args: Any, **params: Any) -> list[Any]:
+    avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
+    return jax.eval_shape(lambda *some: _advanced(*some, **params), *avals)
+
+
+advance_p = jaxcompat.primitive_by_platform(
+    "crazysim_advance", _shapes, {"": _advanced}, derivative=_advanced_on_lanes, batched=jaxcompat.batched_as(_advanced)
+)
+"""Steps of a kernel inside a derivative, whose own derivative is that of the program on lanes."""

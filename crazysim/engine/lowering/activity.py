@@ -1,0 +1,99 @@
+"""Numbers that some leaves change differentiably, for derivatives in either direction."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from jax import lax
+
+from crazysim.engine.errors import LimitError, UnsupportedError
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.blocks import Block, Value
+from crazysim.engine.ir.program import Program, Segment, Slot
+
+
+def differentiable(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
+    """Return a program without its check, and those of the perturbed leaves that are floats and take part.
+
+    Raises:
+        UnsupportedError: If its derivatives have no kernel.
+    """
+    if not program.fused:
+        raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
+    if program.rows:
+        raise LimitError("rows of packed leaves have no gradient in a kernel")
+    program = dataclasses.replace(program, check=None)
+    some = tuple(sorted(i for i in perturbed if program.leaves[i].number.kind == "f" and i in program.ranks))
+    if tables := program.tables.intersection(some):
+        names = ", ".join(program.leaves[i].name for i in sorted(tables))
+        raise UnsupportedError(f"{names} is read as a table, which has no derivative in a kernel")
+    return program, some
+
+
+def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
+    """Return the numbers that depend differentiably on the perturbed leaves, and the hoisted ones that do."""
+    found = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
+    constants: dict[Segment, tuple[int, ...]] = {}
+
+    def of(block: Block, slots: Sequence[Slot], more: Sequence[int] = ()) -> list[int]:
+        wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in found and x.dtype.kind == "f"]
+        wanted += [block.inputs[len(slots) + k] for k in more]
+        on_path = active(block, wanted)
+        return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
+
+    def run(s: Segment) -> None:
+        places = program.per_drone(s, s.writes)
+        reads = program.per_drone(s, s.reads)
+        found.update(places[k] for k in of(s.block, reads, constants.get(s, ())))
+
+    for s in program.of("first"):
+        run(s)
+    for s in program.of("each"):
+        constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
+    while True:  # a number that one step changes may change more in the next
+        before = len(found)
+        for s in program.of("each"):
+            run(s)
+        if len(found) == before:
+            break
+    for s in program.of("last"):
+        run(s)
+    return found, constants
+
+
+def active(block: Block, wanted: Collection[Value]) -> set[Value]:
+    """Return the values of a block, those of inner blocks included, that some of its inputs change differentiably."""
+    found = set(wanted)
+    _spread(block, found)
+    return found
+
+
+def _spread(block: Block, found: set[Value]) -> None:
+    for op in block.operations:
+        if op.name == "over_others":
+            (body,) = op.blocks
+            found.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in found)
+        if op.name in ("loop", "while"):  # what changes in one turn may change all that the next one computes
+            changed = any(x in found for x in (*op.args, *op.blocks[-1].uses()))
+            if changed:
+                found.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
+        if op.name == "custom_jvp":
+            if any(isinstance(x, Value) and x in found for x in op.args):
+                found.update(x for x in op.results if x.dtype.kind == "f")
+            continue
+        for inner in op.blocks:
+            _spread(inner, found)
+        sources = (*op.args, *(x for inner in op.blocks for x in inner.outputs))
+        if any(isinstance(x, Value) and x in found for x in sources):
+            found.update(x for x in op.results if x.dtype.kind == "f")
+
+
+def applied(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:
+    """Return the result of an operation as JAX computes it, which can be differentiated."""
+    if name in ("convert_element_type", "bitcast_convert_type"):
+        return getattr(lax, name)(args[0], dtype)
+    fn = ops.TABLE[name].xla or name
+    return (getattr(lax, fn) if isinstance(fn, str) else fn)(*args, **dict(params))

@@ -1,0 +1,265 @@
+"""Forward mode: the tangents of a program's numbers, computed beside the numbers.
+
+The result is a program like any other. Its tangents are leaves behind those of the program, and the derivative of
+each operation follows the operation, in the same loops and conditions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from crazysim.engine.errors import UnsupportedError
+from crazysim.engine.ir import ops
+from crazysim.engine.ir.algebra import known_zero
+from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
+from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
+from crazysim.engine.lowering.activity import applied, changed, differentiable
+from crazysim.engine.lowering.jaxprs import lower_function
+
+Values = dict[Value, Element]
+
+
+def with_tangents(program: Program, perturbed: Collection[int]) -> Program:
+    """Return the program that takes the tangents of a program's numbers along.
+
+    Leaf ``len(program.leaves) + i`` is the tangent of leaf ``i``; of a leaf that all drones share, each world has its
+    own. Read are the tangents of the perturbed leaves, written those of the leaves that depend on them. The leaves
+    themselves are scratch: what the steps make of them is not kept.
+
+    Args:
+        program: The program.
+        perturbed: Leaves whose tangents are given; those that are no floats have none.
+
+    Raises:
+        UnsupportedError: If a part of it has no derivative in a kernel.
+    """
+    program, perturbed = differentiable(program, perturbed)
+    n = len(program.leaves)
+    found, constants = changed(program, perturbed)
+    segments = [_segment(program, n, s, found, constants.get(s, ())) for s in program.fused_segments]
+    zero = dict.fromkeys((i, k) for s in segments for i in s.written if i >= n and i - n not in perturbed
+                         for k in range(program.leaves[i - n].size))  # fmt: skip
+    zeros = [constant(0, program.leaves[i - n].number) for i, _ in zero]
+    start = Segment("drone", ("tangents",), "first", Block((), (), tuple(zeros)), (), tuple(zero))
+    return dataclasses.replace(
+        program,
+        leaves=(*program.leaves, *map(_tangent_of, program.leaves)),
+        segments=(start, *segments) if zero else tuple(segments),
+        scratch=program.scratch | set(program.written),
+    )
+
+
+def _tangent_of(leaf: Leaf) -> Leaf:
+    own = leaf.scope in ("drone", "world")
+    return Leaf(f"tangent of {leaf.name}", leaf.scope if own else "world", leaf.shape if own else (1, 1, *leaf.shape),
+                leaf.dtype)  # fmt: skip
+
+
+def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int]) -> Segment:
+    """Return a segment with the tangents of what it writes."""
+    reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
+    wanted = [k for k, slot in enumerate(reads) if slot in found and s.block.inputs[k].dtype.kind == "f"]
+    wanted = [k for k in wanted if not s.block.inputs[k].size]
+    block = block_with_tangents(s.block, [s.block.inputs[k] for k in (*wanted, *(n_reads + k for k in constants))])
+    primal, slopes = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
+    inputs = (*primal[:n_reads], *slopes[: len(wanted)], *primal[n_reads:], *slopes[len(wanted) :])
+    floats = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
+    moving = [(k, x) for k, x in zip(floats, block.outputs[len(s.writes) :], strict=True)
+              if program.per_drone(s, [s.writes[k]])[0] in found]  # fmt: skip
+    before = [slot for slot, x in zip(s.hoisted_reads, s.hoisted.inputs, strict=True)
+              if slot in found and x.dtype.kind == "f" and not x.size]  # fmt: skip
+    hoisted, n_hoisted = s.hoisted, len(s.hoisted.outputs)
+    if constants:
+        some = [x for x, slot in zip(s.hoisted.inputs, s.hoisted_reads, strict=True) if slot in before]
+        hoisted = block_with_tangents(s.hoisted, some)
+        places = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
+        kept = [hoisted.outputs[n_hoisted + places.index(k)] for k in constants]
+        hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *kept))
+    return dataclasses.replace(
+        s,
+        block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in moving))),
+        reads=(*s.reads, *((n + s.reads[k][0], s.reads[k][1]) for k in wanted)),
+        writes=(*s.writes, *((n + s.writes[k][0], s.writes[k][1]) for k, _ in moving)),
+        hoisted=hoisted,
+        hoisted_reads=(*s.hoisted_reads, *((n + i, k) for i, k in before)) if constants else s.hoisted_reads,
+    )
+
+
+def block_with_tangents(block: Block, wanted: Sequence[Value]) -> Block:
+    """Return the block that computes tangents beside a block's outputs.
+
+    Args:
+        block: The block.
+        wanted: Inputs whose tangents are given, floats.
+
+    Returns:
+        The block from the inputs of ``block``, and behind them the tangents of ``wanted``, to the outputs of ``block``,
+        and behind them a tangent of each that is a float.
+
+    Raises:
+        UnsupportedError: If an operation has no derivative in a kernel.
+    """
+    builder = Builder()
+    values: Values = {x: builder.input(x.dtype, x.size) for x in block.inputs}
+    tangents: Values = {x: builder.input(x.dtype) for x in wanted}
+    outputs = _push(builder, block, values, tangents)
+    return prune(builder.finish([*outputs, *_tangents_of(block.outputs, tangents)]))
+
+
+def _tangents_of(elements: Sequence[Element], tangents: Values) -> list[Element]:
+    """Return the tangents of those of some elements that are floats, zeros where they have none."""
+    return [_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
+
+
+def _tangent(x: Element, tangents: Values) -> Element:
+    zero = known_zero(x.dtype)  # takes its terms with it
+    return tangents.get(x, zero) if isinstance(x, Value) else zero
+
+
+def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> list[Element]:
+    """Add a block's operations with their derivatives to a builder, and return its outputs.
+
+    Args:
+        builder: Takes the operations.
+        block: The block.
+        values: Elements that its inputs and the values around it are there, to which its own are added.
+        tangents: Their tangents, as far as they are not zero, to which those of its own values are added.
+    """
+    for op in block.operations:
+        builder.stage = op.stage
+        rule = STRUCTURE.get(op.name)
+        if rule is not None:
+            rule(builder, op, values, tangents)
+            continue
+        inline(builder, Block((), (op,), ()), values)
+        if not op.results or op.dtype.kind != "f" or not any(isinstance(x, Value) and x in tangents for x in op.args):
+            continue
+        if ops.TABLE[op.name].structured:
+            raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
+        slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
+        given = [*(_mapped(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+        _record(op.results, inline(builder, slope, dict(zip(slope.inputs, given, strict=True))), tangents)
+    return [_mapped(x, values) for x in block.outputs]
+
+
+def _mapped(x: Element, values: Values) -> Element:
+    return values.get(x, x) if isinstance(x, Value) else x
+
+
+def _record(results: Sequence[Value], found: Sequence[Element], tangents: Values) -> None:
+    """Note the tangents of some results, unless they are zero."""
+    tangents.update((x, t) for x, t in zip(results, found, strict=True) if isinstance(t, Value) or t != 0)
+
+
+@functools.lru_cache(maxsize=1024)
+def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
+    """Return the block from operands, and tangents of those that are floats, to the tangent of an operation."""
+    floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
+
+    def push(*args: Any) -> Any:
+        operands, tangents = args[: len(dtypes)], args[len(dtypes) :]
+
+        def of(*some: Any) -> Any:
+            every = list(operands)
+            for k, x in zip(floats, some, strict=True):
+                every[k] = x
+            return applied(name, every, dtype, params)
+
+        return jax.jvp(of, tuple([operands[k] for k in floats]), tangents)[1]
+
+    return lower_function(push, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, *(dtypes[k] for k in floats))])
+
+
+def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
+    mask, *old = op.args
+    (block,) = op.blocks
+    inner, moving = Builder(builder), dict(tangents)
+    outputs = _push(inner, block, dict(values), moving)
+    after = [_tangent(x, moving) for x in block.outputs]
+    before = [_tangent(x, tangents) for x in old]
+    some = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
+    args = [_mapped(mask, values), *(_mapped(x, values) for x in old), *(before[k] for k in some)]
+    inside = inner.finish([*outputs, *(after[k] for k in some)])
+    results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inside,))
+    values.update(zip(op.results, results, strict=False))
+    _record([op.results[k] for k in some], results[len(old) :], tangents)
+
+
+def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
+    """Compute the derivative that the function has of its own."""
+    (block,) = op.blocks
+    args = [_mapped(x, values) for x in op.args]
+    found = inline(builder, block, values | dict(zip(block.inputs, args, strict=True)))
+    values.update(zip(op.results, found, strict=True))
+    if not any(isinstance(x, Value) and x in tangents for x in op.args):
+        return
+    slope = op.param("slope")()
+    moving = [_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
+    parts = inline(builder, slope, dict(zip(slope.inputs, [*args, *moving], strict=True)))
+    parts = [x for x, like in zip(parts, slope.outputs, strict=True) if like.dtype.kind == "f"]
+    _record([x for x in op.results if x.dtype.kind == "f"], parts, tangents)
+
+
+def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
+    """Carry a tangent for each float: what changes in one turn may change all that the next one computes."""
+    *test, body = op.blocks
+    if not any(isinstance(x, Value) and x in tangents for x in (*op.args, *body.uses())):
+        inline(builder, Block((), (op,), ()), values)
+        return
+    inner = Builder(builder)
+    inside = values | {x: inner.input(x.dtype) for x in body.inputs}
+    moving = tangents | {x: inner.input(x.dtype) for x in body.inputs if x.dtype.kind == "f"}
+    outputs = _push(inner, body, inside, moving)
+    blocks = [inner.finish([*outputs, *_tangents_of(body.outputs, moving)])]
+    args = [*(_mapped(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+    for block in test:
+        inner = Builder(builder)
+        inside = values | {x: inner.input(x.dtype) for x in block.inputs}
+        for x in args[len(op.args) :]:
+            inner.input(x.dtype)
+        blocks.insert(0, inner.finish(inline(inner, block, inside)))
+    results = builder.add_many(op.name, args, [x.dtype for x in args], op.params, tuple(blocks))
+    values.update(zip(op.results, results, strict=False))
+    _record([x for x in op.results if x.dtype.kind == "f"], results[len(op.args) :], tangents)
+
+
+def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
+    """Publish tangents beside the numbers that a drone publishes, and add up those of the sums."""
+    (body,) = op.blocks
+    *others, is_self = body.inputs
+    inner = Builder(builder)
+    inside = values | {x: inner.input(x.dtype) for x in others}
+    published = [(x, y) for x, y in zip(op.args, others, strict=True) if isinstance(x, Value) and x in tangents]
+    moving = tangents | {y: inner.input(y.dtype) for _, y in published}
+    inside[is_self] = inner.input(is_self.dtype)
+    outputs = _push(inner, body, inside, moving)
+    names = op.param("reduce")
+    some = [k for k, x in enumerate(body.outputs) if isinstance(_tangent_or_none(x, moving), Value)]
+    if any(names[k] != "add" for k in some):
+        raise UnsupportedError("the smallest or largest over other drones has no derivative in a kernel", op.name)
+    block = inner.finish([*outputs, *(moving[body.outputs[k]] for k in some)])
+    args = [*(_mapped(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
+    dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in some]
+    params = (("reduce", (*names, *("add" for _ in some))), ("n_members", op.param("n_members")))
+    results = builder.add_many("over_others", args, dtypes, params, (block,))
+    values.update(zip(op.results, results, strict=False))
+    _record([op.results[k] for k in some], results[len(op.results) :], tangents)
+
+
+def _tangent_or_none(x: Element, tangents: Values) -> Element | None:
+    return tangents.get(x) if isinstance(x, Value) else None
+
+
+STRUCTURE: dict[str, Callable[[Builder, Operation, Values, Values], None]] = {
+    "when": _when,
+    "custom_jvp": _custom_jvp,
+    "loop": _loop,
+    "while": _loop,
+    "over_others": _over_others,
+}
