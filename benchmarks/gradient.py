@@ -3,7 +3,8 @@
     python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
 
 The gradient is that of the squared distances from the start after ``--steps`` steps, with respect to the commands.
-``forward_s`` is the time of the distances alone. Calls alternate; on a GPU those of a batch are queued.
+``jvp_s`` is the time of the distances and their derivative in one direction, in forward mode, and ``forward_s`` that of
+the distances alone. Calls alternate; on a GPU those of a batch are queued.
 """
 
 from __future__ import annotations
@@ -51,27 +52,34 @@ def measure(args: argparse.Namespace, control: str, n_worlds: int, n_steps: int)
         end = step(send(start, cmd), n_steps, zeros)
         return jnp.sum((end.states.pos - start.states.pos) ** 2)
 
-    forward, gradient = jax.jit(distance), jax.jit(jax.grad(distance))
-    first_s = {name: seconds(fn, cmd, 1) for name, fn in (("forward", forward), ("gradient", gradient))}
+    functions = {
+        "forward": jax.jit(distance),
+        "gradient": jax.jit(jax.grad(distance)),
+        "jvp": jax.jit(lambda cmd: jax.jvp(distance, (cmd,), (cmd,))),
+    }
+    first_s = {name: seconds(fn, cmd, 1) for name, fn in functions.items()}
     batch = BATCH["cpu" if args.device == "cpu" else "gpu"]
-    taken = medians(
-        {"forward": lambda: seconds(forward, cmd, batch), "gradient": lambda: seconds(gradient, cmd, batch)},
-        args.repeats,
-    )
-    slope = gradient(cmd)
+    taken = medians({name: lambda fn=fn: seconds(fn, cmd, batch) for name, fn in functions.items()}, args.repeats)
+    slope = functions["gradient"](cmd)
     if not (jnp.all(jnp.isfinite(slope)) and jnp.any(slope != 0)):
         raise SystemExit("the gradient is zero or not finite; no figure")
+    _, along = functions["jvp"](cmd)
+    if not jnp.allclose(along, jnp.sum(slope * cmd), rtol=1e-3):
+        raise SystemExit("the gradient and the derivative in one direction differ; no figure")
     report(
         args.device,
         benchmark="gradient",
         control=control,
         n_worlds=n_worlds,
         n_steps=n_steps,
-        ran=sim.explain().splitlines()[-1],
+        ran=[line for line in sim.explain().splitlines() if line.startswith(("gradient: ", "jvp: "))],
         compile_s=digits(first_s["gradient"] - taken["gradient"]),
+        jvp_compile_s=digits(first_s["jvp"] - taken["jvp"]),
         forward_s=digits(taken["forward"]),
         gradient_s=digits(taken["gradient"]),
+        jvp_s=digits(taken["jvp"]),
         forward_passes=digits(taken["gradient"] / taken["forward"]),
+        jvp_passes=digits(taken["jvp"] / taken["forward"]),
         steps_per_s=digits(n_worlds * n_steps / taken["gradient"]),
         crazysim=__version__,
     )

@@ -303,3 +303,4 @@ def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
     (line,) = run("gradient.py", "--worlds", "4", "--controls", "rotor_vel", "--steps", "3", "--repeats", "1")
     assert line["steps_per_s"] == pytest.approx(12 / line["gradient_s"], rel=0.01)
     assert line["forward_passes"] == pytest.approx(line["gradient_s"] / line["forward_s"], rel=0.01)
+    assert line["jvp_passes"] == pytest.approx(line["jvp_s"] / line["forward_s"], rel=0.01)

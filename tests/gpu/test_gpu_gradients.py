@@ -94,6 +94,30 @@ def test_drones_that_act_on_each_other_are_differentiated(n_drones, stage):
     both(build, n_steps=20)
 
 
+@pytest.mark.parametrize("n_drones", [1, 12, 33])
+def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
+    """Of drones alone, of those that act on each other within a warp, and within a block."""
+
+    def run(name):
+        sim = flying(name, 4, n_drones, control="attitude", engine="plain" if name == "cpu" else "auto")
+        if n_drones > 1:
+            insert_fn_before(sim.step_pipeline, "integration", repulsion)
+        start, step = sim.data.states, sim.build_step_fn()
+
+        def end(x):
+            after = step(sim.data.replace(states=start.replace(pos=x[0], vel=x[1])), 20).states
+            return after.pos, after.vel, after.quat
+
+        at = start.pos, start.vel
+        out = jax.jit(lambda x: jax.jvp(end, (x,), (jax.tree.map(jnp.cos, x),))[1])(at)
+        assert name == "cpu" or "jvp: one kernel" in sim.explain()
+        return out
+
+    expected, found = (on(name, run(name)) for name in NAMES)
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=ROUNDING * max(np.abs(y).max(), 1e-3))
+
+
 def test_the_bits_depend_neither_on_the_run_nor_on_memory(monkeypatch):
     """With little memory in intervals, and in fewer blocks of threads, each for several blocks of lanes."""
     found = []
