@@ -65,7 +65,24 @@ RECIPES: dict[str, Recipe] = {
     "deliver": Recipe(n_worlds=4096, config={"iterations": 1000, "discount": 0.99}),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
-"""Recipes by task; the default of other tasks is ``Recipe()``."""
+"""Recipes by task."""
+
+GENERAL: dict[str, Recipe] = {
+    "ppo": Recipe(),
+    "apg": Recipe("apg", n_worlds=64, config={"iterations": 200}, evaluate_every=40),
+}
+"""Recipes by algorithm, for tasks that have none for it."""
+
+
+def recipe_of(task: str, algorithm: str | None = None) -> Recipe:
+    """Return the recipe of a task for an algorithm.
+
+    Args:
+        task: Name of the task.
+        algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for that which suits the task.
+    """
+    recipe = RECIPES.get(task, GENERAL["ppo"])
+    return recipe if algorithm in (None, recipe.algorithm) else GENERAL.get(algorithm, Recipe(algorithm))
 
 
 ALTERABLE = (
@@ -152,12 +169,11 @@ class TrainConfig:
             task = next((name for name, one in TASKS.items() if one is entry), None) or reference_of(entry.task)
         elif is_reference(task):
             task = absolute(task) if split(task)[1] else reference_of(entry.task)
-        recipe = RECIPES.get(task, Recipe())
+        recipe = recipe_of(task, algorithm)
         if resumed is not None:
-            recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
             seed = resumed.seed if seed is None else seed
-        if algorithm not in (None, recipe.algorithm):
-            recipe = Recipe(algorithm)
+            if algorithm in (None, resumed.algorithm):
+                recipe = Recipe(resumed.algorithm, resumed.n_worlds, resumed.config)
         n_worlds = recipe.n_worlds if n_worlds is None else n_worlds
         options, config = known | dict(options or {}), recipe.config | dict(config or {})
         if is_airframe_file(options.get("drone")):  # so that the run can be flown from any folder

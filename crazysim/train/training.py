@@ -28,7 +28,7 @@ from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.storage import replacing
 from crazysim.train import apg, checkpoint, ppo
-from crazysim.train.config import ALGORITHMS, ALTERABLE, RECIPES, Recipe, TrainConfig
+from crazysim.train.config import ALGORITHMS, ALTERABLE, TrainConfig, recipe_of
 from crazysim.train.evaluation import evaluate, outcome
 from crazysim.train.export import describe
 from crazysim.train.networks import Policy
@@ -178,7 +178,7 @@ def train(
     finite: Array | bool = True
     if not resume:
         record(learner)
-    every = RECIPES.get(config.task, Recipe()).evaluate_every
+    every = recipe_of(config.task, config.algorithm).evaluate_every
     try:
         with _bar(hyperparameters.iterations, done, progress) as show:
             for i in range(done, hyperparameters.iterations):
