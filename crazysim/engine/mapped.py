@@ -13,7 +13,7 @@ from jax import Array
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim import jaxcompat
-from crazysim.engine.backends import cuda, kernel, native
+from crazysim.engine.backends import cuda, map_kernel, native
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.ir.blocks import Block, prune
 from crazysim.engine.lowering.jaxprs import Lowering, Rows, as_elements
@@ -44,9 +44,9 @@ class MapKernels:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             if platform == "gpu":
-                self._launches[platform] = cuda.compiled(kernel.write_map(self._block, "cuda"))
+                self._launches[platform] = cuda.compiled(map_kernel.write_map(self._block, "cuda"))
             else:
-                self._launches[platform] = native.HostLaunch(kernel.write_map(self._block, "host"))
+                self._launches[platform] = native.HostLaunch(map_kernel.write_map(self._block, "host"))
         return self._launches[platform]
 
     def results(self, n: int) -> list[jax.ShapeDtypeStruct]:

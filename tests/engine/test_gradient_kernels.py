@@ -11,7 +11,7 @@ from crazysim.core import functional as F
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.engine import Step, explain
 from crazysim.engine.backends import cuda, kernel, native, reverse, xla
-from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.ir.verify import verify, verify_block
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.tangents import block_with_tangents, with_tangents

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.engine.backends.kernel import Kernel, interval
+from crazysim.engine.backends.frame import Kernel, interval
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump

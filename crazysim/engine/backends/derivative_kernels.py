@@ -16,7 +16,7 @@ from crazysim import jaxcompat
 from crazysim.cache import announce, announced
 from crazysim.core.sharding import Location
 from crazysim.engine.backends import Run, kernel, lanes, reverse
-from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.backends.platforms import TARGETS, compiled, described
 from crazysim.engine.backends.reverse import Reverse

@@ -6,77 +6,14 @@ the last.
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Iterable, Sequence
-from importlib import resources
 
-from crazysim.engine.backends.exchange import exchange_for, lanes_of_block
+from crazysim.engine.backends.exchange import exchange_for
+from crazysim.engine.backends.frame import Kernel, framed
 from crazysim.engine.backends.source import TYPES, Writer, require, type_name
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE, Phase, Program, Segment, Slot
-
-UNBOUNDED = "1 /* blocks at least */"
-
-BLOCK = 64
-"""Threads of a block on a GPU."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Kernel:
-    """Source, with its inputs and outputs."""
-
-    text: str
-    """The source."""
-    inputs: tuple[int, ...]
-    """Leaves that it reads."""
-    outputs: tuple[int, ...]
-    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
-    in_place: tuple[int, ...] = ()
-    """Leaves of rows that it updates in place: input and output of each must be the same memory."""
-    threads: int = BLOCK
-    """Threads of a block on a GPU."""
-    lanes: int = BLOCK
-    """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
-    kept: int = 0
-    """Memory of the numbers of a lane that it keeps for each step of an interval, bytes; 0 for a kernel that only goes
-    ahead. The other takes the number of steps of an interval behind that of all steps."""
-
-    def aliases(self) -> dict[int, int]:
-        """Return the result that each operand in place is, by number; two numbers precede the operands."""
-        return {2 + self.inputs.index(i): self.outputs.index(i) for i in self.in_place}
-
-    def with_blocks(self, n: int) -> Kernel:
-        """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
-        return dataclasses.replace(self, text=self.text.replace(UNBOUNDED, f"{n}"))
-
-
-def interval(n_steps: int, size: int, memory: int) -> int:
-    """Return how many steps a gradient goes back at once: all, if there is memory for what they begin with.
-
-    Otherwise it is the root of their number, which takes the least memory, as it also keeps what intervals begin with.
-
-    Args:
-        n_steps: Number of steps.
-        size: Memory of what a step begins with, bytes.
-        memory: Memory that there is, bytes.
-    """
-    return max(n_steps, 1) if n_steps * size <= memory else math.isqrt(n_steps - 1) + 1
-
-
-def preamble(target: str) -> str:
-    """Return the types and functions of a target."""
-    files = resources.files("crazysim.engine.backends").joinpath("targets")
-    text = files.joinpath(f"{target}.h").read_text()
-    return text.replace('#include "scalar.h"\n', files.joinpath("scalar.h").read_text())
-
-
-def epilogue(target: str) -> str:
-    """Return the code through which a target calls the kernel."""
-    if target == "cuda":
-        return ""
-    return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()
 
 
 def write(program: Program, target: str) -> Kernel:
@@ -205,21 +142,12 @@ class Body:
             blocks: Blocks of a step, whose operations are counted.
             kept: Numbers of a lane that it keeps for each step of an interval; None for a kernel that only goes ahead.
         """
-        program, target = self.program, self.target
-        threads, lanes = lanes_of_block(program.group)
         shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
-        if target == "cuda":
-            frame = _cuda(pointers, "\n".join(shared), "\n".join(code), threads, lanes, kept is not None)
-        else:
-            frame = _host(pointers, "\n".join(shared), "\n".join(code), self.exchange.depth > 0, kept is not None)
-        widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
-        defines = f"#define WIDEST {widest}\n#define GROUP {program.group}\n#define BLOCK_THREADS {threads}\n"
-        defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
-        declared = "".join(f"{line}\n" for line in (*self.writer.tables, *self.exchange.declarations))
-        if kept is not None:
-            declared = f"#define N_KEPT {kept}\n{preamble(target + '_kept')}{declared}"
-        text = defines + preamble(target) + declared + frame + epilogue(target)
-        return Kernel(text, inputs, outputs, in_place, threads, lanes, (kept or 0) * widest)
+        return framed(
+            self.target, pointers, shared, code, blocks, [*self.writer.tables, *self.exchange.declarations],
+            inputs=inputs, outputs=outputs, in_place=in_place, group=self.program.group,
+            in_memory=self.exchange.depth > 0, kept=kept,
+        )  # fmt: skip
 
     def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:
         """Return the numbers that the stages write, and all that the kernel uses."""
@@ -239,42 +167,6 @@ class Body:
     def _write_phase(self, phase: Phase) -> None:
         for segment in self.program.of(phase):
             write_segment(self.writer, self.program, segment, self.names, [], self._depth)
-
-
-def _n_operations(block: Block) -> int:
-    """Return the number of operations of a block, with those for each of the others of a world."""
-    inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
-    return len(block.operations) + sum(inner)
-
-
-def write_map(block: Block, target: str) -> Kernel:
-    """Return the source of a function of an index and tables for ``cuda`` or ``host``; each lane has an index.
-
-    Args:
-        block: The function: its inputs are the index and the tables, its outputs single numbers.
-        target: ``"cuda"`` or ``"host"``.
-
-    Raises:
-        UnsupportedError: If there is no source for an operation or a type.
-    """
-    require(block)
-    writer, tables = Writer(), block.inputs[1:]
-    inputs, outputs = ([type_name(x.dtype) for x in some] for some in (tables, block.outputs))
-    pointers = [f"const {kind}* __restrict__ p{k}" for k, kind in enumerate(inputs)]
-    pointers += [f"{kind}* __restrict__ q{k}" for k, kind in enumerate(outputs)]
-    values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
-    for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
-        write_results(writer, f"q{k}", kind, 1, [x], 2)
-    threads, lanes = lanes_of_block(1)
-    body = "\n".join(writer.lines)
-    frame = (_cuda(pointers, "", body, threads, lanes, False) if target == "cuda"
-             else _host(pointers, "", body, False, False))  # fmt: skip
-    text = (
-        f"#define WIDEST {8 if 'f64' in (*inputs, *outputs) else 4}\n#define GROUP 1\n#define BLOCK_THREADS {threads}\n"
-    )
-    text += f"#define OPERATIONS {_n_operations(block)}\n{preamble(target)}"
-    text += "".join(f"{line}\n" for line in writer.tables) + frame + epilogue(target)
-    return Kernel(text, tuple(range(len(inputs))), tuple(range(len(outputs))), (), threads, lanes)
 
 
 def require_source(program: Program) -> None:
@@ -430,62 +322,3 @@ def write_results(writer: Writer, pointer: str, kind: str, drones: int, values: 
 def _drones(program: Program, leaf: int) -> int:
     """Return how many lanes have the same number of a leaf."""
     return program.n_drones if program.leaves[leaf].scope == "world" else 1
-
-
-def _cuda(pointers: Sequence[str], shared: str, body: str, threads: int, lanes: int, keeps: bool) -> str:
-    """Return the kernel of a thread: it computes what all share once, and the rest for its lane, or where it keeps
-    numbers for one lane after the other, as there is memory for a part of them at once.
-    """
-    scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
-    arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])
-    each = f"for (int first = blockIdx.x * {lanes}; first < n_lanes; first += gridDim.x * {lanes})"
-    interval, each = (", interval = count[1]", each) if keeps else ("", f"const int first = blockIdx.x * {lanes};")
-    return f"""
-extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({arguments}) {{
-  const int n_lanes = sizes[0], n_steps = count[0]{interval};
-  const int nothing = n_steps >> 31;
-  const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
-{shared}
-  {each} {{
-  const int wanted = first + place;
-  const bool active = thread < LANES && wanted < n_lanes;
-  const int lane = wanted < n_lanes ? wanted : n_lanes - 1;
-  const int own = lane % GROUP;
-  const int world = active ? place / GROUP * GROUP : 0;
-{body}
-  }}
-}}
-"""
-
-
-def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, keeps: bool) -> str:
-    """Return the function of a range of lanes: it computes what all share once, and the rest for each block of them."""
-    n_in = sum(p.startswith("const") for p in pointers)
-    buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
-    defined = []
-    for pointer, buffer in zip(pointers, buffers, strict=True):
-        kind, name = pointer.split("* __restrict__ ")
-        defined.append(f"  {kind}* __restrict__ const {name} = ({kind}*){buffer};")
-    pointed, memory, free = "\n".join(defined), "", ""
-    if keeps:  # the number of steps, which XLA passes before the inputs, is followed by the interval
-        memory = """
-  const int interval = ((int*)in[-1])[1];
-  char* const kept = static_cast<char*>(ALLOCATE(KEPT_BYTES));
-  if (kept == nullptr) return false;"""
-        free = "\n  free(kept);"
-    if in_memory:
-        memory = """
-  World* const memory = static_cast<World*>(ALLOCATE(sizeof(World)));
-  if (memory == nullptr) return false;
-  World& w = *memory;"""
-        free = "\n  free(memory);"
-    return f"""
-static bool advance_range(int64_t from, int64_t to, int64_t n_lanes, int n_steps, void** in, void** out) {{
-{pointed}{memory}
-{shared}
-  {"EACH_WORLD" if in_memory else "EACH_BLOCK"} {{
-{body}
-  }}{free}
-  return true;
-}}
-"""

@@ -25,7 +25,7 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.engine.backends import kernel_cache
-from crazysim.engine.backends.kernel import Kernel, interval
+from crazysim.engine.backends.frame import Kernel, interval
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError

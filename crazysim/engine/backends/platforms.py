@@ -8,7 +8,7 @@ import jax
 
 from crazysim.core.sharding import Location
 from crazysim.engine.backends import cuda, native
-from crazysim.engine.backends.kernel import Kernel
+from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.native import Launch
 
 TARGETS = {"cpu": "host", "gpu": "cuda"}

@@ -15,7 +15,8 @@ import numpy as np
 
 from crazysim.engine.backends import kernel
 from crazysim.engine.backends.exchange import MAX_IN_VECTOR
-from crazysim.engine.backends.kernel import Body, Kernel
+from crazysim.engine.backends.frame import Kernel
+from crazysim.engine.backends.kernel import Body
 from crazysim.engine.backends.source import type_name
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
