@@ -1,4 +1,4 @@
-"""Derivatives of the steps of a kernel as JAX sees them: primitives with rules for derivatives, transposes and vmap.
+"""Derivatives of the steps of a kernel for JAX: primitives with rules for derivatives, transposes and vmap.
 
 The tangents after some steps are a primitive that is linear in the tangents before them, and its transpose is another
 one. Either becomes a kernel of the platform that JAX lowers it for, or the same program on lanes where it has none.
