@@ -26,5 +26,5 @@ def write_map(block: Block, target: str) -> Kernel:
     values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
     for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
         write_results(writer, f"q{k}", kind, 1, [x], 2)
-    leaves = {"inputs": tuple(range(len(inputs))), "outputs": tuple(range(len(outputs)))}
-    return framed(target, pointers, [], writer.lines, [block], writer.tables, **leaves)
+    read, written = tuple(range(len(inputs))), tuple(range(len(outputs)))
+    return framed(target, pointers, [], writer.lines, [block], writer.tables, inputs=read, outputs=written)
