@@ -89,7 +89,6 @@ def test_all_engines_compute_all_pairs(n_drones):
             assert not step.plan(sim.data).program.unfused_stages
 
 
-@pytest.mark.filterwarnings("ignore:the jvp of the step runs on 'lanes'")  # that of a smallest number
 @pytest.mark.parametrize("n_drones", [3, 9])
 def test_law_08_gradients_equal_central_differences(n_drones, x64):
     """In float64 engines agree to its rounding, and the slope of a sum over velocities is that of differences.

@@ -189,6 +189,11 @@ class Writer:
         reads = self.exchange.publish(self, published, live, depth)
         first = [ops.neutral(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
         name = self._carry(op, [literal(x) for x in first], [False] * len(first), depth)
+        best: dict[int, str] = {}
+        for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
+            if combine in ops.PLACES:
+                best[k], start = self.new(), literal(ops.neutral(combine[3:], x.dtype))
+                self.line(f"auto {best[k]} = {type_name(x.dtype)}_lanes({start});", depth)
         turn = self.new("j")
         self.line(f"UNROLL for (int {turn} = 0; {turn} < GROUP; ++{turn}) {{", depth)
         inputs = [self.new() for _ in body.inputs]
@@ -197,7 +202,14 @@ class Writer:
         self.line(f"const auto {inputs[-1]} = eq_(own, i32({turn}));", depth + 1)
         outs = self.block(body, inputs, depth + 1)
         for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
-            self.line(f"{name}_{k} = {combine}_({name}_{k}, {out});", depth + 1)
+            if k in best:
+                better = self.new()
+                test = f"{ops.PLACES[combine]}_({out}, {best[k]})"
+                self.line(f"const auto {better} = or_({test}, ne_({out}, {out}));", depth + 1)
+                self.line(f"{name}_{k} = select_n_({better}, {name}_{k}, i32_lanes(i32({turn})));", depth + 1)
+                self.line(f"{best[k]} = select_n_({better}, {best[k]}, {out});", depth + 1)
+            else:
+                self.line(f"{name}_{k} = {combine}_({name}_{k}, {out});", depth + 1)
         self.line("}", depth)
 
     def _while(self, op: Operation, args: list[str], depth: int) -> None:

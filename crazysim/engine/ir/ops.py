@@ -244,10 +244,14 @@ twenty rounds of add, rotate and xor make a random number. An operation that run
 REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
 """Operations that combine the results of ``over_others``."""
 
+PLACES: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
+"""Reductions to the first drone with the smallest or largest number, and how a number compares that replaces it. Only
+derivatives in kernels have them."""
+
 
 def neutral(name: str, dtype: np.dtype) -> np.generic:
     """Return the number that an operation of ``REDUCTIONS`` begins with; ``or`` and ``and`` stand for max and min."""
-    if name in ("add", "or", "and"):
+    if name in ("add", "or", "and", *PLACES):
         return dtype.type(name == "and")
     limits = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     return dtype.type(limits[name == "min"])

@@ -140,7 +140,10 @@ def _verify_types(op: Operation) -> None:
         case "over_others":
             (block,) = op.blocks
             _require([x.dtype for x in block.inputs] == [*dtypes, np.dtype(bool)], text)
-            _require([x.dtype for x in block.outputs] == results and len(op.param("reduce")) == len(results), text)
+            names = op.param("reduce")
+            outs = [np.dtype(np.int32) if name in ops.PLACES else x.dtype
+                    for name, x in zip(names, block.outputs, strict=False)]  # fmt: skip
+            _require(outs == results and len(names) == len(results) == len(block.outputs), text)
         case "custom_jvp":
             (block,) = op.blocks
             _require([x.dtype for x in block.inputs] == dtypes, text)

@@ -21,6 +21,7 @@ from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value,
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
 from crazysim.engine.lowering.activity import applied, changed, differentiable
 from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.selections import with_selections
 
 Values = dict[Value, Element]
 
@@ -105,6 +106,9 @@ def block_with_tangents(block: Block, wanted: Sequence[Value]) -> Block:
     Raises:
         UnsupportedError: If an operation has no derivative in a kernel.
     """
+    places = [block.inputs.index(x) for x in wanted]
+    block = with_selections(block)
+    wanted = [block.inputs[k] for k in places]
     builder = Builder()
     values: Values = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     tangents: Values = {x: builder.input(x.dtype) for x in wanted}
@@ -240,9 +244,7 @@ def _over_others(builder: Builder, op: Operation, values: Values, tangents: Valu
     inside[is_self] = inner.input(is_self.dtype)
     outputs = _push(inner, body, inside, moving)
     names = op.param("reduce")
-    some = [k for k, x in enumerate(body.outputs) if isinstance(_tangent_or_none(x, moving), Value)]
-    if any(names[k] != "add" for k in some):
-        raise UnsupportedError("the smallest or largest over other drones has no derivative in a kernel", op.name)
+    some = [k for k, x in enumerate(body.outputs) if names[k] == "add" and isinstance(_tangent(x, moving), Value)]
     block = inner.finish([*outputs, *(moving[body.outputs[k]] for k in some)])
     args = [*(_mapped(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
     dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in some]
@@ -250,10 +252,6 @@ def _over_others(builder: Builder, op: Operation, values: Values, tangents: Valu
     results = builder.add_many("over_others", args, dtypes, params, (block,))
     values.update(zip(op.results, results, strict=False))
     _record([op.results[k] for k in some], results[len(op.results) :], tangents)
-
-
-def _tangent_or_none(x: Element, tangents: Values) -> Element | None:
-    return tangents.get(x) if isinstance(x, Value) else None
 
 
 STRUCTURE: dict[str, Callable[[Builder, Operation, Values, Values], None]] = {

@@ -19,6 +19,7 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 from crazysim.engine.lowering.activity import active, applied
 from crazysim.engine.lowering.jaxprs import lower_function
+from crazysim.engine.lowering.selections import with_selections
 
 MAX_UNROLLED = 4096
 """Most operations of a loop that is unrolled for its derivative."""
@@ -42,7 +43,7 @@ def transposed(block: Block, wanted: Sequence[Value]) -> Block:
         UnsupportedError: If an operation between them has no derivative in a kernel.
     """
     places = [block.inputs.index(x) for x in wanted]
-    block = _unrolled(block)
+    block = _unrolled(with_selections(block))
     wanted = [block.inputs[k] for k in places]
     on_path = active(block, wanted)
     builder = Builder()
@@ -200,8 +201,8 @@ def _over_others(
     """Cotangents go to the drone that reads, and, from all drones that read them, to the numbers it published."""
     used = [ct for ct in found if ct is not None]
     names = [name for name, ct in zip(op.param("reduce"), found, strict=True) if ct is not None]
-    if any(name != "add" for name in names):
-        raise UnsupportedError("the smallest or largest over other drones has no derivative in a kernel", op.name)
+    if any(name != "add" for name in names):  # see ``selections``
+        raise UnsupportedError(f"{', '.join(names)} over other drones has no derivative in a kernel", op.name)
     (body,) = op.blocks
     uses = body.uses()
     own = [x for x in values if x in uses and not x.size and isinstance(values[x], Value)]  # in the same order always

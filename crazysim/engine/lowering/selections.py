@@ -1,0 +1,63 @@
+"""The smallest or largest number over other drones, in a form that has derivatives.
+
+Its derivative is that of the number of the first drone that has it, as ``crazysim.core.others`` defines it. To compare
+numbers with the smallest one would not do: computed twice, they may be rounded differently.
+"""
+
+from __future__ import annotations
+
+from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
+
+PLACES = {"min": "argmin", "max": "argmax"}
+
+
+def with_selections(block: Block) -> Block:
+    """Return a block in which two loops find such a number: which drone has it, and a sum of its number alone."""
+    if not any(map(_selects, block.operations)):
+        return block
+    builder = Builder()
+    values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
+    for op in block.operations:
+        builder.stage = op.stage
+        inline(builder, Block((), (op,), ()), values)
+        if some := _selects(op):
+            values.update(zip([op.results[k] for k in some], _selected(builder, op, some, values), strict=True))
+    outputs = [values.get(x, x) if isinstance(x, Value) else x for x in block.outputs]
+    return Block(tuple([values[x] for x in block.inputs]), tuple(builder.operations), tuple(outputs))
+
+
+def _selects(op: Operation) -> list[int]:
+    """Return the results of an operation that are the smallest or largest of floats."""
+    if op.name != "over_others":
+        return []
+    pairs = zip(op.param("reduce"), op.results, strict=True)
+    return [k for k, (name, x) in enumerate(pairs) if name in PLACES and x.dtype.kind == "f"]
+
+
+def _selected(builder: Builder, op: Operation, some: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
+    (body,) = op.blocks
+    args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
+    dtypes, n_members = [op.results[k].dtype for k in some], ("n_members", op.param("n_members"))
+
+    def of_pair(n_more: int) -> tuple[Builder, list[Value], list[Element]]:
+        """Return the body once more with further published integers, which follow the others."""
+        inner = Builder(builder)
+        fresh = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_more)]
+        is_self = inner.input(bool)
+        own = [*fresh[: len(args)], is_self]
+        outs = inline(inner, body, values | dict(zip(body.inputs, own, strict=True)))
+        return inner, [*fresh[len(args) :], is_self], [outs[k] for k in some]
+
+    inner, (is_self,), found = of_pair(0)
+    one, zero = (constant(x, dtypes[0]) for x in (1, 0))
+    own = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the largest is that of the drone itself
+    names = (*(PLACES[op.param("reduce")[k]] for k in some), "argmax")
+    block = prune(inner.finish([*found, own]))
+    *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
+                                       (block,))  # fmt: skip
+
+    inner, (other, _), found = of_pair(1)
+    terms = [inner.add("select_n", (inner.add("eq", (other, which), bool), constant(0, x.dtype), x), x.dtype)
+             for which, x in zip(chosen, found, strict=True)]  # fmt: skip
+    params = (("reduce", ("add",) * len(some)), n_members)
+    return builder.add_many("over_others", [*args, number], dtypes, params, (prune(inner.finish(terms)),))
