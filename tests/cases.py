@@ -205,6 +205,17 @@ def repulsion(data):
     return data.replace(states=data.states.replace(force=force))
 
 
+@stage("drone")
+def gap(data):
+    """Push a drone up by its distance to the nearest other one, and by the first of equal numbers."""
+    pos = data.states.pos
+    near = reduce_over_others(
+        lambda other, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min"
+    )
+    equal = reduce_over_others(lambda other, _: other[1] - jax.lax.stop_gradient(other[1]), pos, "max")
+    return data.replace(states=data.states.replace(force=jnp.zeros(3).at[2].set(1e-3 * (near + equal))))
+
+
 @stage("world")
 def centre(data):
     """Pull the drones of a world to their centre."""

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import PAIRS, centre, needs_compiler, repulsion, shared_sim
+from cases import PAIRS, centre, gap, needs_compiler, repulsion, shared_sim
 
-from crazysim import Sim, reduce_over_others, stage
+from crazysim import Sim, stage
 from crazysim.core import functional as F
 from crazysim.core.pipeline import insert_fn_before
 from crazysim.engine import Step, explain
@@ -145,17 +145,6 @@ def test_second_derivatives_are_those_of_lanes(x64):
         return jax.jit(lambda x: [jax.jvp(fn, (x,), (vel,))[1] for fn in (forward, jax.grad(loss))])(vel)
 
     assert_same(*(twice(losses) for losses, *_ in pairs))
-
-
-@stage("drone")
-def gap(data):
-    """Push a drone up by its distance to the nearest other one, and by the first of equal numbers."""
-    pos = data.states.pos
-    near = reduce_over_others(
-        lambda other, is_self: jnp.where(is_self, jnp.inf, jnp.sum((pos - other) ** 2)), pos, "min"
-    )
-    equal = reduce_over_others(lambda other, _: other[1] - jax.lax.stop_gradient(other[1]), pos, "max")
-    return data.replace(states=data.states.replace(force=jnp.zeros(3).at[2].set(1e-3 * (near + equal))))
 
 
 @needs_compiler

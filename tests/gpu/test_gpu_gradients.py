@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import centre, repulsion, trees_equal
+from cases import centre, gap, repulsion, trees_equal
 from on_devices import ACCELERATOR, DEVICES, NAMES, agree, flying, on
 
 from crazysim import Battery, Wind
@@ -81,7 +81,9 @@ def test_gradients_go_through_the_states_of_plugins():
 
 
 @pytest.mark.parametrize(
-    ("n_drones", "stage"), [(3, repulsion), (12, repulsion), (33, repulsion), (3, centre)], ids=lambda x: str(x)
+    ("n_drones", "stage"),
+    [(3, repulsion), (12, repulsion), (33, repulsion), (3, centre), (12, gap)],
+    ids=lambda x: str(x),
 )
 def test_drones_that_act_on_each_other_are_differentiated(n_drones, stage):
     """Within a warp and within a block, of which some threads have no drone."""
