@@ -1,10 +1,10 @@
-"""Rays per second of depth images, beside the time to the first image.
+"""Rays per second of depth images, beside the time to the first image; or the time of a step with a range finder.
 
-One JSON line for each number of poles, fixed and movable, with rays by the clock (median) and by the time of processors
-(least). For the figures of another version, run this file with its
-folder in PYTHONPATH, in turns with this one.
+One JSON line for each number of poles, fixed and movable, with rays or steps by the clock (median) and by the time of
+processors (least). For the figures of another version, run this file with its folder in PYTHONPATH, in turns with this
+one. With ``--range-finder`` drones at random places measure six distances up to 4 m in each step.
 
-    python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000]
+    python benchmarks/depth.py [--device gpu] [--worlds 64] [--size 64 64] [--poles 0 30 1000] [--range-finder]
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from functools import partial
 import jax
 import numpy as np
 from jax import Array
-from measure import digits, medians, report, seconds
+from measure import digits, engine_of, medians, report, seconds
 
-from crazysim import Sim, __version__
+from crazysim import RangeFinder, Sim, __version__
 
 HALF = 10.0
 """Half the side of the square in which the poles stand, m."""
@@ -32,9 +32,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(64, 64), help="width and height, pixels")
     parser.add_argument("--poles", type=int, nargs="+", default=(0, 30, 1000))
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--range-finder", action="store_true", help="time a step with a range finder, not images")
     args = parser.parse_args()
     for n_poles, movable in [(n, movable) for n in args.poles for movable in ((False, True) if n else (False,))]:
         sim = scene(args.worlds, n_poles, movable, args.device)
+        if args.range_finder:
+            of_range_finder(sim, n_poles, movable, args)
+            continue
         look = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
         begin = time.perf_counter()
         jax.block_until_ready(look())
@@ -49,8 +53,32 @@ def main() -> None:
         )  # fmt: skip
 
 
+def of_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
+    """Print the time of a step with a range finder."""
+    n, n_steps = sim.n_worlds, 20
+    pos = np.random.default_rng(1).uniform([-HALF, -HALF, 1], [HALF, HALF, 1], (n, 1, 3)).astype(np.float32)
+    sim.add(RangeFinder())
+
+    def steps() -> Array:
+        sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+        sim.step(n_steps)
+        return sim.data.states.pos
+
+    begin = time.perf_counter()
+    jax.block_until_ready(steps())
+    first = time.perf_counter() - begin
+    taken = medians({"step": partial(seconds, steps)}, args.repeats)["step"] / n_steps
+    used = min(processor_seconds(steps) for _ in range(args.repeats)) / n_steps
+    near = float(np.mean(np.asarray(sim.data.plugins["range_finder"].distance)[..., :4] < 4))
+    report(
+        args.device, benchmark="range_finder", n_poles=n_poles, movable=movable, n_worlds=n, first_s=digits(first),
+        step_us=digits(1e6 * taken), processor_ns_per_drone=digits(1e9 * used / n), fraction_that_meets=digits(near),
+        engine=engine_of(sim), crazysim=__version__,
+    )  # fmt: skip
+
+
 def processor_seconds(look: Callable[[], Array]) -> float:
-    """Return the time that all threads of this process compute for an image, which other work on the machine disturbs
+    """Return the time that all threads of this process compute for a call, which other work on the machine disturbs
     less than the time by the clock.
     """
     begin = time.process_time()

@@ -1,7 +1,7 @@
-"""The first geom that a ray meets: a function of one ray, which the engine makes a kernel for all rays.
+"""The first geom that a ray meets: a function of one ray, for kernels of all rays and for stages of a step.
 
-Geoms that do not move are in a hierarchy of boxes, those of movable bodies and drones in a list with a ball around
-each, for every world.
+Geoms that do not move are in a hierarchy of boxes. For kernels of all rays, those of movable bodies and drones are in a
+list with a ball around each, for every world.
 """
 
 from __future__ import annotations
@@ -69,6 +69,19 @@ class Target:
         return np.concatenate([pos, [0.0], rot.reshape(-1), size])
 
 
+class Hierarchy(NamedTuple):
+    """Geoms that do not move, as tables in memory."""
+
+    codes: Array
+    """Index of the surface, and the drone that a geom belongs to. (n, 2)"""
+    boxes: Array
+    """Boxes of the nodes, one order after the other. (8 * n_nodes, 6)"""
+    links: Array
+    """Place behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
+    geoms: Array
+    """Geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
+
+
 class Tables(NamedTuple):
     """Everything that rays of all worlds need, as tables in memory."""
 
@@ -77,9 +90,9 @@ class Tables(NamedTuple):
     codes: Array
     """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
     boxes: Array
-    """Boxes of the hierarchy of the fixed geoms, one order after the other. (8 * n_nodes, 6)"""
+    """As in ``Hierarchy``, of the fixed geoms. (8 * n_nodes, 6)"""
     links: Array
-    """Place behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
+    """As in ``Hierarchy``. (8 * n_nodes, 2)"""
     fixed: Array
     """Fixed geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
     balls: Array
@@ -120,23 +133,23 @@ class Targets:
         """All of them, in the order of their indices."""
         self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all))
         """Surfaces that there are."""
-        self.codes = np.array([self.surfaces.index(x.surface) for x in self.all], np.int32)
-        """Index of the surface of each geom. (n,)"""
+        owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
+        codes = [(self.surfaces.index(x.surface), owner) for x, owner in zip(self.all, owners, strict=True)]
+        self.codes = np.array(codes, np.int32).reshape(-1, 2)
+        """Index of the surface of each geom, and the drone that it belongs to. (n, 2)"""
 
-    def hierarchy(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the hierarchy of the fixed geoms; see ``hierarchy.build``."""
+    def hierarchy(self, dtype: DTypeLike) -> Hierarchy:
+        """Return the fixed geoms; see ``hierarchy.build``."""
         low, high = np.zeros((2, len(self.fixed), 3))
         for k, target in enumerate(self.fixed):
             rot = np.eye(3) if target.geom.rot is None else np.array(target.geom.rot)
             centre, half = bounding_box(target.geom.shape)
             centre, half = np.array(target.geom.pos) + rot @ centre, np.abs(rot) @ half
             low[k], high[k] = centre - half, centre + half
-        return hierarchy.build(low, high)
-
-    def fixed_rows(self, dtype: DTypeLike) -> Array:
-        """Return the fixed geoms. (n_fixed, 16)"""
-        rows = [x.numbers(np.array(x.geom.pos)) for x in self.fixed]
-        return jnp.asarray(np.array(rows).reshape(-1, 16), dtype)
+        boxes, links = (x.reshape(-1, x.shape[-1]) for x in hierarchy.build(low, high))
+        geoms = np.array([x.numbers(np.array(x.geom.pos)) for x in self.fixed]).reshape(-1, 16)
+        codes = self.codes[: len(self.fixed)]
+        return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
 
     def movable_rows(self, data: SimData) -> tuple[Array, Array]:
         """Return centres and radii of balls around the movable geoms, and the geoms, world frame.
@@ -180,12 +193,9 @@ class Targets:
             eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
             pixels: Directions in the frame of the camera, and the drone that a ray passes. (n_cameras, n_pixels, 4)
         """
-        dtype, (boxes, links) = eyes.dtype, self.hierarchy()
-        owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
-        codes = np.stack([self.codes, np.array(owners, np.int32)], axis=1) if self.all else np.zeros((0, 2), np.int32)
-        counts = np.array([[boxes.shape[1], len(self.fixed), len(self.movable)]], np.int32)
-        of_scene = jnp.asarray(counts), jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links)
-        found = (*of_scene, self.fixed_rows(dtype), balls, geoms, eyes, pixels)
+        fixed = self.hierarchy(eyes.dtype)
+        counts = np.array([[len(fixed.boxes) // hierarchy.N_ORDERS, len(self.fixed), len(self.movable)]], np.int32)
+        found = (jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], balls, geoms, eyes, pixels)
         # No table is empty, since one of no rows has no memory.
         flat = [x.reshape(-1, x.shape[-1]) for x in found]
         return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
@@ -228,11 +238,35 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     ray = Ray((eye[0], eye[1], eye[2]), (x, y, z), passes.astype(jnp.int32))
     best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
 
-    def visit(k: Array, geoms: Array, row: Array, meets: Array, best: Best) -> Best:
-        """Return the nearer of the best hit and, where a ray may meet it, that of geom ``k``, a row of a table."""
-        code, _ = table_rows(t.codes, k)
-        return _nearer(surfaces, code, k, table_rows(geoms, row), ray, meets, best)
+    best = first_fixed(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
 
+    def turn(carry: tuple[Array, Best]) -> tuple[Array, Best]:
+        k, best = carry
+        row, geom = world * n_movable + k, n_fixed + k
+        code, owner = table_rows(t.codes, geom)
+        meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
+
+        def visit(best: Best) -> Best:
+            return _nearer(surfaces, code, geom, table_rows(t.movable, row), ray, meets, best)
+
+        return k + 1, compute_where(any_lane(meets), visit, best)
+
+    return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
+
+
+def first_fixed(
+    surfaces: Sequence[Surface], tables: Hierarchy, ray: Ray, best: Best, n_nodes: Array | int | None = None
+) -> Best:
+    """Return the nearer of the best hit and the first fixed geom that a ray meets.
+
+    Args:
+        surfaces: Surfaces that there are.
+        tables: The fixed geoms.
+        ray: The ray.
+        best: Best hit so far.
+        n_nodes: Nodes of an order of the hierarchy; None for as many as the tables have.
+    """
+    n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes
     inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
     signs = [any_lane(d < 0) for d in ray.direction]
@@ -240,25 +274,19 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
 
     def walk(carry: tuple[Array, Best]) -> tuple[Array, Best]:
         place, best = carry
-        box, (after, geom) = table_rows(t.boxes, start + place), table_rows(t.links, start + place)
+        box, (after, geom) = table_rows(tables.boxes, start + place), table_rows(tables.links, start + place)
         meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
 
+        def visit(best: Best) -> Best:
+            code, _ = table_rows(tables.codes, geom)
+            return _nearer(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
+
         def go_in(carry: tuple[Array, Best]) -> tuple[Array, Best]:
-            _, best = carry
-            return place + 1, compute_where(geom >= 0, lambda best: visit(geom, t.fixed, geom, meets, best), best)
+            return place + 1, compute_where(geom >= 0, visit, carry[1])
 
         return compute_where(any_lane(meets), go_in, (after, best))
 
-    _, best = lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))
-
-    def turn(carry: tuple[Array, Best]) -> tuple[Array, Best]:
-        k, best = carry
-        row, geom = world * n_movable + k, n_fixed + k
-        _, owner = table_rows(t.codes, geom)
-        meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
-        return k + 1, compute_where(any_lane(meets), lambda best: visit(geom, t.movable, row, meets, best), best)
-
-    return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
+    return lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))[1]
 
 
 def _larger(a: Array, b: Array) -> Array:

@@ -22,11 +22,16 @@ from crazysim.geometry.points import components
 from crazysim.geometry.rays import hit_distance, hit_normal
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionGeom, CollisionModel
-from crazysim.scene.first_hit import NOBODY, Targets, first_hit, in_frame, shape_of
+from crazysim.scene.first_hit import NOBODY, Ray, Surface, Targets, first_fixed, first_hit, in_frame, shape_of
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 MAX_UNROLLED = 16
 """Geoms of equal objects up to which the program is unrolled; more go through a loop, which compiles once."""
+MAX_PAIRS = 36
+"""Rays times fixed geoms of one world or drone up to which the program is unrolled: it is two to three times as fast as
+a hierarchy then, and compiles in about the same time."""
+MAX_LOOPED = 64
+"""Rays of a loop within a step; an index that is computed at run time selects among at most 64 places."""
 
 
 class Hits(PyTree):
@@ -56,6 +61,7 @@ def cast(
     drones: bool = True,
     mocap: MocapPoses = None,
     kernels: RayKernels | None = None,
+    limit: Array | float = np.inf,
 ) -> Hits:
     """Return the first surfaces that rays meet, in all worlds, in one world, or around one drone, as the data is.
 
@@ -68,6 +74,7 @@ def cast(
         drones: True for rays to meet drones; a stage of one drone has no access to the others.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
         kernels: Kernels that may cast the rays of all worlds; None for XLA.
+        limit: Distance beyond which rays of one world or drone need not meet what does not move, m.
 
     Raises:
         ConfigError: If the scene has such bodies and their poses are not given.
@@ -88,14 +95,15 @@ def cast(
         number=jnp.full(origin.shape[:-1], -1, jnp.int32),
         names=names(model, data.core.n_drones if drones else 0),
     )
-    for geom in model.floor:
-        best = _nearer(best, *_meet(geom, origin, direction), 0)
+    targets = Targets(model, 0, drones=False)
+    if len(targets.fixed) * len(origin) <= MAX_PAIRS:
+        for target in targets.fixed:
+            best = _nearer(best, *_meet(target.geom, origin, direction), target.number)
+    else:
+        best = _nearer(best, *_meet_fixed(targets, origin, direction, limit))
     groups: dict[tuple[CollisionGeom, ...], list[tuple[int, int]]] = {}
     for number, body in enumerate(model.objects, start=1):
-        if body.row is None:
-            for geom in body.geoms:
-                best = _nearer(best, *_meet(geom, origin, direction), number)
-        else:
+        if body.row is not None:
             groups.setdefault(body.geoms, []).append((body.row, number))
     if data.objects is not None:
         pos, quat = data.objects.pos, data.objects.quat
@@ -176,6 +184,85 @@ def _nearer(best: Hits, far: Array, normal: Array, number: Array | int) -> Hits:
     )
 
 
+def _meet_fixed(targets: Targets, origin: Array, direction: Array, limit: Array | float) -> tuple[Array, Array, Array]:
+    """Return the first fixed geoms that rays of one world or drone meet, in a hierarchy.
+
+    A loop over the rays finds the geoms without a derivative. The distance is that to the one geom that was found, with
+    its derivative.
+
+    Args:
+        targets: The geoms.
+        origin: Origins of the rays, world frame, m. (n_rays, 3)
+        direction: Unit directions, world frame. (n_rays, 3)
+        limit: Distance beyond which nothing needs to be found, m.
+
+    Returns:
+        Distance, m, infinite for none. (n_rays,)
+        Unit normal, world frame, zero for none. (n_rays, 3)
+        Number of the body, as in ``Hits``. (n_rays,)
+    """
+    tables = targets.hierarchy(origin.dtype)
+    surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed), 0].max()]
+    starts, ways = jax.lax.stop_gradient((origin, direction))
+    begin = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
+
+    def of_some(starts: Array, ways: Array) -> Array:
+        def turn(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+            k, which = carry
+            ray = Ray(components(starts[k]), components(ways[k]), jnp.int32(NOBODY))
+            return (k + 1, which.at[k].set(first_fixed(surfaces, tables, ray, begin)[1])), None
+
+        none = jnp.int32(0), jnp.full(len(starts), -1, jnp.int32)
+        return jax.lax.scan(turn, none, length=len(starts))[0][1]
+
+    chunks = [slice(k, k + MAX_LOOPED) for k in range(0, len(starts), MAX_LOOPED)]
+    which = jnp.concatenate([of_some(starts[chunk], ways[chunk]) for chunk in chunks])
+    rows = jnp.take(tables.geoms, jnp.maximum(which, 0), axis=0)
+    distance, normal_at = _meet_rows(surfaces, targets.codes, which, rows, origin, direction)
+    numbers = jnp.asarray([target.number for target in targets.fixed], jnp.int32)
+    return distance, normal_at(distance), jnp.take(numbers, jnp.maximum(which, 0))
+
+
+def _meet_rows(
+    surfaces: Sequence[Surface], codes: np.ndarray, which: Array, rows: Array, origin: Array, direction: Array
+) -> tuple[Array, Callable[[Array], Array]]:
+    """Return the distance along rays to a geom each, and a function from distances to unit normals, world frame.
+
+    Args:
+        surfaces: Surfaces that there are.
+        codes: Index of the surface of each geom in the first column. (n, 2)
+        which: Index of the geom of each ray, -1 for none. (...)
+        rows: Rows of these geoms; see ``Target.numbers``. (..., 16)
+        origin: Origins of the rays, world frame, m. (..., 3)
+        direction: Unit directions, world frame. (..., 3)
+    """
+    row = [rows[..., k] for k in range(16)]
+    start, along = in_frame(row, components(origin), components(direction))
+    begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
+    code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(which, 0))
+    found = []
+    exact = jnp.full_like(start[0], jnp.inf)
+    for number, surface in enumerate(surfaces):
+        mine = (which >= 0) & (code == number)
+        # A size for geoms of other kinds, so that their slopes are finite.
+        shape = shape_of(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
+        if isinstance(shape, Shape) and shape.kind == "hfield":
+            far, normal = ray_distance(shape, begin, way)
+        else:
+            far, normal = hit_distance(shape, start, along), None
+        exact = jnp.where(mine, far, exact)
+        found.append((mine, shape, normal))
+
+    def normal_at(distance: Array) -> Array:
+        across = jnp.zeros_like(origin)
+        for mine, shape, normal in found:
+            normal = hit_normal(shape, begin, way, distance) if normal is None else normal
+            across = jnp.where(mine[..., None], normal, across)
+        return jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
+
+    return exact, normal_at
+
+
 # Rays of all worlds -------------------------------------------------------------------------------------------------
 
 
@@ -211,30 +298,12 @@ def cast_in_worlds(
     origin = jnp.repeat(eyes[..., :3], n_pixels, axis=1)
     if not targets.all:
         return Hits(distance, jnp.zeros_like(origin), which, names(model, data.core.n_drones if drones else 0))
-    fixed = jnp.broadcast_to(targets.fixed_rows(eyes.dtype), (n_worlds, len(targets.fixed), 16))
+    fixed = jnp.broadcast_to(tables.fixed[: len(targets.fixed)], (n_worlds, len(targets.fixed), 16))
     rows = jnp.concatenate([fixed, movable], axis=1)
     rows = jnp.take_along_axis(rows, jnp.maximum(which, 0)[..., None], axis=1)
-    row = [rows[..., k] for k in range(16)]
-    start, along = in_frame(row, components(origin), components(direction))
-    begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
-    code = jnp.asarray(targets.codes)[jnp.maximum(which, 0)]
-    found = []
-    exact = jnp.full_like(distance, jnp.inf)
-    for number, surface in enumerate(targets.surfaces):
-        mine = (which >= 0) & (code == number)
-        # A size for geoms of other kinds, so that their slopes are finite.
-        shape = shape_of(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
-        if isinstance(shape, Shape) and shape.kind == "hfield":
-            far, normal = ray_distance(shape, begin, way)
-        else:
-            far, normal = hit_distance(shape, start, along), None
-        exact = jnp.where(mine, far, exact)
-        found.append((mine, shape, normal))
-    distance, across = _with_derivative_of(distance, exact), jnp.zeros_like(origin)
-    for mine, shape, normal in found:
-        normal = hit_normal(shape, begin, way, distance) if normal is None else normal
-        across = jnp.where(mine[..., None], normal, across)
-    normal = jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
+    exact, normal_at = _meet_rows(targets.surfaces, targets.codes, which, rows, origin, direction)
+    distance = _with_derivative_of(distance, exact)
+    normal = normal_at(distance)
     numbers = jnp.asarray([*(target.number for target in targets.all), -1], jnp.int32)
     return Hits(distance, normal, numbers[which], names(model, data.core.n_drones if drones else 0))
 

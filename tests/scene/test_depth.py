@@ -206,6 +206,41 @@ def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
     assert np.all(seen < 1.1)
 
 
+def test_a_range_finder_finds_the_first_of_many_objects(x64, rng):
+    """In a kernel, where C MuJoCo's rays end; with the gradient that central differences have, from one kernel too."""
+    n = 16
+    sim = Sim(n, control="rotor_vel", engine="fused", strict=True)
+    pos, quat = rng.uniform([-3, -3, 0.2], [3, 3, 2], (40, 3)), rng.normal(size=(40, 4))
+    sim.scene.add("pole", count=20, pos=pos[:20], quat=quat[:20], mocap=False)
+    sim.scene.add("box", count=20, pos=pos[20:], quat=quat[20:], size=(0.8, 0.6, 1.0), mocap=False)
+    look = np.array([[1.0, 0.2, -0.1], [-0.6, 0.8, 0.0]]) / np.sqrt([[1.05], [1.0]])
+    sim.add(RangeFinder(look, max_range=2.5))
+    sim.data = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, sim.data)
+    start = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (n, 1, 3))
+    step, weight = sim.build_step_fn(), rng.uniform(size=(n, 1, 2))
+
+    @jax.jit
+    def measured(pos):
+        data = step(sim.data.replace(states=sim.data.states.replace(pos=pos)), 2)
+        found = data.plugins["range_finder"].distance
+        return jnp.sum(weight * found), (found, data.states.pos)
+
+    slope, (distance, at) = jax.jit(jax.grad(measured, has_aux=True))(start)
+    assert "gradient: one kernel" in sim.explain()
+    group, geom = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+    sim.scene.sync_one(sim.data, 0)
+    rays = [(w, k) for w in range(n) for k in range(2)]
+    far = [mujoco.mj_ray(sim.mj_model, sim.mj_data, at[w, 0], look[k], group, 1, -1, geom, None) for w, k in rays]
+    far = np.array([x if 0 <= x < 2.5 else 2.5 for x in far])
+    assert 8 < np.sum(far < 2.5) < 28
+    # MuJoCo's compiler rounds sizes and poses of the scene to 1e-9 at most.
+    np.testing.assert_allclose(np.asarray(distance).reshape(-1), far, atol=1e-7)
+    h = 1e-6  # the third derivative of the distance to a pole costs some h^2 = 1e-12, rounding 1e-16 / h
+    for k, way in enumerate(h * np.eye(3)):
+        ends = [np.sum(weight * np.asarray(measured(start + sign * way)[1][0]), axis=-1) for sign in (1, -1)]
+        np.testing.assert_allclose(slope[..., k], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
+
+
 def test_a_range_finder_measures_at_its_rate():
     sim = Sim(control="attitude")
     sim.add(RangeFinder([[0, 0, -2]], freq=50))

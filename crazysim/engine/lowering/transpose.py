@@ -79,9 +79,9 @@ def _again(
     """Compute a part of a block once more from what it uses, and return the elements that its values are then.
 
     Otherwise all that is computed on the way ahead would take registers until the way back needs it. Reductions over
-    other drones are not computed again.
+    other drones and loops are not computed again.
     """
-    repeated = [op for op in part.operations if op.name != "over_others"]
+    repeated = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
     own, used = {x for op in repeated for x in op.results}, part.uses()
     before = [x for x in values if x in used and x in on_path and x not in own and isinstance(values[x], Value)]
     fresh = {x: builder.add("again", (values[x],), x.dtype, (("part", number),)) for x in before}
@@ -249,13 +249,20 @@ STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_ot
 
 
 def _unrolled(block: Block) -> Block:
-    """Return a block whose loops of a fixed length are unrolled; the carries of their turns are needed backwards."""
-    if not any(op.name == "loop" for inner in block.blocks() for op in inner.operations):
+    """Return a block whose loops of a fixed length are unrolled; the carries of their turns are needed backwards.
+
+    Loops of integers and bools alone have no derivative, and stay.
+    """
+    if not any(_is_reversed(op) for inner in block.blocks() for op in inner.operations):
         return block
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     outputs = _unroll(builder, block, values)
     return Block(tuple(values[x] for x in block.inputs), tuple(builder.operations), tuple(outputs))
+
+
+def _is_reversed(op: Operation) -> bool:
+    return op.name == "loop" and any(x.dtype.kind == "f" for x in op.results)
 
 
 def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
@@ -264,7 +271,7 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
 
     for op in block.operations:
         builder.stage = op.stage
-        if op.name == "loop":
+        if _is_reversed(op):
             (body,) = op.blocks
             length, carry = op.param("length"), [mapped(x) for x in op.args]
             if length * sum(1 for _ in body.walk()) > MAX_UNROLLED:

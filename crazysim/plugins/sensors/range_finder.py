@@ -122,6 +122,8 @@ class RangeFinder(Plugin):
         n_rays = direction.shape[1]
         origin = jnp.broadcast_to(pos[:, None], direction.shape)
         own = np.repeat(np.arange(direction.shape[0]), n_rays) if self.drones else None
-        hits = cast(model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones)
+        hits = cast(
+            model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones, limit=record.max_range
+        )
         distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:2])
         return record.replace(distance=distance if of_world else distance[0])
