@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from measure import Flight, digits, engine_of, medians, report
+from measure import Flight, report_flights
 
 from crazysim import Sim, SlungLoad
 from crazysim.engine.ir.program import Segment
@@ -49,22 +49,9 @@ def main() -> None:
     references = [name for name in REFERENCES if any(CASES[case][0] == name for case in args.cases)]
     cases = dict.fromkeys([*references, *args.cases])
     flights = {name: fly(args, name) for name in cases}
-    taken = medians({name: flight.seconds for name, flight in flights.items()}, args.repeats)
-    for name, flight in flights.items():
-        flight.require_flying()
-        line: dict[str, Any] = {"operations": operations(flight.sim)} if args.operations else {}
-        report(
-            args.device,
-            benchmark="flight_stack",
-            case=name,
-            engine=engine_of(flight.sim),
-            n_worlds=args.worlds,
-            call_s=digits(taken[name]),
-            steps_per_s=digits(args.worlds * N_STEPS / taken[name]),
-            reference=CASES[name][0],
-            ratio=digits(taken[name] / taken[CASES[name][0]]),
-            **line,
-        )
+    counted = {"operations": operations} if args.operations else {}
+    reference = {name: CASES[name][0] for name in flights}
+    report_flights(args.device, flights, args.repeats, reference, benchmark="flight_stack", **counted)
 
 
 def fly(args: argparse.Namespace, name: str) -> Flight:

@@ -125,6 +125,41 @@ def medians(measures: dict[str, Callable[[], float]], repeats: int) -> dict[str,
     return {name: statistics.median(values) for name, values in found.items()}
 
 
+def report_flights(
+    device: str,
+    flights: dict[str, Flight],
+    repeats: int,
+    references: dict[str, str],
+    **line: Any,
+) -> None:
+    """Time flights in turn; print rate, and ratio to the time of its reference, of each.
+
+    Args:
+        device: The platform.
+        flights: Flights by name of the case.
+        repeats: Number of times that each is measured.
+        references: Name of the flight that each is compared with.
+        line: What else each line contains; a function is called with the simulation.
+    """
+    taken = medians({name: flight.seconds for name, flight in flights.items()}, repeats)
+    for name, flight in flights.items():
+        flight.require_flying()
+        sim, reference = flight.sim, references[name]
+        report(
+            device,
+            case=name,
+            engine=engine_of(sim),
+            n_worlds=sim.n_worlds,
+            n_drones=sim.n_drones,
+            first_s=digits(flight.first_s),
+            call_s=digits(taken[name]),
+            steps_per_s=digits(sim.n_worlds * sim.n_drones * flight.n_steps / taken[name]),
+            reference=reference,
+            ratio=digits(taken[name] / taken[reference]),
+            **{key: value(sim) if callable(value) else value for key, value in line.items()},
+        )
+
+
 def alone(function: Any, *args: Any) -> Any:
     """Return the result of a function in a new process, where nothing is compiled yet."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
