@@ -3,9 +3,10 @@
     python benchmarks/plugins.py [--device gpu] [--worlds 262144] [--drones 2] [--cases imu kalman everything ...]
 
 Drones hover on a constant state command, in calls of 100 steps; all cases alternate. Sensors have their default rates;
-``kalman``, ``error_state`` and ``complementary`` are what ``Sim(estimator=...)`` adds with its sensors (the last only
-runs along), and ``all_aids`` is one Kalman filter on all kinds of sensors that it takes. ``everything`` is all sensors,
-the Kalman filter, wind with gusts, downwash, ground effect, battery and latency.
+``kalman``, ``eskf`` and ``complementary`` are what ``Sim(estimator=...)`` adds with its sensors (the last only runs
+along); ``all_aids`` is one Kalman filter on all kinds of sensors that it takes, ``outdoors`` an error-state filter on
+satellites, barometer and magnetometer. ``everything`` is all sensors, the Kalman filter, wind with gusts, downwash,
+ground effect, battery and latency.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from crazysim import (
     GroundEffect,
     Kalman,
     Latency,
-    RangeFinder,
     Randomize,
+    RangeFinder,
     RotorAerodynamics,
     Sim,
     Wind,
 )
 from crazysim.core.plugin import Plugin
 from crazysim.plugins import sensors
-from crazysim.plugins.estimators import Complementary, Estimator
+from crazysim.plugins.estimators import ESKF, Complementary, Estimator
 
 N_STEPS = 100
 """Steps per call."""
@@ -86,6 +87,8 @@ def _everything() -> list[Plugin]:
     return [*others, *aids, Kalman(aids)]  # type: ignore[arg-type]
 
 
+OUTDOORS = ("imu", "gps", "barometer", "magnetometer")
+"""Cases of the sensors of ``outdoors``."""
 UNLIKE = ("imu", "motion_capture", "battery", "rotor_aerodynamics", "randomize")
 """Cases that ``everything`` has otherwise (sensors of the filter, the battery of its voltage), or lacks."""
 CASES: dict[str, Build] = {
@@ -95,6 +98,8 @@ CASES: dict[str, Build] = {
     "motion_capture_late": lambda: [sensors.MotionCapture(1e-3, 1e-3, delay=0.01, jitter=0.01, dropout=0.05)],
     "complementary": lambda: _on(Complementary([sensors.IMU.crazyflie(), sensors.Barometer()], control=False)),
     "kalman": lambda: _on(Kalman.default()),
+    "eskf": lambda: _on(ESKF.default()),
+    "outdoors": lambda: _on(ESKF([s for name in OUTDOORS for s in SENSORS[name]()])),  # type: ignore[misc]
     "all_aids": _all_aids,
     **EFFECTS,
     "everything": _everything,

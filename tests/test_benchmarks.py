@@ -269,8 +269,8 @@ def test_controllers_are_compared_on_the_same_flights(run):
     assert cost["steps_per_s"] > 0
 
 
-def test_sensors_are_timed_against_a_step_without(run):
-    lines = run("sensors.py", "--worlds", "4", "--cases", "imu", "complementary", "--repeats", "1")
+def test_plugins_are_timed_against_a_step_without(run):
+    lines = run("plugins.py", "--worlds", "4", "--cases", "imu", "complementary", "--repeats", "1")
     assert [line["case"] for line in lines] == ["none", "imu", "complementary"]
     assert lines[0]["ratio"] == 1
 

@@ -2,12 +2,13 @@
 
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators.complementary import Complementary
+from crazysim.plugins.estimators.eskf import ESKF
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.estimators.kalman import Kalman
 
-__all__ = ["Complementary", "Estimator", "Kalman", "find_estimator"]
+__all__ = ["ESKF", "Complementary", "Estimator", "Kalman", "find_estimator"]
 
-ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman, "complementary": Complementary}
+ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman, "eskf": ESKF, "complementary": Complementary}
 """Estimators by the names that ``Sim(estimator=...)`` takes."""
 
 

@@ -1,17 +1,22 @@
-"""Extended Kalman filter with nine error states, as functions of one drone.
+"""Extended Kalman filters with error states, as functions of one drone.
 
 The equations, constants and guards are those of the Crazyflie's firmware (kalman_core.c and the mm_*.c of
 bitcraze/crazyflie-firmware, commit 2a18fc29), whose sources are M. W. Mueller, M. Hamer and R. D'Andrea, Fusing
 ultra-wideband range measurements with accelerometers and rate gyroscopes for quadrocopter state estimation, ICRA 2015,
 and M. W. Mueller, M. Hehn and R. D'Andrea, Covariance correction step for Kalman filtering with an attitude, Journal of
 Guidance, Control, and Dynamics 40 (2017). The drag that the firmware can model is zero on Crazyflies, and left out.
+An estimate may also contain the biases of the inertial sensors, which ``predict_biased`` and all updates use: the
+filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with velocities in
+the body frame.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -21,12 +26,10 @@ from crazysim.pytree import PyTree, leaf
 
 POS, VEL, ATT = (0, 1, 2), (3, 4, 5), (6, 7, 8)
 """Rows of the errors of position, velocity and attitude."""
-N = 9
-"""Number of error states."""
-N_COV = N * (N + 1) // 2
-"""Number of different entries of a covariance."""
-MAX_COVARIANCE, MIN_VARIANCE = 100.0, 1e-6
-"""Bounds of a covariance and a variance (kalman_core.c)."""
+N, N_BIASED = 9, 15
+"""Number of error states without biases, and with those of accelerometer and gyroscope, in this order."""
+MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
+"""Bounds of a covariance and a variance (kalman_core.c); with biases, whose variances are smaller, an assumption."""
 EPS = 1e-6
 """Added to a norm that something is divided by (kalman_core.c)."""
 MAX_POS, MAX_VEL = 100.0, 10.0
@@ -43,12 +46,6 @@ HALF_CONE = 0.5 * 15 * math.pi / 180
 REVERSION = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
-# Unsigned: to signed indices JAX 0.10 adds sizes of the precision in which it indexed first, float32 or float64.
-_UPPER = tuple([places.astype(np.uint32) for places in np.triu_indices(N)])
-_PLACE = np.zeros((N, N), np.uint32)
-_PLACE[_UPPER] = np.arange(N_COV)
-_PLACE = np.maximum(_PLACE, _PLACE.T)
-
 
 class Estimate(PyTree):
     """Estimate of one drone with its uncertainty."""
@@ -62,25 +59,44 @@ class Estimate(PyTree):
     att_error: Array = leaf("drone", 1)
     """Attitude error that ``finalize`` moves into the attitude, body frame, rad. (..., 3)"""
     cov: Array = leaf("drone", 1)
-    """Covariance of the errors of position, velocity and attitude: its upper triangle, row by row. (..., 45)"""
+    """Covariance of the n errors of position, velocity, attitude and biases: its upper triangle, row by row.
+    (..., n (n + 1) / 2)"""
+    accel_bias: Array | None = leaf("drone", 1)
+    """Bias of the accelerometer, body frame, m/s^2; None if it is not estimated. (..., 3)"""
+    gyro_bias: Array | None = leaf("drone", 1)
+    """Bias of the gyroscope, body frame, rad/s; None if it is not estimated. (..., 3)"""
 
 
 def covariance(upper: Array) -> Array:
-    """Return a covariance from its upper triangle. (..., 9, 9)"""
-    return upper[..., _PLACE]
+    """Return a covariance from its upper triangle. (..., n, n)"""
+    n = _n_errors(upper)
+    # Unsigned: to signed indices JAX 0.10 adds sizes of the precision in which it indexed first, float32 or float64.
+    place = np.zeros((n, n), np.uint32)
+    place[_upper(n)] = np.arange(upper.shape[-1])
+    return upper[..., np.maximum(place, place.T)]
 
 
-def start(pos: Array, vel: Array, quat: Array, deviations: Sequence[Array | float]) -> Estimate:
+def start(
+    pos: Array,
+    vel: Array,
+    quat: Array,
+    deviations: Sequence[Array | float],
+    accel_bias: Array | None = None,
+    gyro_bias: Array | None = None,
+) -> Estimate:
     """Return an estimate with independent errors.
 
     Args:
         pos: Position, world frame, m. (3,)
         vel: Velocity, body frame, m/s. (3,)
         quat: Attitude, body to world, unit, xyzw. (4,)
-        deviations: Standard deviations of the nine errors, m, m/s, rad. (9,)
+        deviations: Standard deviations of the errors, m, m/s, rad, and of biases, m/s^2, rad/s. (n,)
+        accel_bias: Bias of the accelerometer, body frame, m/s^2; None to estimate none. (3,)
+        gyro_bias: Bias of the gyroscope, body frame, rad/s; None to estimate none. (3,)
     """
     variance = jnp.stack([jnp.asarray(d, pos.dtype) ** 2 for d in deviations])
-    return Estimate(pos, vel, quat, jnp.zeros_like(vel), jnp.diag(variance)[_UPPER])
+    cov = jnp.diag(variance)[_upper(len(deviations))]
+    return Estimate(pos, vel, quat, jnp.zeros_like(vel), cov, accel_bias, gyro_bias)
 
 
 def predict(
@@ -119,11 +135,67 @@ def predict(
     shift = dt * vel + 0.5 * dt**2 * force
     pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY * dt**2], pos.dtype)
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
-    return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=p[_UPPER])
+    return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=p[_upper(N)])
+
+
+def predict_biased(
+    estimate: Estimate,
+    accel: Array,
+    gyro: Array,
+    dt: float,
+    gravity: Array,
+    accel_variance: Array,
+    gyro_variance: Array,
+) -> Estimate:
+    """Return the estimate with biases after an interval, with the noise of the inertial sensors.
+
+    Position and velocity move with the mean specific force, turned by half of the rotation in the interval; the errors
+    are those of Solà (2017), section 5.4.3, with the velocity turned into the body frame: with a turn E, attitude R and
+    gravity g after the interval, force f, turn M of half the interval, and errors a of accelerometer and w of gyroscope
+
+        d_att' = E d_att - dt w
+        d_vel' = E d_vel + dt [R^T g]x E d_att - dt [v']x w - dt E M a
+
+    Args:
+        estimate: The estimate.
+        accel: Mean specific force as measured, body frame, m/s^2. (3,)
+        gyro: Mean angular velocity as measured, body frame, rad/s. (3,)
+        dt: Length of the interval, s.
+        gravity: Acceleration of gravity, world frame, m/s^2. (3,)
+        accel_variance: Variances of the mean specific force, m^2/s^4. (3,)
+        gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
+    """
+    vel, quat = estimate.vel, estimate.quat
+    angle = dt * (gyro - estimate.gyro_bias)
+    middle, end = _turned(quat, 0.5 * angle), _turned(quat, angle)
+    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (quat, middle, end))
+    acc = rotation.matvec(rot_middle, accel - estimate.accel_bias, gravity)
+    vel_world = rotation.matvec(rot, vel)
+    pos = estimate.pos + dt * vel_world + 0.5 * dt**2 * acc
+    new_vel = rotation.matvec(rot_end.T, vel_world + dt * acc)
+
+    turn, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
+    vel_to_pos, att_to_pos = dt * rot, -dt * rot @ rotation.cross_matrix(vel)
+    fall, gyro_to_vel = dt * rotation.cross_matrix(rot_end.T @ gravity), -dt * rotation.cross_matrix(new_vel)
+
+    def rows(p: Array) -> Array:
+        """Return the linearised step times a matrix."""
+        turned = turn @ p[6:9]
+        pos_rows = p[:3] + vel_to_pos @ p[3:6] + att_to_pos @ p[6:9]
+        vel_rows = turn @ p[3:6] + fall @ turned + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
+        return jnp.concatenate([pos_rows, vel_rows, turned - dt * p[12:], p[9:]])
+
+    p = rows(rows(covariance(estimate.cov)).T)
+    by_gyro = gyro_to_vel * gyro_variance
+    vel_noise = (accel_to_vel * accel_variance) @ accel_to_vel.T + by_gyro @ gyro_to_vel.T
+    both = -dt * by_gyro
+    p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(both).at[6:9, 3:6].add(both.T)
+    p = p.at[6:9, 6:9].add(dt**2 * jnp.diag(gyro_variance))
+    return estimate.replace(pos=pos, vel=new_vel, quat=end, cov=_bounded(p))
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
-    """Return the estimate with process noise: variances of the nine errors. (9,)"""
+    """Return the estimate with process noise: variances of the errors. (n,)"""
     return estimate.replace(cov=_bounded(covariance(estimate.cov) + jnp.diag(variances)))
 
 
@@ -138,39 +210,74 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
         deviation: Standard deviation of the measurement.
     """
     p, rows = covariance(estimate.cov), list(rows)
+    n = p.shape[0]
     ph = p[:, rows] @ h
     r = deviation * deviation
     gain = ph / (jnp.dot(h, ph[jnp.asarray(rows)]) + r)
     # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns of I - K H that belong to rows are not trivial.
-    left = jnp.eye(N, dtype=p.dtype)[:, rows] - gain[:, None] * h
-    others = np.setdiff1d(np.arange(N), rows)
-    keep = np.zeros((N, 1), bool)
+    left = jnp.eye(n, dtype=p.dtype)[:, rows] - gain[:, None] * h
+    others = np.setdiff1d(np.arange(n), rows)
+    keep = np.zeros((n, 1), bool)
     keep[others] = True
     p = jnp.where(keep, p, 0.0) + left @ p[jnp.asarray(rows)]
     p = jnp.where(keep.T, p, 0.0) + p[:, rows] @ left.T
     p = p + r * gain[:, None] * gain
     step = error * gain
+    biases = {}
+    if estimate.accel_bias is not None and estimate.gyro_bias is not None:
+        biases = {"accel_bias": estimate.accel_bias + step[9:12], "gyro_bias": estimate.gyro_bias + step[12:]}
     return estimate.replace(
         pos=estimate.pos + step[:3],
         vel=estimate.vel + step[3:6],
-        att_error=estimate.att_error + step[6:],
+        att_error=estimate.att_error + step[6:9],
         cov=_bounded(p),
+        **biases,
     )
 
 
 def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured position, world frame, m. (3,)"""
-    for k in POS:
-        estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], deviation)
+    """Return the estimate after a measured position, world frame, m, (3,), of a standard deviation, m. () or (3,)"""
+    for k, std in enumerate(_each(deviation)):
+        estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], std)
+    return estimate
+
+
+def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured velocity, world frame, m/s, (3,), of a deviation, m/s. () or (3,)"""
+    rot = rotation.matrix(estimate.quat)
+    for k, std in enumerate(_each(deviation)):
+        across = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
+        predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(across, estimate.att_error)[0]
+        estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], across]), vel[k] - predicted, std)
+    return estimate
+
+
+def update_direction(estimate: Estimate, direction: Array, known: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured direction, such as that of a magnetic field.
+
+    Args:
+        estimate: The estimate.
+        direction: Measured direction, body frame; its length is that of ``known`` but for errors. (3,)
+        known: The direction, world frame, unit. (3,)
+        deviation: Standard deviation along each axis, rad. () or (3,)
+    """
+    predicted = rotation.rotate_inverse(estimate.quat, known)
+    slopes = rotation.cross_matrix(predicted)
+    for k, std in enumerate(_each(deviation)):
+        error = direction[k] - predicted[k] - rotation.dot(slopes[k], estimate.att_error)[0]
+        estimate = update(estimate, ATT, slopes[k], error, std)
     return estimate
 
 
 def update_quat(estimate: Estimate, quat: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured attitude, body to world, unit, xyzw. (4,)"""
+    """Return the estimate after a measured attitude, body to world, unit, xyzw, (4,), of a deviation, rad.
+
+    The deviation is () or (3,).
+    """
     residual = rotation.multiply(rotation.conjugate(estimate.quat), quat)
     error = 2 * residual[:3] / residual[3]
-    for k in range(3):
-        estimate = update(estimate, [ATT[k]], jnp.ones_like(quat[:1]), error[k], deviation)
+    for k, std in enumerate(_each(deviation)):
+        estimate = update(estimate, [ATT[k]], jnp.ones_like(quat[:1]), error[k], std)
     return estimate
 
 
@@ -275,35 +382,55 @@ def update_sweep(
     return select(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
 
 
-def finalize(estimate: Estimate) -> Estimate:
-    """Return the estimate with its attitude error moved into the attitude."""
+def finalize(estimate: Estimate, least: float = SMALL_ANGLE) -> Estimate:
+    """Return the estimate with its attitude error moved into the attitude.
+
+    Args:
+        estimate: The estimate.
+        least: Size of the error, rad, up to which the firmware drops it.
+    """
     error, p = estimate.att_error, covariance(estimate.cov)
     size = jnp.abs(error)
-    moves = jnp.any(size > SMALL_ANGLE) & jnp.all(size < LARGE_ANGLE)
+    moves = jnp.any(size > least) & jnp.all(size < LARGE_ANGLE)
     turn = _turn(0.5 * jnp.where(moves, error, 0.0))
-    p = jnp.concatenate([p[:6], turn @ p[6:]])
-    p = jnp.concatenate([p[:, :6], p[:, 6:] @ turn.T], axis=1)
+    p = jnp.concatenate([p[:6], turn @ p[6:9], p[9:]])
+    p = jnp.concatenate([p[:, :6], p[:, 6:9] @ turn.T, p[:, 9:]], axis=1)
     quat = jnp.where(moves, _turned(estimate.quat, error), estimate.quat)
     return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=_bounded(p))
 
 
-def within_bounds(estimate: Estimate) -> Array:
-    """Return whether position and velocity are ones that the firmware takes for possible. ()"""
-    return jnp.all(jnp.abs(estimate.pos) <= MAX_POS) & jnp.all(jnp.abs(estimate.vel) <= MAX_VEL)
+def within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
+    """Return whether all coordinates, m, and velocities, m/s, are within bounds, by default the firmware's. ()"""
+    return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 
 def select(which: Array, one: Estimate, other: Estimate) -> Estimate:
     """Return one estimate where a flag is set, and the other elsewhere."""
-    return Estimate(
-        *(jnp.where(which, getattr(one, f), getattr(other, f)) for f in ("pos", "vel", "quat", "att_error", "cov"))
-    )
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), one, other)
 
 
 def _bounded(p: Array) -> Array:
     """Return the upper triangle of a covariance made symmetric and bounded; NaN becomes the upper bound."""
-    upper = 0.5 * p[_UPPER] + 0.5 * p.T[_UPPER]
-    least = np.where(_UPPER[0] == _UPPER[1], MIN_VARIANCE, -np.inf)
+    places = rows, columns = _upper(p.shape[0])
+    upper = 0.5 * p[places] + 0.5 * p.T[places]
+    least = np.where(rows == columns, MIN_VARIANCE[p.shape[0]], -np.inf)
     return jnp.where(upper <= MAX_COVARIANCE, jnp.maximum(upper, least.astype(p.dtype)), MAX_COVARIANCE)
+
+
+def _n_errors(upper: Array) -> int:
+    """Return the number of errors of a covariance whose upper triangle is given."""
+    return math.isqrt(2 * upper.shape[-1])
+
+
+@functools.cache
+def _upper(n: int) -> tuple[np.ndarray, ...]:
+    """Return rows and columns of the upper triangle of a matrix (n, n), row by row."""
+    return tuple([places.astype(np.uint32) for places in np.triu_indices(n)])
+
+
+def _each(deviation: Array | float) -> Sequence[Array | float]:
+    """Return the standard deviation of each of three axes."""
+    return [deviation] * 3 if jnp.ndim(deviation) == 0 else [deviation[k] for k in range(3)]  # type: ignore[index]
 
 
 def _turn(half: Array) -> Array:

@@ -54,7 +54,7 @@ class Estimator(Plugin):
         raise NotImplementedError
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimate of fields of ``data.states`` of one drone, but for the angular velocity."""
+        """Return the estimate of fields of ``data.states`` of one drone; the ``IMU`` measures those that lack."""
         raise NotImplementedError
 
     @property
@@ -83,7 +83,7 @@ class Estimator(Plugin):
         s, found = data.states, self.estimated_states(data)
         first = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
         states = {name: jnp.where(first, getattr(s, name), value) for name, value in found.items()}
-        return states | self.imu.measured_states(data)
+        return self.imu.measured_states(data) | states
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the estimated state."""

@@ -112,11 +112,11 @@ class Kalman(Estimator):
         deviations, shape = DEVIATIONS | dict(self.deviations), sim.data.states.pos.shape[:2]
         level = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4)
         still = per_drone(sim, 0.0, 3)
-        cov = per_drone(sim, np.diag(np.square(START))[np.triu_indices(error_state.N)], error_state.N_COV)
+        cov = np.diag(np.square(START))[np.triu_indices(error_state.N)]
         return self.filled(
             sim,
             KalmanData,
-            estimate=Estimate(still, still, level, still, cov),
+            estimate=Estimate(still, still, level, still, per_drone(sim, cov, *cov.shape), None, None),
             previous=level,
             used=on_device(np.full((*shape, len(self.aids)), -1), np.int32),
             failures=on_device(np.zeros((*shape, 1)), np.int32),

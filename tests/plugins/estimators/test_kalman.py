@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from consistency import assert_chi_squared, errors, normalised
 
 from crazysim import ConfigError, Plugin, Sim, rotation
 from crazysim.core.random import drone_key
@@ -83,15 +84,6 @@ def build(*aids, n_worlds=8, imu=None, engine="auto", **settings):
     return sim
 
 
-def errors(sim):
-    """Return the errors of position, velocity and attitude, body frame for the last two. (n_worlds, 9)"""
-    e, s = sim.data.plugins["kalman"].estimate, sim.data.states
-    vel = rotation.rotate_inverse(s.quat, s.vel) - e.vel
-    turn = 2 * rotation.multiply(rotation.conjugate(e.quat), s.quat)
-    turn = turn[..., :3] * jnp.sign(turn[..., 3:])
-    return np.asarray(jnp.concatenate([s.pos - e.pos, vel, turn], axis=-1))[:, 0]
-
-
 class Gusts(Plugin):
     """White accelerations along x and y of the body, of the size that the filter assumes."""
 
@@ -119,18 +111,6 @@ def captured():
     return sim
 
 
-def assert_chi_squared(values, k):
-    """Check that values have the mean of a chi-square distribution with k degrees of freedom.
-
-    The mean of n has the standard deviation sqrt(2 k / n); beyond 3.3 of them it is once in a thousand seeds.
-    """
-    assert abs(np.mean(values) - k) < 3.3 * math.sqrt(2 * k / len(values))
-
-
-def normalised(error, cov):
-    return np.einsum("wi,wij,wj->w", error, np.linalg.inv(cov), error)
-
-
 def test_drones_hover_on_the_estimate(captured):
     """The setpoint is held to some standard deviations of the estimate, here some 3 mm, in gusts that move drones."""
     pos = np.asarray(captured.data.states.pos)
@@ -141,7 +121,7 @@ def test_drones_hover_on_the_estimate(captured):
 def test_the_covariance_is_that_of_the_errors(captured):
     """NEES: squared errors normalised by the covariance are chi-square distributed, one degree for each state."""
     cov = np.asarray(error_state.covariance(captured.data.plugins["kalman"].estimate.cov))[:, 0]
-    assert_chi_squared(normalised(errors(captured), cov), 9)
+    assert_chi_squared(normalised(errors(captured, "kalman"), cov), 9)
 
 
 def test_innovations_are_as_the_filter_expects(captured):
@@ -198,7 +178,7 @@ def test_all_sensors_on_all_engines():
         ]
         sim = build(*aids, n_worlds=3, engine=engine)
         sim.step(100)
-        ends.append((np.asarray(sim.data.states.pos), errors(sim)))
+        ends.append((np.asarray(sim.data.states.pos), errors(sim, "kalman")))
     assert np.abs(ends[0][1]).max() > 1e-5, "the estimate is the truth"
     for one, other in zip(*ends, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=2e-4)
@@ -216,7 +196,7 @@ def test_all_axes_of_the_accelerometer_serve_any_airframe(drone):
         sim.data = sim.data.replace(states=states.replace(pos=pos, force=force))
         sim.state_control(pos=(0.0, 0.0, 1.0))
         sim.step(2500)
-        wrong.append(np.abs(errors(sim)[0, 3]))
+        wrong.append(np.abs(errors(sim, "kalman")[0, 3]))
     assert wrong[0] > 0.02
     assert wrong[1] < 0.1 * wrong[0]
 

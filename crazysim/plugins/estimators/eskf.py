@@ -1,0 +1,250 @@
+"""Error-state Kalman filter with biases of the inertial sensors, for any airframe, and flight on its estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation, per_drone
+from crazysim.core.settings import dividing_rate
+from crazysim.core.stage import Stage
+from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators.error_state import Estimate
+from crazysim.plugins.estimators.estimator import Estimator, arrivals, at_the_start
+from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
+from crazysim.plugins.estimators.kalman import Std
+from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
+from crazysim.plugins.sensors.beacons import UWB, Lighthouse
+from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
+from crazysim.plugins.sensors.gps import GPS
+from crazysim.plugins.sensors.imu import IMU
+from crazysim.plugins.sensors.magnetometer import Magnetometer
+from crazysim.plugins.sensors.motion_capture import MotionCapture
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.plugins.sensors.triad import TriadData
+from crazysim.pytree import PyTree, leaf, on_device
+
+START = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
+"""Standard deviations at the start: position, m, velocity, m/s, attitude, rad. Assumptions; the start is the truth."""
+ANEW = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
+"""The same where a filter that diverged begins again. Assumptions: some are the upper bound of a covariance."""
+LEAST = 1e-3
+"""Least standard deviation assumed for a measurement, in m, m/s, rad, pixels, or of the field that a magnetometer
+measures; 0.1 Pa for pressures. An assumption, for sensors without noise and the rounding of float32."""
+
+
+class ESKFData(PyTree):
+    """The filter of every drone."""
+
+    estimate: Estimate
+    """The estimate, with biases."""
+    accel: Array = leaf("drone", 1, (3,))
+    """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
+    gyro: Array = leaf("drone", 1, (3,))
+    """Sum of the angular velocities since the last prediction, with half of that before, body frame, rad/s.
+    (n_worlds, n_drones, 3)"""
+    used: Array = leaf("drone", 1)
+    """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
+    failures: Array = leaf("drone", 1)
+    """Number of times that the estimate left its bounds and the filter began again. (n_worlds, n_drones, 1)"""
+
+
+class ESKF(Estimator):
+    """Error-state Kalman filter: position, velocity, attitude and biases of the ``IMU``, for any airframe.
+
+    The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
+    velocity in the body frame. Its noise is that of the records of its sensors, so it has no gains to tune: densities,
+    random walk and spread of the biases of the ``IMU``, and the noise of the others. Errors that wander or stay the
+    same count as new in every measurement. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``,
+    ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, all as if at the centre of mass.
+    """
+
+    _: dataclasses.KW_ONLY
+    freq: int = 100
+    """Predictions per second, Hz, a divisor of ``sim.freq``."""
+    max_pos: float = 1e4
+    """Coordinate beyond which the estimate has diverged, m."""
+    max_vel: float = 100.0
+    """Velocity along an axis beyond which the estimate has diverged, m/s."""
+    name: str = "eskf"
+
+    @classmethod
+    def default(cls) -> ESKF:
+        """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
+        return cls([IMU.crazyflie(), MotionCapture()])
+
+    @property
+    def kinds(self) -> tuple[type[Sensor], ...]:
+        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
+        return tuple(UPDATES)
+
+    def record(self, sim: Simulation) -> ESKFData:
+        """Return the filter before its first step."""
+        self.check_sensors(sim)
+        n, shape = error_state.N_BIASED, sim.data.states.pos.shape[:2]
+        level, still = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4), per_drone(sim, 0.0, 3)
+        return self.filled(
+            sim,
+            ESKFData,
+            estimate=Estimate(still, still, level, still, per_drone(sim, 0.0, n * (n + 1) // 2), still, still),
+            used=on_device(np.full((*shape, len(self.aids)), -1), np.int32),
+            failures=on_device(np.zeros((*shape, 1)), np.int32),
+        )
+
+    def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
+        """Return the stages of the filter by name, in their order."""
+        period = freq // dividing_rate("freq", self.freq, freq)
+
+        def every(data: SimData) -> Any:
+            return (data.core.steps + 1) % period == 0
+
+        return [
+            ("begin", Stage(self._begin, "drone", at_the_start)),
+            ("sample", Stage(self._sample, "drone")),
+            ("predict", Stage(self._predict(period), "drone", every)),
+            *((s.name, Stage(self._fuse(k, s), "drone", arrivals(s))) for k, s in enumerate(self.aids)),
+            ("", Stage(self._check, "drone")),
+        ]
+
+    def estimated_states(self, data: SimData) -> dict[str, Array]:
+        """Return the estimated position, attitude, velocity and angular velocity of one drone."""
+        estimate = self.read(data).estimate
+        quat = rotation.safe_normalize(estimate.quat, data.states.quat)
+        ang_vel = self.inertial(data)[0] - estimate.gyro_bias
+        return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel), "ang_vel": ang_vel}
+
+    def _begin(self, data: SimData) -> SimData:
+        """Begin at the true state of one drone."""
+        s = data.states
+        estimate = self._started(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)
+        return self.write(
+            data, self.read(data).replace(estimate=estimate, gyro=0.5 * s.ang_vel + 0.5 * estimate.gyro_bias)
+        )
+
+    def _started(self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]) -> Estimate:
+        """Return the estimate of one drone before any measurement, with the mean biases of its sensors."""
+        imu = self.imu.read(data)
+        spreads = [x for triad in (imu.accel, imu.gyro) for x in _size(triad.spread[:3], triad.instability, least=0.0)]
+        means = [rotation.rotate(imu.quat, triad.mean[:3]) for triad in (imu.accel, imu.gyro)]
+        return error_state.start(pos, vel, quat, [*deviations, *spreads], *means)
+
+    def _sample(self, data: SimData) -> SimData:
+        """Add the latest inertial measurement of one drone to the sums."""
+        record = self.read(data)
+        gyro, accel = self.inertial(data)
+        return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
+
+    def _predict(self, period: int) -> Callable[[SimData], SimData]:
+        def predict(data: SimData) -> SimData:
+            """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
+            record, imu, dt = self.read(data), self.imu.read(data), period / data.core.freq
+            half = 0.5 * self.inertial(data)[0]
+            accel, gyro = record.accel / period, (record.gyro - half) / period
+            white = [0.5 / dt * triad.noise**2 for triad in (imu.accel, imu.gyro)]
+            estimate = error_state.predict_biased(
+                record.estimate, accel, gyro, dt, data.params.gravity_vec, white[0], white[1]
+            )
+            walks = [_bias_walk(triad, dt) for triad in (imu.accel, imu.gyro)]
+            estimate = error_state.add_noise(estimate, jnp.concatenate([jnp.zeros(9, accel.dtype), *walks]))
+            return self.write(data, record.replace(estimate=estimate, accel=jnp.zeros_like(accel), gyro=half))
+
+        return predict
+
+    def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
+        def fuse(data: SimData) -> SimData:
+            """Use a measurement of one sensor, if it is new."""
+            record, taken = self.read(data), sensor.read(data).samples.taken
+            new = taken[0] != record.used[k]
+            after = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, record.estimate))
+            estimate = error_state.select(new, after, record.estimate)
+            return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
+
+        return fuse
+
+    def _check(self, data: SimData) -> SimData:
+        """Begin again at the origin, level, where the estimate of one drone left its bounds."""
+        record = self.read(data)
+        estimate = record.estimate
+        valid = error_state.within_bounds(estimate, self.max_pos, self.max_vel)
+        zero, level = jnp.zeros_like(estimate.pos), jnp.zeros_like(estimate.quat).at[3].set(1.0)
+        estimate = error_state.select(valid, estimate, self._started(data, zero, zero, level, ANEW))
+        return self.write(data, record.replace(estimate=estimate, failures=record.failures + jnp.where(valid, 0, 1)))
+
+
+def _bias_walk(triad: TriadData, dt: float) -> Array:
+    """Return the variance by which the bias of a sensor changes in an interval; the wandering part walks, too. (3,)"""
+    return dt * (triad.random_walk**2 + 2 * triad.instability**2 / triad.correlation_time)
+
+
+def _finalized(estimate: Estimate) -> Estimate:
+    return error_state.finalize(estimate, least=0.0)
+
+
+def _size(*deviations: Array | float, least: float = LEAST) -> Array:
+    """Return the standard deviation of a sum of independent errors, not below ``LEAST``. (...)"""
+    return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(least * least)))
+
+
+def _firmware(deviations: Callable[[Any], Std]) -> Callable[..., Estimate]:
+    """Return the firmware's update for a kind of sensor, with the standard deviations of its record."""
+
+    def update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+        rot, std = rotation.matrix(estimate.quat), deviations(sensor.read(data))
+        return FIRMWARE[type(sensor)](sensor, imu, data, estimate, rot, std)
+
+    return update
+
+
+def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record = sensor.read(data)
+    estimate = _finalized(error_state.update_pos(estimate, sensor.part(data, "pos"), _size(record.noise)))
+    return error_state.update_quat(estimate, sensor.part(data, "quat"), _size(record.angle_noise))
+
+
+def _satellites(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record = sensor.read(data)
+    std = _size(record.noise, record.drift)
+    estimate = _finalized(error_state.update_pos(estimate, sensor.part(data, "pos"), std))
+    return error_state.update_vel(estimate, sensor.part(data, "vel"), _size(record.vel_noise))
+
+
+def _pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record = sensor.read(data)
+    altitude = estimate.pos[2:] + record.altitude
+    predicted = pressure_at(altitude)
+    slope = -EXPONENT * LAPSE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE * altitude)
+    std = _size(record.noise, record.drift, record.offset_spread, least=100 * LEAST)
+    error = sensor.part(data, "pressure") - predicted
+    return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
+
+
+def _field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record = sensor.read(data)
+    errors, size = record.errors, rotation.safe_norm(record.field)
+    noise = errors.noise * math.sqrt(0.5 / sensor.interval(data))
+    std = _size(*(x / size for x in (noise, errors.spread[:3], errors.instability)))
+    measured = rotation.rotate(record.quat, sensor.part(data, "field") - errors.mean[:3]) / size
+    return error_state.update_direction(estimate, measured, record.field / size, std)
+
+
+UPDATES: dict[type, Callable[..., Estimate]] = {
+    MotionCapture: _pose,
+    GPS: _satellites,
+    Barometer: _pressure,
+    Magnetometer: _field,
+    OpticalFlow: _firmware(lambda record: {"flow": _size(record.noise[0])}),
+    TimeOfFlight: _firmware(lambda record: {"range": _size(record.noise[0], record.far_noise[0])}),
+    UWB: _firmware(
+        lambda record: {"distance": _size(record.noise[0]), "difference": _size(math.sqrt(2) * record.noise[0])}
+    ),
+    Lighthouse: _firmware(lambda record: {"sweep": _size(record.noise[0])}),
+}
+"""Functions that use the measurements of each kind of sensor."""

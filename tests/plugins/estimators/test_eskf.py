@@ -1,0 +1,170 @@
+"""The error-state filter with biases: its linearisation, honest about its errors, and flown on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from consistency import assert_chi_squared, errors, normalised
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.plugins.estimators import ESKF, error_state
+from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer, MotionCapture, RotorSpeeds, Triad
+
+GYRO = Triad(noise=2.4e-4, bias_spread=0.0175, random_walk=1e-4)
+ACCEL = Triad(noise=2e-3, bias_spread=0.2, random_walk=1e-3)
+POS, ANGLE = 0.01, 0.02
+
+
+def moved(estimate, error):
+    """Return an estimate with errors, (15,), added: its true state."""
+    turn = jnp.concatenate([0.5 * error[6:9], jnp.ones(1)])
+    return estimate.replace(
+        pos=estimate.pos + error[:3],
+        vel=estimate.vel + error[3:6],
+        quat=rotation.multiply(estimate.quat, turn / jnp.sqrt(turn @ turn)),
+        accel_bias=estimate.accel_bias + error[9:12],
+        gyro_bias=estimate.gyro_bias + error[12:],
+    )
+
+
+def difference(true, estimate):
+    """Return the errors of an estimate, (15,)."""
+    turn = 2 * rotation.multiply(rotation.conjugate(estimate.quat), true.quat)[:3]
+    biases = true.accel_bias - estimate.accel_bias, true.gyro_bias - estimate.gyro_bias
+    return jnp.concatenate([true.pos - estimate.pos, true.vel - estimate.vel, turn, *biases])
+
+
+@pytest.fixture
+def estimate(x64):
+    """Return an estimate in motion, with a full covariance."""
+    quat = jnp.array([0.3, -0.2, 0.4, 0.8])
+    pos, vel, small = jnp.array([0.3, -0.2, 1.0]), jnp.array([2.0, -1.0, 0.5]), jnp.array([0.1, -0.2, 0.3])
+    found = error_state.start(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, small, 0.1 * small)
+    root = np.random.default_rng(1).normal(size=(15, 15))
+    return found.replace(cov=jnp.asarray(0.01 * root @ root.T)[np.triu_indices(15)])
+
+
+def test_the_covariance_moves_with_the_derivatives_of_the_step(estimate):
+    """``F P F' + G Q G'`` with F by automatic differentiation; half of dt^2 times 10 m/s^2 is neglected."""
+    accel, gyro, gravity, dt = jnp.array([0.5, 1.0, 9.0]), jnp.array([3.0, -2.0, 1.0]), jnp.array([0, 0, -9.81]), 1e-3
+    noise = jnp.array([10.0, 20.0, 30.0]), jnp.array([40.0, 50.0, 60.0])
+
+    def step(at):
+        return error_state.predict_biased(at, accel, gyro, dt, gravity, *noise)
+
+    after = step(estimate)
+    f = jax.jacfwd(lambda error: difference(step(moved(estimate, error)), after))(jnp.zeros(15))
+    g = f[:, 9:] * (np.arange(15) < 9)[:, None]  # noise acts as a bias of one interval, and leaves the biases
+    expected = f @ error_state.covariance(estimate.cov) @ f.T + g @ jnp.diag(jnp.concatenate(noise)) @ g.T
+    np.testing.assert_allclose(error_state.covariance(after.cov), expected, rtol=0, atol=5e-6)
+    assert (g @ g.T)[3:9, 3:9].max() * 40 > 1e-4, "the noise shows nothing"
+
+
+@pytest.mark.parametrize("kind", ["vel", "direction"])
+def test_updates_move_by_the_derivatives_of_the_measurement(estimate, kind):
+    """A measurement of the state with a tiny error, all axes at once with the gain of its derivatives."""
+    known = jnp.array([0.6, 0.0, -0.8])
+
+    def measured(at):
+        return rotation.rotate(at.quat, at.vel) if kind == "vel" else rotation.rotate_inverse(at.quat, known)
+
+    error, std = 1e-7 * jnp.array([1.0, -2.0, 1.5]), jnp.array([0.1, 0.2, 0.3])
+    z = measured(estimate) + error
+    after = error_state.update_vel(estimate, z, std) if kind == "vel" else (
+        error_state.update_direction(estimate, z, known, std)
+    )  # fmt: skip
+    h = jax.jacfwd(lambda e: measured(moved(estimate, e)))(jnp.zeros(15))
+    p = error_state.covariance(estimate.cov)
+    gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + jnp.diag(std**2))
+    found = difference(error_state.finalize(after, least=0.0), estimate)
+    # rounding of float64 and the 1e-6 that the firmware adds to norms
+    np.testing.assert_allclose(found, gain @ error, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(error_state.covariance(after.cov), p - gain @ h @ p, rtol=1e-6, atol=1e-8)
+
+
+def flown(n_worlds, aids, steps, engine="auto"):
+    """Return a simulation that has flown small moves, exact in time, on the estimate."""
+    imu = IMU(gyro=GYRO, accel=ACCEL)
+    sim = Sim(n_worlds, control="state", integrator="rk4", rng_key=2, engine=engine, estimator=ESKF([imu, *aids]))
+    for k in range(steps // 500):
+        x, y = [(0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1)][k % 4]
+        sim.state_control(pos=(x, y, 1.0))
+        sim.step(500)
+    return sim
+
+
+@pytest.fixture(scope="module")
+def indoors():
+    return flown(128, [MotionCapture(noise=POS, angle_noise=ANGLE), Barometer(noise=3.0)], 2000)
+
+
+def all_errors(sim):
+    """Return the errors of all states, and the covariances. (n_worlds, 15), (n_worlds, 15, 15)"""
+    estimate, imu = sim.data.plugins["eskf"].estimate, sim.data.plugins["imu"]
+    biases = [imu.accel.bias - estimate.accel_bias, imu.gyro.bias - estimate.gyro_bias]
+    error = np.concatenate([errors(sim, "eskf"), *(np.asarray(b)[:, 0] for b in biases)], axis=-1)
+    return error, np.asarray(error_state.covariance(estimate.cov), np.float64)[:, 0]
+
+
+def test_the_covariance_is_that_of_the_errors(indoors):
+    """NEES: 15 states, one degree of freedom each."""
+    assert_chi_squared(normalised(*all_errors(indoors)), 15)
+    assert not np.asarray(indoors.data.plugins["eskf"].failures).any()
+
+
+def test_biases_are_found(indoors):
+    """After 4 s with 1 cm and 0.02 rad of noise the errors are a fraction of the spread of the biases."""
+    error, _ = all_errors(indoors)
+    rms = np.sqrt(np.mean(error**2, axis=0))
+    assert rms[9:12].max() < 0.1 * 0.2
+    assert rms[12:].max() < 0.1 * 0.0175
+    measured = indoors.plugins.observations(indoors.data)["eskf.ang_vel"]
+    wrong = np.asarray(measured - indoors.data.states.ang_vel)
+    white = 2.4e-4 * np.sqrt(250)  # of one sample at 500 Hz
+    assert np.sqrt(np.mean(wrong**2)) < 1.1 * white
+
+
+def test_innovations_are_as_the_filter_expects(indoors):
+    """NIS: poses that the filter does not use yet, minus predictions, normalised by ``H P H' + R``."""
+    record, step = indoors.data.plugins["eskf"], indoors.data.core.steps[0, 0]
+    data = ESKF(()).write(indoors.data, record.replace(used=jnp.full_like(record.used, step)))
+    data = indoors.step_fn(data, jnp.int32(1))
+    estimate, pose = data.plugins["eskf"].estimate, data.plugins["motion_capture"].samples.value[:, 0]
+    turn = rotation.multiply(rotation.conjugate(estimate.quat[:, 0]), pose[:, 3:7])
+    error = np.concatenate([pose[:, :3] - estimate.pos[:, 0], 2 * turn[:, :3] / turn[:, 3:]], axis=-1)
+    rows = [*error_state.POS, *error_state.ATT]
+    cov = np.asarray(error_state.covariance(estimate.cov))[:, 0][:, rows][..., rows]
+    assert_chi_squared(normalised(error, cov + np.diag([POS**2] * 3 + [ANGLE**2] * 3)), 6)
+
+
+@pytest.mark.slow
+def test_satellites_barometer_and_magnetometer_are_enough():
+    """NEES after 8 s: 15; the heading is known by the field alone, whose noise is 0.08 rad in a sample."""
+    field = Magnetometer((2e-5, 0.0, -4.5e-5), Triad(noise=5e-7))
+    sim = flown(128, [GPS(noise=0.3, vel_noise=0.05), Barometer(noise=3.0), field], 4000)
+    error, cov = all_errors(sim)
+    assert_chi_squared(normalised(error, cov), 15)
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 0.08, "m: a quarter of the noise of one position"
+    assert np.sqrt(np.mean(error[:, 12:] ** 2)) < 0.1 * 0.0175
+
+
+def test_engines_agree_and_an_impossible_estimate_begins_anew():
+    """Rounding of float32 apart; world 1 is moved out of bounds."""
+    ends = []
+    for engine in ("plain", "fused"):
+        sim = flown(2, [MotionCapture(noise=POS, angle_noise=ANGLE), Barometer(noise=3.0)], 500, engine)
+        record = sim.data.plugins["eskf"]
+        ends.append(np.concatenate([sim.data.states.pos, record.estimate.pos, record.estimate.gyro_bias], axis=-1))
+    np.testing.assert_allclose(*ends, rtol=0, atol=2e-4)
+    far = record.replace(estimate=record.estimate.replace(pos=record.estimate.pos.at[1].set(1.1e4)))
+    sim.data = ESKF(()).write(sim.data, far)
+    sim.step(1)
+    record = sim.data.plugins["eskf"]
+    assert np.asarray(record.failures)[:, 0, 0].tolist() == [0, 1]
+    assert np.abs(np.asarray(record.estimate.pos)[1]).max() < 20.0
+
+
+def test_one_argument_adds_it_and_wrong_sensors_are_refused():
+    assert list(Sim(estimator="eskf").plugins) == ["imu", "motion_capture", "eskf"]
+    with pytest.raises(ConfigError, match="got RotorSpeeds"):
+        Sim(estimator=ESKF([IMU(), RotorSpeeds()]))
