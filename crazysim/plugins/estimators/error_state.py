@@ -166,10 +166,10 @@ def predict_biased(
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
     vel, quat = estimate.vel, estimate.quat
-    angle = dt * (gyro - estimate.gyro_bias)
+    angle = dt * (gyro - estimate.gyro_bias)  # type: ignore[operator]
     middle, end = _turned(quat, 0.5 * angle), _turned(quat, angle)
     rot, rot_middle, rot_end = (rotation.matrix(q) for q in (quat, middle, end))
-    acc = rotation.matvec(rot_middle, accel - estimate.accel_bias, gravity)
+    acc = rotation.matvec(rot_middle, accel - estimate.accel_bias, gravity)  # type: ignore[operator]
     vel_world = rotation.matvec(rot, vel)
     pos = estimate.pos + dt * vel_world + 0.5 * dt**2 * acc
     new_vel = rotation.matvec(rot_end.T, vel_world + dt * acc)

@@ -125,9 +125,8 @@ class ESKF(Estimator):
         """Begin at the true state of one drone."""
         s = data.states
         estimate = self._started(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)
-        return self.write(
-            data, self.read(data).replace(estimate=estimate, gyro=0.5 * s.ang_vel + 0.5 * estimate.gyro_bias)
-        )
+        half = 0.5 * (s.ang_vel + estimate.gyro_bias)  # type: ignore[operator]
+        return self.write(data, self.read(data).replace(estimate=estimate, gyro=half))
 
     def _started(self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]) -> Estimate:
         """Return the estimate of one drone before any measurement, with the mean biases of its sensors."""
