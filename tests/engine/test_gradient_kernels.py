@@ -177,6 +177,18 @@ def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
     assert "a loop of 3000 iterations is too long to be reversed" in explain(step, data)
 
 
+def undeclared(data):
+    """Push drones, in a stage of all worlds."""
+    return data.replace(states=data.states.replace(force=1e-2 * jnp.sin(data.states.pos)))
+
+
+@needs_compiler
+def test_a_step_that_splits_is_differentiated_on_lanes(x64):
+    ((fast, step, data), (plain, *_)), at = functions(stages=[undeclared], n_steps=1, dynamics="so_rpy")
+    assert_same(gradient(fast)(at), gradient(plain)(at))
+    assert "gradient: on lanes ('undeclared' is not fused)" in explain(step, data)
+
+
 @pytest.mark.parametrize(("dynamics", "control"), PAIRS)
 def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
     """With respect to all that a drone has of its own."""

@@ -182,7 +182,9 @@ def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
 
 def _transposed(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
     del params
-    if not case.kernels.program.fused:  # its stages may have effects, such as printing, that a primitive has not
+    kernels = case.kernels
+    if not kernels.program.fused:  # its stages may have effects, such as printing, that a primitive has not
+        kernels.reverse(case.changing, kernels.location.platform)  # has none, and notes the reason
         return _cotangents_on_lanes(*fixed, *seeds, case=case)
     return cotangent_p.bind(*fixed, *seeds, case=case)
 
