@@ -240,7 +240,7 @@ def _transposed_by(
 
 
 def _batched_by(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: Any, **params: Any) -> Any:
-    batched = [d is not batching.not_mapped for d in dims]
+    batched = [d is not None for d in dims]
     moved = [jax.numpy.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
     n = next(x.shape[0] for x, b in zip(moved, batched, strict=True) if b)
     out = list(fn(primitive, n, moved, batched, **params))
