@@ -89,7 +89,7 @@ class DerivativeKernels:
                 self._launches[place] = None
                 source = write(made, TARGETS[platform])
                 location = self.location if platform == self.location.platform else Location(platform)
-                with announced("compiling a derivative of the steps", "5 to 20 s"):
+                with announced("compiling a derivative of the steps", "2 to 10 s"):
                     self._launches[place] = compiled(source, location)
                 self.used[f"{kind}: one kernel, {described(source, platform, location.devices)}"] = None
         except UnsupportedError as error:
