@@ -224,6 +224,28 @@ FN f32v exp_(f32v x) {
   return (1.0f + (r + r * r * p)) * (f32v)((half + 127) << 23) * (f32v)((whole - half + 127) << 23);
 }
 FN f64v exp_(f64v x) { return each<f64v>([](f64 t) { return exp_(t); }, x); }
+// S. L. Moshier's logf of the Cephes library at 1 + x, from -1 to 0, with what the sum rounds off.
+FN f32v log1p_below(f32v x) {
+  const f32v u = 1.0f + x, rest = (x - (u - 1.0f)) / u;
+  const i32v bits = (i32v)u, scaled = bits - 0x3f3504f3;  // the mantissa from sqrt(1/2) to sqrt(2)
+  const i32v e = scaled >> 23;
+  const f32v n = __builtin_convertvector(e, f32v), m = (f32v)(bits - (e << 23)) - 1.0f, z = m * m;
+  const f32v p = 3.3333331174e-1f + m * (-2.4999993993e-1f + m * (2.0000714765e-1f + m * (-1.6668057665e-1f +
+      m * (1.4249322787e-1f + m * (-1.2420140846e-1f + m * (1.1676998740e-1f + m * (-1.1514610310e-1f +
+      m * 7.0376836292e-2f)))))));
+  return n * 0.693359375f + (m + (m * z * p + n * -2.12194440e-4f - 0.5f * z + rest));
+}
+// As for single numbers, both branches.
+FN f32v erf_inv_(f32v x) {
+  const f32v w = -log1p_below(-x * x), near = w - 2.5f, far = sqrt_(w) - 3.0f;
+  f32v p = 3.43273939e-07f + 2.81022636e-08f * near, q = 0.000100950558f + -0.000200214257f * far;
+  p = -3.5233877e-06f + p * near; p = -4.39150654e-06f + p * near; p = 0.00021858087f + p * near;
+  p = -0.00125372503f + p * near; p = -0.00417768164f + p * near; p = 0.246640727f + p * near; p = 1.50140941f + p * near;
+  q = 0.00134934322f + q * far; q = -0.00367342844f + q * far; q = 0.00573950773f + q * far; q = -0.0076224613f + q * far;
+  q = 0.00943887047f + q * far; q = 1.00167406f + q * far; q = 2.83297682f + q * far;
+  const f32v size = abs_(x), infinite = lift(f32_infinity());
+  return size == 1.0f ? x * infinite : size > 1.0f ? infinite - infinite : (w < 5.0f ? p : q) * x;
+}
 FN f32v atan2_(f32v y, f32v x) {
   const i32v sign = (i32v)y & i32v(lift(i32(-2147483647 - 1)));
   const f32v a = (f32v)((i32v)x & 0x7fffffff), b = (f32v)((i32v)y & 0x7fffffff);
