@@ -10,6 +10,7 @@ from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter
 from crazysim.drones import load_airframe
+from crazysim.dynamics.utils.identification import FITTED
 from crazysim.identify import (
     Columns,
     Model,
@@ -18,6 +19,7 @@ from crazysim.identify import (
     fast_rotation,
     fit_residual,
     identify,
+    identify_attitude,
     plot_errors,
     prediction_errors,
     read_log,
@@ -42,6 +44,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
     add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
+    add("--dynamics", choices=["first_principles", *FITTED], default="first_principles", help="model to fit")
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
     add("--iterations", type=int, default=1000, metavar="N", help="iterations of that training")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")
@@ -66,6 +69,12 @@ def run(options: argparse.Namespace) -> None:
     for log in logs + held_out:
         for repair in log.repairs:
             print(f"{log.name}: {repair}")
+    source = f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {', '.join(log.name for log in logs)}"
+    if options.dynamics != "first_principles":
+        _, text = identify_attitude(logs, options.airframe, options.dynamics, source, mass=options.mass)
+        options.out.write_text(text, encoding="utf-8")
+        print(f"{text}wrote {options.out}")
+        return
     result = identify(logs, options.airframe, mass=options.mass)
     for name, x in result.values.items():
         print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
@@ -88,8 +97,7 @@ def run(options: argparse.Namespace) -> None:
     if options.plot:
         plot_errors(held_out or logs, models, options.plot)
         print(f"wrote {options.plot}")
-    names = ", ".join(log.name for log in logs)
-    text = result.toml(f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {names}")
+    text = result.toml(source)
     options.out.write_text(text, encoding="utf-8")
     print(f"wrote {options.out}")
 

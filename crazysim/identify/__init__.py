@@ -1,5 +1,6 @@
 """Identification of airframes from logs of real flights."""
 
+from crazysim.identify.attitude import identify_attitude
 from crazysim.identify.fit import Identification, identify
 from crazysim.identify.logs import Columns, Log, read_log
 from crazysim.identify.network import fit_residual
@@ -17,6 +18,7 @@ __all__ = [
     "fast_rotation",
     "fit_residual",
     "identify",
+    "identify_attitude",
     "plot_errors",
     "prediction_errors",
     "read_log",

@@ -1,0 +1,155 @@
+"""Preparation of logs for the identification of fitted dynamics: outliers, levelling, filters with derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim import rotation
+from crazysim.errors import ConfigError
+
+LEVEL = 0.1
+"""Duration at the start of a log over which its attitude is taken to be level, s."""
+OUTLIER = 0.3
+"""Distance from the median over a second beyond which a position is an outlier, m."""
+CUTOFFS = {"translation": 6.0, "rotation": 8.0}
+"""Cutoffs of the filters of Crazyflow's identification, Hz."""
+
+
+def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
+    """Return a log with time from zero, outliers interpolated, and attitudes relative to that of the first 0.1 s.
+
+    Args:
+        data: ``time``, s, (n,); ``pos``, m, (n, 3); ``quat``, body to world, xyzw, (n, 4); ``cmd_rpy``, rad, (n, 3);
+            ``cmd_f``, collective thrust, N, (n,).
+
+    Returns:
+        The same, with ``dt``, s, (n - 1,), and ``rpy``, rad, (n, 3).
+
+    Raises:
+        ConfigError: If a column is missing or the time does not increase.
+    """
+    needed = ("time", "pos", "quat", "cmd_rpy", "cmd_f")
+    if missing := [key for key in needed if key not in data]:
+        raise ConfigError(f"expected {', '.join(needed)}, got no {', '.join(missing)}. Add them to the log.")
+    log = {key: np.array(x, np.float64) for key, x in data.items()}
+    time, pos, quat = log["time"] - log["time"][0], log["pos"], log["quat"]
+    if not np.all(np.diff(time) > 0):
+        raise ConfigError("expected a time that increases, got repeated or earlier samples. Drop them first.")
+    dt = np.diff(time)
+    half = max(1, round(0.5 / float(np.mean(dt))))
+    middle = np.stack([np.median(pos[max(0, k - half) : k + half + 1], axis=0) for k in range(len(time))])
+    good = ~np.any(np.abs(pos - middle) > OUTLIER, axis=-1)
+    if np.sum(good) < 2:
+        raise ConfigError("expected positions along a path, got jumps at nearly every sample. Check their unit.")
+    sign = np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])
+    quat = sign[:, None] * quat
+    pos, quat = (np.stack([np.interp(time, time[good], c[good]) for c in x.T], axis=-1) for x in (pos, quat))
+    first = np.mean(quat[: max(1, round(LEVEL / float(np.mean(dt))))], axis=0)
+    inverse = first / np.linalg.norm(first) * [-1, -1, -1, 1]
+    quat = np.asarray(rotation.multiply(jnp.asarray(inverse), jnp.asarray(quat)), np.float64)
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    rpy = np.unwrap(np.asarray(rotation.to_rpy(jnp.asarray(quat)), np.float64), axis=0)
+    return log | {"time": time, "dt": dt, "pos": pos, "quat": quat, "rpy": rpy}
+
+
+def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
+    """Return a log with filtered signals and their derivatives, without phase shift.
+
+    Position and thrust pass 6 Hz, angles 8 Hz. Commands are held from sample to sample, as flight controllers do.
+
+    Args:
+        data: A log from ``preprocessing``.
+
+    Returns:
+        The same, with ``SVF_pos``, ``SVF_vel``, ``SVF_acc``, ``SVF_jerk``, SI units, (n, 3); ``SVF_rpy``, ``SVF_drpy``,
+        ``SVF_ddrpy``, ``SVF_dddrpy``, rad and s, (n, 3); ``SVF_quat``, (n, 4); ``SVF_cmd_f``, N, (n,); ``SVF_cmd_rpy``,
+        rad, (n, 3).
+    """
+    log = {key: np.asarray(x, np.float64) for key, x in data.items()}
+    time = log["time"]
+
+    def filtered(key: str, cutoff: str, n: int, held: bool = False) -> NDArray:
+        return state_variable_filter(log[key].T, time, CUTOFFS[cutoff], n, held=held)
+
+    def columns(x: NDArray, k: int) -> NDArray:
+        return x[:, k].T
+
+    pos, rpy = filtered("pos", "translation", 3), filtered("rpy", "rotation", 3)
+    log |= {f"SVF_{key}": columns(pos, k) for k, key in enumerate(("pos", "vel", "acc", "jerk"))}
+    log |= {f"SVF_{key}": columns(rpy, k) for k, key in enumerate(("rpy", "drpy", "ddrpy", "dddrpy"))}
+    log["SVF_quat"] = np.asarray(rotation.from_rpy(jnp.asarray(log["SVF_rpy"])), np.float64)
+    log["SVF_cmd_f"] = filtered("cmd_f", "translation", 3, held=True)[0]
+    log["SVF_cmd_rpy"] = columns(filtered("cmd_rpy", "rotation", 3, held=True), 0)
+    return log
+
+
+def state_variable_filter(
+    y: ArrayLike, t: ArrayLike, f_c: float = 1.0, N_deriv: int = 2, *, held: bool = False
+) -> NDArray:
+    """Return a signal through Butterworth low-passes backward and forward in time, and its derivatives.
+
+    The low-pass of order ``N_deriv + 2`` is simulated exactly between samples, of which the signal is linear, or
+    constant where it is held. Uneven times are resampled.
+
+    Args:
+        y: Signals. (n,) or (n_signals, n)
+        t: Times, s. (n,)
+        f_c: Cutoff, Hz.
+        N_deriv: Number of derivatives.
+        held: True for signals that stay until the next sample.
+
+    Returns:
+        Filtered signals and derivatives, (n_signals, N_deriv + 1, n), without axes of length one.
+    """
+    y, t = np.atleast_2d(np.asarray(y, np.float64)), np.asarray(t, np.float64)
+    even = np.linspace(t[0], t[-1], len(t))
+    if held:
+        u = y[:, np.clip(np.searchsorted(t, even + 1e-9, side="right") - 1, 0, len(t) - 1)]
+    else:
+        u = np.stack([np.interp(even, t, x) for x in y])
+    order, omega = N_deriv + 2, 2 * np.pi * f_c
+    poles = np.exp(1j * np.pi * (2 * np.arange(1, order + 1) + order - 1) / (2 * order))
+    a = np.zeros((order + 2, order + 2))  # filter states in time times omega, input, and the input's change
+    a[: order - 1, 1:order] = np.eye(order - 1)
+    a[order - 1, :order] = -np.real(np.poly(poles))[:0:-1]
+    a[order - 1, order] = 1.0
+    step = omega * (t[-1] - t[0]) / (len(t) - 1)
+    a *= step
+    a[order, order + 1] = 1.0
+    move = exponential(a)[:order]
+
+    def passed(u: NDArray, change: NDArray) -> NDArray:
+        x = np.zeros((len(u), order))
+        x[:, 0] = u[:, 0]
+        inputs = u[..., None] * move[:, order] + change[..., None] * move[:, order + 1]
+        states, transition = np.empty((*u.shape, order)), move[:, :order].T
+        for k in range(u.shape[1]):
+            states[:, k] = x
+            x = x @ transition + inputs[:, k]
+        return states
+
+    zero = np.zeros((len(u), 1))
+    if held:  # backward in time, the value before a sample holds after it
+        back = passed(np.concatenate([u[:, -2::-1], u[:, :1]], axis=1), np.zeros_like(u))[:, ::-1, 0]
+    else:
+        back = passed(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]
+    states = passed(back, np.concatenate([np.diff(back, axis=1), zero], axis=1))
+    found = [[np.interp(t, even, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
+    return np.squeeze(np.array(found))
+
+
+def exponential(a: NDArray) -> NDArray:
+    """Return the exponential of a small matrix, by its series after halving it to a norm below 1/8. (k, k)"""
+    halvings = max(0, int(np.ceil(np.log2(max(np.linalg.norm(a, 1), 1e-12)))) + 3)
+    small = a / 2**halvings
+    total = term = np.eye(len(a))
+    for k in range(1, 12):  # (1/8)^12 / 12! is below the rounding of float64
+        term = term @ small / k
+        total = total + term
+    for _ in range(halvings):
+        total = total @ total
+    return total

@@ -1,0 +1,280 @@
+"""Identification of the fitted dynamics from attitude commands: gain, lag and drag of the thrust, and angles."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim import rotation
+from crazysim.dynamics.models import GRAVITY, Dynamics
+from crazysim.errors import ConfigError
+
+logger = logging.getLogger(__name__)
+
+RATES = (0.5, 500.0)
+"""Range of the rate of the thrust's lag that is searched, 1/s."""
+BLOCK = 5.0
+"""Duration of the blocks whose scatter gives the standard deviations, s."""
+FITTED = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
+
+
+def sys_id_translation(
+    dynamics: str,
+    mass: float,
+    data: Mapping[str, ArrayLike],
+    data_validation: Mapping[str, ArrayLike] | None = None,
+    gravity: ArrayLike = GRAVITY,
+    verbose: int = 0,
+    plot: bool = False,
+) -> dict[str, float]:
+    """Return the parameters of the translation of a fitted model.
+
+    For each rate of the lag the others follow by linear least squares of the filtered accelerations; the rate is found
+    by a search. The lag is simulated exactly between samples.
+
+    Args:
+        dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
+        mass: Mass, kg.
+        data: A log from ``derivatives_svf``.
+        data_validation: Another one, whose error is logged.
+        gravity: Gravitational acceleration, world frame, m/s^2. (3,)
+        verbose: Ignored: results are logged at level INFO.
+        plot: Accepted as False only; ``crazysim identify --plot`` draws errors.
+
+    Returns:
+        ``cmd_f_coef``, thrust per commanded thrust, 1; with a lag ``thrust_dyn_coef``, its rate, 1/s; with drag
+        ``drag_xy_coef`` and ``drag_z_coef``, N s/m.
+
+    Raises:
+        ConfigError: If the model is not one of these, or a plot is asked for.
+    """
+    del verbose  # an argument of Crazyflow
+    _refuse_plot(plot)
+    values, _ = fit_translation(dynamics, mass, [data], gravity)
+    for name, log in (("data", data), ("validation", data_validation)):
+        if log is not None:
+            terms, acc = _terms(Dynamics(dynamics), mass, log, values.get("thrust_dyn_coef", np.inf), gravity)
+            coefs = [values[key] for key in ("cmd_f_coef", "drag_xy_coef", "drag_z_coef") if key in values]
+            logger.info("%s, %s: RMSE of the acceleration %.4g m/s^2", dynamics, name, _rms(acc - terms @ coefs))
+    return values
+
+
+def sys_id_rotation(
+    data: Mapping[str, ArrayLike],
+    data_validation: Mapping[str, ArrayLike] | None = None,
+    verbose: int = 0,
+    plot: bool = False,
+) -> dict[str, NDArray]:
+    """Return the parameters of the rotation of the fitted models; roll and pitch share theirs.
+
+    Simulated angles are fitted to the filtered ones by Levenberg and Marquardt's method.
+
+    Args:
+        data: A log from ``derivatives_svf``.
+        data_validation: Another one, whose error is logged.
+        verbose: Ignored: results are logged at level INFO.
+        plot: Accepted as False only; ``crazysim identify --plot`` draws errors.
+
+    Returns:
+        ``rpy_coef``, 1/s^2, ``rpy_rates_coef``, 1/s, and ``cmd_rpy_coef``, 1/s^2. (3,) each
+
+    Raises:
+        ConfigError: If a plot is asked for.
+    """
+    del verbose  # an argument of Crazyflow
+    _refuse_plot(plot)
+    values, _ = fit_rotation([data])
+    for name, log in (("data", data), ("validation", data_validation)):
+        if log is not None:
+            rest = [_rotation_error(np.array([x[k] for x in values.values()]), *_angles(log, [k])) for k in range(3)]
+            logger.info("rotation, %s: RMSE of roll, pitch, yaw %s rad", name, [f"{_rms(x):.4g}" for x in rest])
+    return values
+
+
+def fit_translation(
+    dynamics: str, mass: float, logs: Sequence[Mapping[str, ArrayLike]], gravity: ArrayLike = GRAVITY
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the parameters of ``sys_id_translation`` for several logs, and their standard deviations.
+
+    Raises:
+        ConfigError: If the model is not a fitted one, or the mass is not positive.
+    """
+    if dynamics not in list(FITTED):
+        raise ConfigError(f"expected dynamics as one of {', '.join(FITTED)}, got {dynamics!r}. Choose one of them.")
+    if not 0 < mass < np.inf:
+        raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}. Weigh the drone.")
+    kind = Dynamics(dynamics)
+
+    def solved(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
+        parts = [_terms(kind, mass, log, rate, gravity) for log in logs]
+        terms, acc = (np.concatenate(x) for x in zip(*parts, strict=True))
+        coefs = np.linalg.lstsq(terms.reshape(-1, terms.shape[-1]), acc.ravel(), rcond=None)[0]
+        rest = acc - terms @ coefs
+        return float(np.sum(rest**2)), coefs, terms, rest
+
+    rate = np.inf
+    if kind != Dynamics.so_rpy:
+        grid = np.geomspace(*RATES, 31)
+        k = int(np.argmin([solved(x)[0] for x in grid]))
+        low, high = np.log(grid[max(0, k - 1)]), np.log(grid[min(len(grid) - 1, k + 1)])
+        golden = (np.sqrt(5) - 1) / 2
+        for _ in range(30):
+            a, b = high - golden * (high - low), low + golden * (high - low)
+            low, high = (low, b) if solved(np.exp(a))[0] < solved(np.exp(b))[0] else (a, high)
+        rate = float(np.exp((low + high) / 2))
+    _, coefs, terms, rest = solved(rate)
+    names, values, jacobian = ["cmd_f_coef"], [coefs[0]], terms
+    if kind != Dynamics.so_rpy:
+        names, values = [*names, "thrust_dyn_coef"], [*values, rate]
+        slope = (solved(1.001 * rate)[2] - solved(rate / 1.001)[2]) @ coefs / (rate * 0.002)
+        jacobian = np.insert(jacobian, 1, slope, axis=-1)
+    if kind == Dynamics.so_rpy_rotor_drag:
+        names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
+    spread = _deviations(jacobian, rest, _blocks(logs))
+    return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, spread), strict=True))
+
+
+def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    """Return the parameters of ``sys_id_rotation`` for several logs, and their standard deviations."""
+    groups = []
+    for axes in ([0, 1], [2]):
+        data = [_angles(log, axes) for log in logs]
+
+        def rest(x: NDArray, data: list = data) -> NDArray:
+            return np.concatenate([_rotation_error(x, *log) for log in data])
+
+        def slope(x: NDArray, data: list = data) -> NDArray:
+            return np.concatenate([np.asarray(_rotation_slope(jnp.asarray(x), *log), np.float64) for log in data])
+
+        # Angles, rates and accelerations obey the equation up to noise, which gives the first guess.
+        columns = [
+            np.concatenate([np.asarray(log[key], np.float64)[:, axes].ravel() for log in logs])
+            for key in ("SVF_rpy", "SVF_drpy", "SVF_cmd_rpy", "SVF_ddrpy")
+        ]
+        guess = np.linalg.lstsq(np.stack(columns[:3], -1), columns[3], rcond=None)[0]
+        start = np.where(np.sign(guess) == [-1, -1, 1], guess, [-100.0, -20.0, 100.0])
+        x = _levenberg_marquardt(rest, slope, start)
+        groups.append((x, _deviations(slope(x), rest(x), _blocks(logs))))
+    (tilt, tilt_spread), (turn, turn_spread) = groups
+    names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
+    values = {name: np.array([tilt[k], tilt[k], turn[k]]) for k, name in enumerate(names)}
+    spread = {name: np.array([tilt_spread[k], tilt_spread[k], turn_spread[k]]) for k, name in enumerate(names)}
+    return values, spread
+
+
+def _terms(
+    kind: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
+) -> tuple[NDArray, NDArray]:
+    """Return the acceleration per coefficient, (n, 3, k), and that of all forces but gravity, (n, 3)."""
+    time, vel, acc, quat, cmd = (
+        np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
+    )
+    thrust = cmd if kind == Dynamics.so_rpy else lagged(cmd, float(time[-1] - time[0]) / (len(time) - 1), rate)
+    matrix = np.asarray(rotation.matrix(jnp.asarray(quat)), np.float64)
+    terms = [matrix[..., 2] * thrust[:, None]]
+    if kind == Dynamics.so_rpy_rotor_drag:
+        along = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
+        terms += [vel - along, along]
+    return np.stack(terms, axis=-1) / mass, acc - np.asarray(gravity, np.float64)
+
+
+def lagged(x: NDArray, dt: float, rate: float) -> NDArray:
+    """Return a signal, linear between samples, behind a lag of first order that starts at rest. (n,)"""
+    decay = np.exp(-rate * dt)
+    after = 1 - (1 - decay) / (rate * dt)  # weight of the later sample
+    inputs = (1 - decay - after) * x[:-1] + after * x[1:]
+    out = np.empty_like(x)
+    out[0] = x[0]
+    for k, u in enumerate(inputs):
+        out[k + 1] = decay * out[k] + u
+    return out
+
+
+def _angles(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, Array, Array, Array]:
+    """Return sample time, commands, angles, (n, len(axes)), and the first angles and rates, (2, len(axes))."""
+    time = np.asarray(log["time"], np.float64)
+    cmd, rpy, rates = (jnp.asarray(log[key])[:, jnp.asarray(axes)] for key in ("SVF_cmd_rpy", "SVF_rpy", "SVF_drpy"))
+    return float(time[-1] - time[0]) / (len(time) - 1), cmd, rpy, jnp.stack([rpy[0], rates[0]])
+
+
+def _simulated(x: Array, dt: float, cmd: Array, start: Array) -> Array:
+    """Return the angles of damped springs, exact for commands that are linear between samples. (n, k)"""
+    stiffness, damping, gain = x
+    zero = jnp.zeros_like(gain)
+    system = jnp.array([
+        [zero, 1.0, zero, zero],
+        [stiffness, damping, gain, zero],
+        [zero, zero, zero, 1 / dt],
+        [zero, zero, zero, zero],
+    ])  # fmt: skip
+    move = jax.scipy.linalg.expm(system * dt)[:2]
+
+    def step(state: Array, u: tuple[Array, Array]) -> tuple[Array, Array]:
+        now, change = u
+        new = move[:, :2] @ state + move[:, 2:3] * now + move[:, 3:4] * change
+        return new, new[0]
+
+    _, path = jax.lax.scan(step, start, (cmd[:-1], jnp.diff(cmd, axis=0)))
+    return jnp.concatenate([start[:1], path])
+
+
+@jax.jit
+def _rest(x: Array, dt: float, cmd: Array, rpy: Array, start: Array) -> Array:
+    return rpy - _simulated(x, dt, cmd, start)
+
+
+_rotation_slope = jax.jit(lambda x, *log: -jax.jacfwd(_rest)(x, *log))
+
+
+def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
+    return np.asarray(_rest(jnp.asarray(x), *log), np.float64)
+
+
+def _levenberg_marquardt(rest: Callable, slope: Callable, x: NDArray) -> NDArray:
+    """Return the parameters of least squares; ``rest`` is data minus model, ``slope`` the model's derivative."""
+    damping, error = 1e-3, rest(x)
+    for _ in range(100):
+        jacobian = slope(x).reshape(-1, len(x))
+        normal, vector = jacobian.T @ jacobian, jacobian.T @ error.ravel()
+        move = np.linalg.lstsq(
+            normal + damping * np.diag(np.diag(normal)) + 1e-30 * np.eye(len(x)), vector, rcond=None
+        )[0]
+        new = rest(x + move)
+        better = np.all(np.isfinite(new)) and np.sum(new**2) < np.sum(error**2)
+        if better:
+            small = np.all(np.abs(move) < 1e-6 * np.abs(x))
+            x, error, damping = x + move, new, damping / 10
+            if small:
+                break
+        elif (damping := 10 * damping) > 1e8:
+            break
+    return x
+
+
+def _blocks(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
+    """Return the number of the block of each sample of all logs. (n,)"""
+    parts = [1000 * k + np.asarray(log["time"], np.float64) // BLOCK for k, log in enumerate(logs)]
+    return np.concatenate(parts)
+
+
+def _deviations(jacobian: NDArray, rest: NDArray, blocks: NDArray) -> NDArray:
+    """Return standard deviations from the scatter between blocks of time. (k,)"""
+    inverse = np.linalg.pinv(np.einsum("nri,nrj->ij", jacobian, jacobian), hermitian=True)
+    scores = np.einsum("nri,nr->ni", jacobian, rest)
+    each = np.stack([scores[blocks == b].sum(axis=0) for b in np.unique(blocks)])
+    return np.sqrt(np.diag(inverse @ (each.T @ each) @ inverse))
+
+
+def _refuse_plot(plot: bool) -> None:
+    if plot:
+        raise ConfigError("expected plot=False, got True. Plot errors with crazysim identify --plot.")
+
+
+def _rms(x: NDArray) -> float:
+    return float(np.sqrt(np.mean(np.asarray(x) ** 2)))

@@ -1,0 +1,91 @@
+"""Fitted dynamics are found in logs with attitude commands."""
+
+import numpy as np
+import pytest
+
+from crazysim.__main__ import main
+from crazysim.drones import load_airframe
+from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing, state_variable_filter
+from crazysim.dynamics.utils.identification import sys_id_rotation, sys_id_translation
+from crazysim.errors import ConfigError
+from crazysim.sim import Sim
+
+MODEL = "so_rpy_rotor_drag"
+RATE, SECONDS = 100, 40
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """Columns of a simulated flight of cf2x_L250 with the fitted model, that starts in hover."""
+    sim = Sim(drone="cf2x_L250", dynamics=MODEL, control="attitude", freq=1000, attitude_freq=RATE, integrator="rk4")
+    airframe, rng = load_airframe("cf2x_L250"), np.random.default_rng(0)
+    hover = float(airframe.value("rigid_body.mass")) * 9.81 / float(airframe.value(f"fitted.{MODEL}.cmd_f_coef"))
+    states = sim.data.states
+    high = states.pos + np.array([0, 0, 50.0], np.float32)
+    sim.data = sim.data.replace(states=states.replace(pos=high, rotor_vel=np.full_like(states.rotor_vel, hover)))
+    cmd, rows = np.array([0, 0, 0, hover]), []
+    for k in range(SECONDS * RATE):
+        states = sim.data.states
+        pos, quat, vel = (np.asarray(x)[0, 0] for x in (states.pos, states.quat, states.vel))
+        if k >= RATE and k % 25 == 0:
+            back = np.clip([0.1 * vel[1], -0.1 * vel[0]], -0.2, 0.2)
+            lift = rng.uniform(0.8, 1.25) - np.clip(0.15 * vel[2] + 0.02 * (pos[2] - 50), -0.25, 0.25)
+            cmd = np.array([*rng.uniform(-0.35, 0.35, 2) + back, rng.uniform(-0.5, 0.5), hover * lift])
+        rows.append([k / RATE, *pos, *quat, *cmd])
+        sim.attitude_control(cmd[None, None])
+        sim.step(1000 // RATE)
+    names = "t x y z qx qy qz qw roll_command pitch_command yaw_command thrust_command".split()
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def columns(flight, *names):
+    return np.stack([flight[name] for name in names], axis=-1)
+
+
+def test_names_of_crazyflow_find_the_parameters(flight):
+    data = {"time": flight["t"], "cmd_f": flight["thrust_command"], "pos": columns(flight, *"xyz")}
+    data |= {"quat": columns(flight, "qx", "qy", "qz", "qw")}
+    data |= {"cmd_rpy": columns(flight, "roll_command", "pitch_command", "yaw_command")}
+    log, airframe = derivatives_svf(preprocessing(data)), load_airframe("cf2x_L250")
+    found = sys_id_translation(MODEL, float(airframe.value("rigid_body.mass")), log)
+    true = {key: airframe.value(f"fitted.{MODEL}.{key}") for key in ("cmd_f_coef", "thrust_dyn_coef")}
+    drag = airframe.value(f"fitted.{MODEL}.drag_coefficients")
+    assert found["cmd_f_coef"] == pytest.approx(true["cmd_f_coef"], rel=0.005)
+    # Products of attitude and velocity are formed after the filter, which biases the drag by some percent.
+    assert found["thrust_dyn_coef"] == pytest.approx(true["thrust_dyn_coef"], rel=0.02)
+    assert found["drag_xy_coef"] == pytest.approx(drag[0], rel=0.1)
+    assert found["drag_z_coef"] == pytest.approx(drag[2], rel=0.05)
+    turn = sys_id_rotation(log)
+    for key, x in turn.items():
+        np.testing.assert_allclose(x, airframe.value(f"fitted.{MODEL}.{key}"), rtol=0.01, err_msg=key)
+
+
+def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
+    path, out = tmp_path / "flight.npz", tmp_path / "mine.toml"
+    np.savez(path, **flight)
+    assert main(["identify", str(path), "--airframe", "cf2x_L250", "--dynamics", MODEL, "--out", str(out)]) == 0
+    assert "wrote" in capsys.readouterr().out
+    mine, base = load_airframe(out), load_airframe("cf2x_L250")
+    for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef"):
+        np.testing.assert_allclose(mine.value(f"fitted.{MODEL}.{key}"), base.value(f"fitted.{MODEL}.{key}"), rtol=0.02)
+    Sim(drone=out, dynamics=MODEL, control="attitude").step()
+
+
+def test_logs_without_commands_and_other_models_are_refused(flight, tmp_path, capsys):
+    path = tmp_path / "flight.npz"
+    np.savez(path, **{key: x for key, x in flight.items() if not key.endswith("command")})
+    assert main(["identify", str(path), "--dynamics", "so_rpy", "--out", str(tmp_path / "a.toml")]) != 0
+    assert "attitude_command" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="so_rpy_rotor"):
+        sys_id_translation("first_principles", 0.03, {})
+    with pytest.raises(ConfigError, match="cmd_f"):
+        preprocessing({"time": flight["t"]})
+
+
+def test_filter_keeps_slow_signals_and_their_derivatives():
+    t = np.arange(0, 6, 0.01)
+    found = state_variable_filter(np.sin(2 * t), t, f_c=6, N_deriv=2)
+    inner = slice(100, -100)
+    # Twice a Butterworth low-pass at 1/19 of its cutoff: flat to (1/19)^8; linear interpolation costs 4e-5.
+    for x, true in zip(found, (np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)), strict=True):
+        np.testing.assert_allclose(x[inner], true[inner], atol=1e-3)
