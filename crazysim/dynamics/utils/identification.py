@@ -52,7 +52,7 @@ def sys_id_translation(
         ``drag_xy_coef`` and ``drag_z_coef``, N s/m.
 
     Raises:
-        ConfigError: If the model is not one of these, or a plot is asked for.
+        ConfigError: If the model is not one of these, or a plot is requested.
     """
     del verbose  # an argument of Crazyflow
     _refuse_plot(plot)
@@ -85,7 +85,7 @@ def sys_id_rotation(
         ``rpy_coef``, 1/s^2, ``rpy_rates_coef``, 1/s, and ``cmd_rpy_coef``, 1/s^2. (3,) each
 
     Raises:
-        ConfigError: If a plot is asked for.
+        ConfigError: If a plot is requested.
     """
     del verbose  # an argument of Crazyflow
     _refuse_plot(plot)
