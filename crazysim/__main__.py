@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from crazysim import cache
-from crazysim.commands import airframe, demo, identify, info, live, replay, show, training
+from crazysim.commands import airframe, demo, identify, info, live, replay, show, training, validate
 from crazysim.errors import DivergedError, RenderError
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="crazysim", description="A drone simulator in which millions of worlds advance in one call."
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command")
-    for module in (demo, replay, show, live, training, airframe, identify, info):
+    for module in (demo, replay, show, live, training, airframe, identify, validate, info):
         module.add(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command != "info":
         cache.enable_for_command()
     try:
-        options.run(options)
+        status = options.run(options)
         sys.stdout.flush()
     except (ValueError, ImportError, DivergedError, RenderError) as error:
         print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # who reads the output, such as head, has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
         return 141
-    return 0
+    return status or 0
 
 
 def _named_extra(error: Exception, command: str) -> str:
