@@ -21,6 +21,8 @@ RATES = (0.5, 500.0)
 """Range of the rate of the thrust's lag that is searched, 1/s."""
 BLOCK = 5.0
 """Duration of the blocks whose scatter gives the standard deviations, s."""
+EDGE = 0.5
+"""Duration at both ends of a log, s, that is left out: filters of 6 Hz start there, with a velocity that they lack."""
 FITTED = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
 
 
@@ -136,7 +138,7 @@ def fit_translation(
         jacobian = np.insert(jacobian, 1, slope, axis=-1)
     if kind == Dynamics.so_rpy_rotor_drag:
         names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
-    spread = _deviations(jacobian, rest, _blocks(logs))
+    spread = _deviations(jacobian, rest, np.arange(len(rest)) * len(logs) * 10 // len(rest))
     return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, spread), strict=True))
 
 
@@ -181,7 +183,9 @@ def _terms(
     if kind == Dynamics.so_rpy_rotor_drag:
         along = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
         terms += [vel - along, along]
-    return np.stack(terms, axis=-1) / mass, acc - np.asarray(gravity, np.float64)
+    inner = (time >= time[0] + EDGE) & (time <= time[-1] - EDGE)
+    inner = inner if np.any(inner) else np.ones(len(time), bool)
+    return (np.stack(terms, axis=-1) / mass)[inner], (acc - np.asarray(gravity, np.float64))[inner]
 
 
 def lagged(x: NDArray, dt: float, rate: float) -> NDArray:
