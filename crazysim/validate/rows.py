@@ -92,7 +92,7 @@ def page(sections: Sequence[Section], rows: dict[str, list[Row]], made: str) -> 
         summary += " Outside: " + "; ".join(row.what for row in bad) + "."
     parts = [
         "# Validation",
-        "Comparisons of crazysim with closed forms, other simulators, compiled firmware and real flights. "
+        "Comparisons of crazysim with closed forms, other simulators and real flights. "
         "`crazysim validate` measures them and writes this page; rows with bad figures stay.",
         f"{made} {summary}",
         "A bound says what passes; where there is none, the row reports a figure. Each section says how to repeat it.",
