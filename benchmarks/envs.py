@@ -1,16 +1,18 @@
 """Environment steps per second, with random actions and with a policy, in one compiled rollout with automatic resets.
 
-    python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576] [--randomize]
+    python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576] [--randomize] [--depth 16 12]
 
 An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
 contains the fraction of worlds whose episode ends per step. With ``--randomize`` the same rollouts with
-``Randomize.crazyflie()`` are timed in turn with them.
+``Randomize.crazyflie()`` are timed in turn with them. With ``--depth`` the policies receive a depth image of each
+drone's camera at every environment step, too.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -23,6 +25,8 @@ from crazysim.envs.state import bare, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.train.networks import Policy, init_mlp
 
+MAX_DEPTH = 5.0
+"""Largest distance that a policy receives, m."""
 SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
 
 
@@ -34,13 +38,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50, help="environment steps per call")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--randomize", action="store_true", help="time the same with Randomize.crazyflie() in turn")
+    parser.add_argument("--depth", type=int, nargs=2, help="width and height of images that the policies receive")
     args = parser.parse_args()
     for task in args.tasks:
         for n_worlds in args.worlds or SIZES["cpu" if args.device == "cpu" else "gpu"]:
-            rollouts(task, n_worlds, args.steps, args.device, args.repeats, args.randomize)
+            rollouts(task, n_worlds, args.steps, args.device, args.repeats, args.randomize, args.depth)
 
 
-def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int, randomize: bool) -> None:
+def rollouts(
+    task: str, n_worlds: int, n_steps: int, device: str, repeats: int, randomize: bool, size: Sequence[int] | None
+) -> None:
     """Print the rates of both kinds of rollout."""
     base = envs.make(task, n_worlds, device=device)
     places = {"as the airframe": envs.AutoReset(base)}
@@ -50,12 +57,19 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int, 
     place = base.sim.device
     key = jax.device_put(jax.random.key(0), place)
     starts = {drones: jax.jit(env.reset)(key) for drones, env in places.items()}
-    n_obs = flatten(starts["as the airframe"].obs).shape[-1]
+    look = base.sim.scene.depth_fn("fpv_cam", *size) if size else None
+    n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (size[0] * size[1] if size else 0)
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, place)
 
+    def observed(state: Any) -> dict[str, jax.Array]:
+        if look is None:
+            return state.obs
+        depth = jnp.minimum(look(state.data).distance, MAX_DEPTH)
+        return {**state.obs, "depth": depth.reshape(*depth.shape[:2], -1)}
+
     def flying(policy: Policy) -> Any:
-        return lambda state, key: policy(state.obs) + 0.1 * jax.random.normal(key, state.action.shape)
+        return lambda state, key: policy(observed(state)) + 0.1 * jax.random.normal(key, state.action.shape)
 
     def jitted(env: Any, act: Any) -> Any:
         def run(carry: Any) -> Any:
@@ -102,6 +116,7 @@ def rollouts(task: str, n_worlds: int, n_steps: int, device: str, repeats: int, 
                 drones=drones,
                 n_worlds=n_worlds,
                 n_steps=n_steps,
+                depth=size,
                 engine=engine_of(base.sim),
                 compile_s=round(compile_s[drones], 2),
                 env_steps_per_s=digits(n_worlds * base.sim.n_drones * n_steps / seconds),
