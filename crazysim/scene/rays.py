@@ -26,7 +26,7 @@ from crazysim.scene.first_hit import NOBODY, Ray, Surface, Targets, first_fixed,
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 MAX_UNROLLED = 16
-"""Geoms of equal objects up to which the program is unrolled; more go through a loop, which compiles once."""
+"""Movable geoms of one world up to which a stage of one world or drone should cast rays: its program is unrolled."""
 MAX_PAIRS = 36
 """Rays times fixed geoms of one world or drone up to which the program is unrolled: it is two to three times as fast as
 a hierarchy then, and compiles in about the same time."""
@@ -150,12 +150,9 @@ def _met_by(
             best = _nearer(best, far, rotation.rotate(q, normal), number)
         return best
 
-    if len(group) * len(geoms) <= MAX_UNROLLED:
-        for row, number in group:
-            best = with_one(best, row, number)
-        return best
-    table = jnp.asarray(group, jnp.int32)
-    return jax.lax.fori_loop(0, len(group), lambda k, best: with_one(best, table[k, 0], table[k, 1]), best)
+    for row, number in group:
+        best = with_one(best, row, number)
+    return best
 
 
 def _meet(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:

@@ -523,13 +523,13 @@ class Sim:
     def explain(self, measure: bool = False) -> str:
         """Return in a few lines which engine runs the step, which stages it fuses, and which it does not and why.
 
-        A line follows on the depth images that were computed last.
+        A line follows on the rays of all worlds that were cast last, for images or for many movable objects.
 
         Args:
             measure: True to measure the cost of stages that are not fused, which compiles a second step.
         """
         step, rays = explain(self.step_fn, self.data, flag("measure", measure)), self._scene.ray_kernels.used
-        return f"{step}\ndepth: {rays}" if rays else step
+        return f"{step}\nrays: {rays}" if rays else step
 
     @locked
     def reset(self, mask: ArrayLike | None = None) -> None:

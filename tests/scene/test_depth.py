@@ -241,6 +241,30 @@ def test_a_range_finder_finds_the_first_of_many_objects(x64, rng):
         np.testing.assert_allclose(slope[..., k], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
 
 
+@pytest.mark.parametrize("engine", ["plain", "auto"])
+def test_a_range_finder_measures_many_movable_objects_as_it_does_fixed_ones(engine, rng):
+    """A stage of all worlds measures them, at the same steps, and where they are in each world."""
+    pos, quat = rng.uniform([-2, -2, 0.2], [2, 2, 2], (20, 3)), rng.normal(size=(20, 4))
+    start = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (6, 2, 3))
+    found = []
+    for mocap in (False, True):
+        sim = Sim(6, 2, control="attitude", engine=engine)
+        boxes = sim.scene.add("box", count=20, pos=pos, quat=quat, size=(0.5, 0.5, 0.5), mocap=mocap)
+        sim.add(RangeFinder(freq=250, drones=True, max_range=2.0))
+        placed(sim, start)
+        sim.step(5)
+        found.append(np.asarray(sim.data.plugins["range_finder"].distance))
+        assert engine == "plain" or ("splits the step: 'range_finder'" in sim.explain()) == mocap
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5)
+    assert 0.1 < np.mean(found[0] < 2.0) < 0.9
+    sim.data = boxes.set_pose(sim.data, pos - [0, 0, 50])
+    sim.step(1)
+    np.testing.assert_array_equal(sim.data.plugins["range_finder"].distance, found[1])  # not at odd steps
+    sim.step(1)
+    far = np.asarray(sim.data.plugins["range_finder"].distance)
+    assert np.mean(far < 2.0) < np.mean(found[1] < 2.0)
+
+
 def test_a_range_finder_measures_at_its_rate():
     sim = Sim(control="attitude")
     sim.add(RangeFinder([[0, 0, -2]], freq=50))
@@ -466,7 +490,7 @@ def test_explain_says_what_cast_the_rays_of_an_image(forest):
     forest.depth("fpv_cam", 8, 6)
     line = forest.explain().splitlines()[-1]
     assert line.startswith(
-        "depth: one kernel with a lane for each ray; 111 fixed geoms in a hierarchy, 52 movable geoms"
+        "rays: one kernel with a lane for each ray; 111 fixed geoms in a hierarchy, 52 movable geoms"
     )
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -20,7 +21,7 @@ from crazysim.plugins.sensors.sensor import steps_between
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.placement import place, placed_by
-from crazysim.scene.rays import cast
+from crazysim.scene.rays import MAX_UNROLLED, RayKernels, cast
 
 MULTI_RANGER = {
     "front": (1, 0, 0),
@@ -61,7 +62,7 @@ class RangeFinder(Plugin):
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
     drones: bool = False
-    """True to measure distances to other drones too, in a stage of one world."""
+    """True to measure distances to other drones too."""
     visible: bool = False
     """True to draw the rays into images."""
     name: str = "range_finder"
@@ -80,7 +81,9 @@ class RangeFinder(Plugin):
         return RangeFinderData(on_device(distance), on_device(rays), on_device(far))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that measures, of one drone, or of one world if drones or loads are to be measured."""
+        """Return the stage that measures: of one drone; of one world if drones or loads are to be measured; or of all
+        worlds if more can move than a step's kernel has code for.
+        """
         visual, solid = sim.scene.visual_model, sim.scene.collision_model
         placed = placed_by(sim.scene.plugins(), [body.name for body in visual.objects])
         touched = {body.name for body in solid.objects}
@@ -88,16 +91,24 @@ class RangeFinder(Plugin):
         # The outline of a drone is enough for a few rays.
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
         placed = {name: plugin for name, plugin in placed.items() if name in touched}
-        scope = "world" if self.drones or placed else "drone"
-        period = steps_between(self, sim)
+        n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
+        if self.drones:
+            n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
+        scope = "batch" if n_movable > MAX_UNROLLED else "world" if self.drones or placed else "drone"
+        period, scene = steps_between(self, sim), sim.scene
         when = None if period == 1 else lambda data: data.core.steps % period == 0
 
         def measure(data: SimData) -> SimData:
             """Measure distances, to loads where they are now."""
             present = {name: plugin for name, plugin in placed.items() if plugin.name in data.plugins}
-            return self.write(data, self._measured(model, place(data, present), scope == "world"))
+            return self.write(data, self._measured(model, place(data, present), scope == "drone", scene.ray_kernels))
 
-        return [Placement(Stage(measure, scope, when), before="increment_steps")]
+        def measure_at_times(data: SimData) -> SimData:
+            """Measure in a call that is left out where no world measures."""
+            return jax.lax.cond(jnp.any(when(data)), measure, lambda data: data, data)
+
+        fn = measure if scope != "batch" or when is None else measure_at_times
+        return [Placement(Stage(fn, scope, when, name="range_finder"), before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the distances, m."""
@@ -114,16 +125,15 @@ class RangeFinder(Plugin):
         for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
             sim.scene.renderer.overlays.line(points, GREEN, 2.0, 2.0)
 
-    def _measured(self, model: CollisionModel, data: SimData, of_world: bool) -> RangeFinderData:
-        """Return the record with the distances of one drone, or of one world."""
+    def _measured(self, model: CollisionModel, data: SimData, of_drone: bool, kernels: RayKernels) -> RangeFinderData:
+        """Return the record with the distances of one drone, of one world, or of all worlds."""
         record, states = self.read(data), data.states
-        pos, quat = (states.pos, states.quat) if of_world else (states.pos[None], states.quat[None])
-        direction = rotation.rotate(quat[:, None], record.direction)
-        n_rays = direction.shape[1]
-        origin = jnp.broadcast_to(pos[:, None], direction.shape)
-        own = np.repeat(np.arange(direction.shape[0]), n_rays) if self.drones else None
-        hits = cast(
-            model, data, origin.reshape(-1, 3), direction.reshape(-1, 3), own, self.drones, limit=record.max_range
-        )
-        distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:2])
-        return record.replace(distance=distance if of_world else distance[0])
+        pos, quat = (states.pos[None], states.quat[None]) if of_drone else (states.pos, states.quat)
+        direction = rotation.rotate(quat[..., None, :], record.direction)
+        n_drones, n_rays = direction.shape[-3:-1]
+        origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
+        own = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
+        rays = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
+        hits = cast(model, data, *rays, own, self.drones, kernels=kernels, limit=record.max_range)
+        distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:-1])
+        return record.replace(distance=distance[0] if of_drone else distance)
