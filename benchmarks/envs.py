@@ -57,7 +57,7 @@ def rollouts(
     place = base.sim.device
     key = jax.device_put(jax.random.key(0), place)
     starts = {drones: jax.jit(env.reset)(key) for drones, env in places.items()}
-    look = base.sim.scene.depth_fn("fpv_cam", *size) if size else None
+    look = base.sim.scene.depth_fn("fpv_cam", size[0], size[1]) if size else None
     n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (size[0] * size[1] if size else 0)
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, place)

@@ -96,7 +96,10 @@ class RangeFinder(Plugin):
             n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
         scope = "batch" if n_movable > MAX_UNROLLED else "world" if self.drones or placed else "drone"
         period, scene = steps_between(self, sim), sim.scene
-        when = None if period == 1 else lambda data: data.core.steps % period == 0
+
+        def is_due(data: SimData) -> Array:
+            """Return which worlds measure after this step."""
+            return data.core.steps % period == 0
 
         def measure(data: SimData) -> SimData:
             """Measure distances, to loads where they are now."""
@@ -105,9 +108,10 @@ class RangeFinder(Plugin):
 
         def measure_at_times(data: SimData) -> SimData:
             """Measure in a call that is left out where no world measures."""
-            return jax.lax.cond(jnp.any(when(data)), measure, lambda data: data, data)
+            return jax.lax.cond(jnp.any(is_due(data)), measure, lambda data: data, data)
 
-        fn = measure if scope != "batch" or when is None else measure_at_times
+        fn = measure_at_times if scope == "batch" and period > 1 else measure
+        when = None if period == 1 else is_due
         return [Placement(Stage(fn, scope, when, name="range_finder"), before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -133,7 +137,7 @@ class RangeFinder(Plugin):
         n_drones, n_rays = direction.shape[-3:-1]
         origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
         own = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
-        rays = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
-        hits = cast(model, data, *rays, own, self.drones, kernels=kernels, limit=record.max_range)
-        distance = jnp.minimum(hits.distance, record.max_range).reshape(direction.shape[:-1])
+        origin, direction = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
+        hits = cast(model, data, origin, direction, own, self.drones, kernels=kernels, limit=record.max_range)
+        distance = jnp.minimum(hits.distance, record.max_range).reshape(*pos.shape[:-1], n_rays)
         return record.replace(distance=distance[0] if of_drone else distance)
