@@ -42,7 +42,7 @@ class Recipe:
 
 
 RECIPES: dict[str, Recipe] = {
-    "hover": Recipe(config={"iterations": 80}),
+    "hover": Recipe(config={"iterations": 80, "learning_rate": 2e-3}),
     "recover": Recipe(config={"iterations": 150}),
     "race": Recipe(
         n_worlds=2048,
