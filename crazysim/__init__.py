@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from crazysim.plugins.contacts.drone_collisions import DroneCollisions
     from crazysim.plugins.contacts.response import ContactResponse
     from crazysim.plugins.contacts.terrain import Terrain
+    from crazysim.plugins.estimators.eskf import ESKF
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
     from crazysim.plugins.payloads import Hook, RotorJet, SharedLoad, SlungLoad
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from crazysim.sim.mppi import MPPI
 
 __all__ = [
+    "ESKF",
     "IMU",
     "MPPI",
     "Airframe",
@@ -116,6 +118,7 @@ __getattr__ = lazy(
         "ContactResponse": "crazysim.plugins.contacts.response",
         "DroneCollisions": "crazysim.plugins.contacts.drone_collisions",
         "Follow": "crazysim.plugins.follow",
+        "ESKF": "crazysim.plugins.estimators.eskf",
         "FreeBodies": "crazysim.plugins.bodies",
         "Hook": "crazysim.plugins.payloads",
         "IMU": "crazysim.plugins.sensors.imu",

@@ -11,6 +11,7 @@ from typing import Any
 from crazysim.commands.options import DefaultsFormatter
 from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.identification import FITTED
+from crazysim.errors import ConfigError
 from crazysim.identify import (
     Columns,
     Model,
@@ -55,6 +56,8 @@ def run(options: argparse.Namespace) -> None:
     """Fit an airframe, print its errors, and write its file."""
     if options.out.suffix != ".toml" or not options.out.parent.is_dir() or options.out.exists():
         raise ValueError(f"expected a new .toml file in an existing folder, got {str(options.out)!r}")
+    if options.dynamics != "first_principles":
+        _check_fitted(options)
     columns = _columns(options.columns) if options.columns else None
     paths = [*options.logs, *options.test]
     if options.motion and len(options.motion) != len(paths):
@@ -100,6 +103,24 @@ def run(options: argparse.Namespace) -> None:
     text = result.toml(source)
     options.out.write_text(text, encoding="utf-8")
     print(f"wrote {options.out}")
+
+
+def _check_fitted(options: argparse.Namespace) -> None:
+    """Refuse options that only the fit of the first-principles model has."""
+    if options.test:
+        raise ConfigError(
+            f"expected no --test with --dynamics {options.dynamics}, whose errors are not computed. "
+            "Leave --test out, and compare flights of Sim(drone=..., dynamics=...) with the logs."
+        )
+    if options.plot:
+        raise ConfigError(
+            f"expected no --plot with --dynamics {options.dynamics}, whose errors are not computed. Leave --plot out."
+        )
+    if options.network is not None:
+        raise ConfigError(
+            f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
+            "Leave --network out, or use --dynamics first_principles with logs of rotor speeds."
+        )
 
 
 def _columns(texts: Sequence[str]) -> Columns:

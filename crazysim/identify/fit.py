@@ -274,7 +274,10 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
                 f"{log.name}: expected samples every {logs[0].dt:.4g} s as in the first log, got {log.dt:.4g}"
             )
         if log.rotor_vel.shape[1] != airframe.n_rotors:
-            raise ConfigError(f"{log.name}: expected {airframe.n_rotors} rotors, got {log.rotor_vel.shape[1]}")
+            raise ConfigError(
+                f"{log.name}: expected measured speeds of {airframe.n_rotors} rotors, got {log.rotor_vel.shape[1]}. "
+                "Name their columns as rotor_vel, or fit a model of attitude commands (--dynamics so_rpy)."
+            )
         ratio = float(np.median(log.rotor_vel)) / hover
         if not 0.4 < ratio < 2.5:
             raise ConfigError(

@@ -71,6 +71,16 @@ def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
     Sim(drone=out, dynamics=MODEL, control="attitude").step()
 
 
+@pytest.mark.parametrize("option", ["--test", "--plot", "--network"])
+def test_options_of_the_other_fit_are_refused(flight, tmp_path, capsys, option):
+    path, out = tmp_path / "flight.npz", tmp_path / "a.toml"
+    np.savez(path, **flight)
+    value = {"--test": str(path), "--plot": "errors.png", "--network": "0"}[option]
+    assert main(["identify", str(path), "--dynamics", MODEL, "--out", str(out), option, value]) != 0
+    assert f"Leave {option} out" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_logs_without_commands_and_other_models_are_refused(flight, tmp_path, capsys):
     path = tmp_path / "flight.npz"
     np.savez(path, **{key: x for key, x in flight.items() if not key.endswith("command")})

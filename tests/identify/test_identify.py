@@ -169,6 +169,12 @@ def test_wrong_units_are_refused(flights):
         identify([read_log(radians)])
 
 
+def test_logs_without_rotor_speeds_are_refused(flights):
+    log = read_log({k: x for k, x in flights[0].items() if not k.startswith("rpm")})
+    with pytest.raises(ConfigError, match=r"speeds of 4 rotors, got 0\. Name their columns"):
+        identify([log])
+
+
 def test_other_order_of_rotors_is_refused(flights):
     other = flights[0] | {"rpm1": flights[0]["rpm2"], "rpm2": flights[0]["rpm1"]}
     with pytest.raises(ConfigError, match=r"order \[2, 1, 3, 4\]"):
