@@ -92,6 +92,18 @@ def test_logs_without_commands_and_other_models_are_refused(flight, tmp_path, ca
         preprocessing({"time": flight["t"]})
 
 
+def test_outliers_are_interpolated_and_fast_turns_are_not():
+    """A circle of 1 m in 1 s, as in Crazyflow's tests of these functions."""
+    t = np.linspace(0, 1, 100)
+    pos = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), t], axis=-1)
+    data = {"time": t, "quat": np.tile([0.0, 0, 0, 1], (100, 1)), "cmd_rpy": np.zeros((100, 3)), "cmd_f": np.ones(100)}
+    np.testing.assert_array_equal(preprocessing(data | {"pos": pos})["pos"], pos)
+    spoiled = pos.copy()
+    spoiled[40:42] += 1.0
+    # Straight lines over three intervals of 10 ms at 40 m/s^2.
+    np.testing.assert_allclose(preprocessing(data | {"pos": spoiled})["pos"], pos, atol=40 * 0.03**2 / 8)
+
+
 def test_filter_keeps_slow_signals_and_their_derivatives():
     t = np.arange(0, 6, 0.01)
     found = state_variable_filter(np.sin(2 * t), t, f_c=6, N_deriv=2)

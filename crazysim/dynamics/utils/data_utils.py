@@ -14,7 +14,9 @@ from crazysim.errors import ConfigError
 LEVEL = 0.1
 """Duration at the start of a log over which its attitude is taken to be level, s."""
 OUTLIER = 0.3
-"""Distance from the median over a second beyond which a position is an outlier, m."""
+"""Distance from the median over ``NEAR`` beyond which a position is an outlier, m."""
+NEAR = 0.1
+"""Duration of that median, s: over longer ones fast turns look like outliers."""
 CUTOFFS = {"translation": 6.0, "rotation": 8.0}
 """Cutoffs of the filters of Crazyflow's identification, Hz."""
 
@@ -40,7 +42,7 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     if not np.all(np.diff(time) > 0):
         raise ConfigError("expected a time that increases, got repeated or earlier samples. Drop them first.")
     dt = np.diff(time)
-    half = max(1, round(0.5 / float(np.mean(dt))))
+    half = max(1, round(NEAR / 2 / float(np.mean(dt))))
     middle = np.stack([np.median(pos[max(0, k - half) : k + half + 1], axis=0) for k in range(len(time))])
     good = ~np.any(np.abs(pos - middle) > OUTLIER, axis=-1)
     if np.sum(good) < 2:
