@@ -75,7 +75,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     x, y = 1 / roll / inertia[0], 1 / pitch / inertia[1]
     z = (x * inertia[0] + y * inertia[1]) / (inertia[0] + inertia[1])
     inertia = inertia * [x, y, z]
-    values = np.array([x, y, z, drag * inertia[2], reaction * inertia[2]])
+    values = np.array([x, y, z, max(drag, 0.0) * inertia[2], max(reaction, 0.0) * inertia[2]])
     tilt = np.array(deviations[:2]) / [roll, pitch]
     turn = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
     spread = [*tilt * [x, y], turn * z, *inertia[2] * np.array(deviations[2:])]
