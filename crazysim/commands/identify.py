@@ -24,6 +24,7 @@ from crazysim.identify import (
     plot_errors,
     prediction_errors,
     read_log,
+    with_speeds,
 )
 
 
@@ -68,8 +69,10 @@ def run(options: argparse.Namespace) -> None:
     every = [
         read_log(*x) for x in zip(paths, [columns] * len(paths), options.motion or [None] * len(paths), strict=True)
     ]
-    logs, held_out = every[: len(options.logs)], every[len(options.logs) :]
-    for log in logs + held_out:
+    logs, base = every[: len(options.logs)], load_airframe(options.airframe)
+    if options.dynamics == "first_principles":
+        every = [with_speeds(log, base) for log in every]
+    for log in every:
         for repair in log.repairs:
             print(f"{log.name}: {repair}")
     source = f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {', '.join(log.name for log in logs)}"
@@ -83,10 +86,10 @@ def run(options: argparse.Namespace) -> None:
         print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
     if result.doubtful:
         print(f"doubtful, more than three times from the airframe: {', '.join(result.doubtful)}")
-    logs = [aligned(log, result.delays[log.name]) for log in logs]
-    held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
+    logs = [aligned(log, result.delays[log.name]) for log in every[: len(logs)]]
+    held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in every[len(logs) :]]
     models = {
-        options.airframe: Model.create(load_airframe(options.airframe), options.mass),
+        options.airframe: Model.create(base, options.mass),
         "identified": result.model,
     }
     if options.network is not None:

@@ -3,6 +3,7 @@
 from crazysim.identify.attitude import identify_attitude
 from crazysim.identify.fit import Identification, identify
 from crazysim.identify.logs import Columns, Log, read_log
+from crazysim.identify.motors import motor_lag, with_speeds
 from crazysim.identify.network import fit_residual
 from crazysim.identify.plots import plot_errors
 from crazysim.identify.prediction import Model, errors_table, prediction_errors
@@ -19,7 +20,9 @@ __all__ = [
     "fit_residual",
     "identify",
     "identify_attitude",
+    "motor_lag",
     "plot_errors",
     "prediction_errors",
     "read_log",
+    "with_speeds",
 ]

@@ -17,8 +17,9 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.errors import ConfigError
 from crazysim.identify.logs import Log
+from crazysim.identify.motors import motor_lag, with_speeds
 from crazysim.identify.prediction import Model, windows
-from crazysim.identify.rotation import BLOCK, aligned, fast_rotation
+from crazysim.identify.rotation import BLOCK, aligned, fast_rotation, median
 from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
 from crazysim.rotation import rotate, rotate_inverse
 
@@ -49,7 +50,8 @@ class Identification:
     model: Model
     """Model of that airframe, with its residual."""
     values: dict[str, float]
-    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``."""
+    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, of logs with
+    commands and measured speeds."""
     deviations: dict[str, float]
     """Standard deviations of the parameters, from the scatter between blocks or windows."""
     delays: dict[str, float]
@@ -80,7 +82,8 @@ class Identification:
         units = {
             "rigid_body.mass": "kg", "rigid_body.inertia": "kg m^2", "rotors.position": "m",
             "rotors.thrust_curve": "N, N/rpm, N/rpm^2", "rotors.torque_curve": "N m, N m/rpm, N m/rpm^2",
-            "rotors.inertia": "kg m^2", "drag.coefficients": "N s/m", "controller.thrust2torque": "m",
+            "rotors.inertia": "kg m^2", "rotors.lag": "1/s, 1/(s rpm), twice",
+            "drag.coefficients": "N s/m", "controller.thrust2torque": "m",
             "residual.linear": "N and N m per input", "residual.hidden": "1 per input", "residual.output": "N and N m",
         }  # fmt: skip
         lines = [f"base = {json.dumps(self.base)}", "", "[sources]", f"flights = {json.dumps(source)}"]
@@ -101,7 +104,7 @@ class Identification:
 
 
 def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: float | None = None) -> Identification:
-    """Fit the parameters of an airframe to logs with measured rotor speeds.
+    """Fit the parameters of an airframe to logs with rotor speeds, measured or from ``with_speeds``.
 
     Three linear regressions: of the changes of velocity over 0.5 s on thrust and drag, turned by the measured attitude;
     of fast rotation on the torques of the rotors (``fast_rotation``); and of the changes of angular velocity over
@@ -118,6 +121,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     base = load_airframe(airframe)
     if mass is not None and not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
+    measured, logs = logs, [with_speeds(log, base) for log in logs]
     _check(logs, base)
     windows(logs, DURATION, DURATION)
     if base.n_rotors <= 4:
@@ -134,7 +138,13 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         return dict(zip((*FORCES, *TORQUES, *FACTORS[1:]), map(float, numbers), strict=True))
 
     values = named(force, torque, fast.values)
+    deviations = named(force_spread, torque_spread, fast.deviations)
     changes = _changes(base, weight, values)
+    rates = motor_lag(measured)
+    if 2 * np.sum(np.isfinite(rates)) > rates.size:
+        rates = rates[np.isfinite(rates)]
+        values["motor lag"], deviations["motor lag"] = median(rates, np.ones(len(rates)))
+        changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
     try:
         identified = load_airframe(_nested(str(airframe), base.name, changes))
     except ConfigError as error:
@@ -144,7 +154,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         airframe=identified,
         model=Model.create(identified),
         values=values,
-        deviations=named(force_spread, torque_spread, fast.deviations),
+        deviations=deviations,
         delays=dict(zip([log.name for log in logs], fast.delays.tolist(), strict=True)),
         changes=changes,
     )
@@ -276,7 +286,8 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
         if log.rotor_vel.shape[1] != airframe.n_rotors:
             raise ConfigError(
                 f"{log.name}: expected measured speeds of {airframe.n_rotors} rotors, got {log.rotor_vel.shape[1]}. "
-                "Name their columns as rotor_vel, or fit a model of attitude commands (--dynamics so_rpy)."
+                "Name their columns as rotor_vel; or log commands, as shares of the voltage, and the voltage, for an "
+                "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy)."
             )
         ratio = float(np.median(log.rotor_vel)) / hover
         if not 0.4 < ratio < 2.5:

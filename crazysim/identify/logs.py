@@ -40,7 +40,7 @@ class Columns:
     rotor_vel: tuple[str, ...] = ("rpm1", "rpm2", "rpm3", "rpm4")
     """Rotor speeds in the order of the airframe's rotors."""
     command: tuple[str, ...] = ("command1", "command2", "command3", "command4")
-    """Commands of the rotors in any unit, in the order of the airframe's rotors."""
+    """Commands of the rotors in the order of the airframe's rotors, in any unit if their speeds were measured."""
     attitude_command: tuple[str, ...] = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
     """Commanded roll, pitch and yaw, rad, and collective thrust, N."""
     voltage: tuple[str, ...] = ("voltage",)
@@ -55,6 +55,8 @@ class Columns:
     """Factor from the commanded angles to rad."""
     newton_per_command: float = 1.0
     """Factor from the commanded collective thrust to N."""
+    share_per_command: float = 1.0
+    """Factor from the commands of the rotors to shares of the battery's voltage."""
 
 
 KNOWN = {
@@ -72,6 +74,7 @@ KNOWN = {
         rotor_vel=(),
         command=("motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4"),
         voltage=("pwr_pm_vbat",),
+        share_per_command=1 / 65535,
     ),
 }
 """Columns of known logs: the default names, IDSIA's benchmark (arXiv 2512.14450; motors of six pole pairs), and
@@ -163,7 +166,11 @@ def read_log(
         names = getattr(columns, key)
         if names and _plain(names[0]) in table:
             data[key] = _stacked(name, table, names)
-    for key, factor in (("rotor_vel", columns.rpm_per_unit), ("ang_vel", columns.rad_per_unit)):
+    for key, factor in (
+        ("rotor_vel", columns.rpm_per_unit),
+        ("ang_vel", columns.rad_per_unit),
+        ("command", columns.share_per_command),
+    ):
         if key in data:
             data[key] = data[key] * factor
     if "attitude_command" in data:

@@ -64,7 +64,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     found = np.concatenate(blocks)
     if not len(found):
         raise ConfigError(f"expected logs of over {YAW_SLOW + 1:g} s without gaps, got none. Use longer logs.")
-    medians = [_median(found[:, k], found[:, k + 5]) for k in range(4)]
+    medians = [median(found[:, k], found[:, k + 5]) for k in range(4)]
     (roll, pitch, drag, reaction), deviations = zip(*medians, strict=True)
     if not (roll > 0 and pitch > 0):
         raise ConfigError(
@@ -79,8 +79,8 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     tilt = np.array(deviations[:2]) / [roll, pitch]
     turn = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
     spread = [*tilt * [x, y], turn * z, *inertia[2] * np.array(deviations[2:])]
-    every = _median(found[:, 4], np.ones(len(found)))[0]
-    delays = [_median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
+    every = median(found[:, 4], np.ones(len(found)))[0]
+    delays = [median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
     return FastRotation(values, np.array(spread), np.array(delays))
 
 
@@ -94,7 +94,7 @@ def aligned(log: Log, delay: float) -> Log:
     return replace(log, rotor_vel=late(log.rotor_vel), command=command)
 
 
-def _median(x: NDArray, variance: NDArray) -> tuple[float, float]:
+def median(x: NDArray, variance: NDArray) -> tuple[float, float]:
     """Return the median, weighted by inverse variances, and its standard deviation from the scatter."""
     weight = 1 / np.maximum(variance, 0.25 * np.median(variance))  # so that no single block decides
 

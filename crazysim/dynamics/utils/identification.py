@@ -188,12 +188,12 @@ def _terms(
     return (np.stack(terms, axis=-1) / mass)[inner], (acc - np.asarray(gravity, np.float64))[inner]
 
 
-def lagged(x: NDArray, dt: float, rate: float) -> NDArray:
-    """Return a signal, linear between samples, behind a lag of first order that starts at rest. (n,)"""
+def lagged(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
+    """Return a signal, linear between samples, behind a lag of first order that starts at rest. (n, ...)"""
     decay = np.exp(-rate * dt)
     after = 1 - (1 - decay) / (rate * dt)  # weight of the later sample
     inputs = (1 - decay - after) * x[:-1] + after * x[1:]
-    out = np.empty_like(x)
+    out = np.empty((len(x), *inputs.shape[1:]))
     out[0] = x[0]
     for k, u in enumerate(inputs):
         out[k + 1] = decay * out[k] + u
