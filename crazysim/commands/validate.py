@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -13,10 +14,12 @@ from pathlib import Path
 
 import crazysim
 from crazysim.commands.options import DefaultsFormatter
-from crazysim.validate import closed_forms, flights, peers
+from crazysim.validate import closed_forms, firmware_controllers, firmware_filters, flights, peers
 from crazysim.validate.rows import Section, measure, page
 
-NAMES = ("closed", "mujoco", "crazyflow", "idsia", "nanobench", "raptor")
+NAMES = ("closed", "mujoco", "firmware", "crazyflow", "idsia", "nanobench", "raptor")
+PEERS = ("crazyflow", "foundation-policy")
+"""Other programs that are compared if they are installed, by their names for pip."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -56,11 +59,16 @@ def sections(data: Path | None) -> Sequence[Section]:
     """
     absent = "" if data else "give `--data FOLDER`"
     folder = data or Path()
+    recorded = "" if firmware_controllers.VECTORS.is_dir() else "run it in a checkout of the sources"
     return (
         Section("closed", "Closed forms and orders",
                 "In float64, at 500 Hz. Repeat: `crazysim validate --only closed`.", closed_forms.CHECKS),
         Section("mujoco", "C MuJoCo", "In float64, steps of 1 ms. Repeat: `crazysim validate --only mujoco`.",
                 (peers.of_mujoco,)),
+        Section("firmware", "The Crazyflie's firmware", "Recorded outputs of its compiled C sources, on the same "
+                "inputs, in float32; the recordings are in tests/control and tests/plugins/estimators. Figures "
+                "are the largest differences, of motors for 8 flights and a full scale of 65,535. Repeat: `crazysim validate --only firmware`.",
+                (firmware_controllers.of_controllers, firmware_filters.of_filters), absent=recorded),
         Section("crazyflow", "Crazyflow", "In float32, Crazyflow's controllers in both programs. Repeat: `crazysim "
                 "validate --only crazyflow`.", (peers.of_crazyflow,), "crazyflow", "crazyflow==0.4.0"),
         Section("idsia", "Real flights, open loop", "A Crazyflie 2.1 Brushless of 45 g: flight melon of IDSIA's "
@@ -86,7 +94,8 @@ def _made() -> str:
         commit = f", commit {done.stdout.strip()}" if done.returncode == 0 else ""
     except OSError:
         commit = ""
-    programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy"))
+    found = [name for name in ("jax", "mujoco", "numpy", *PEERS) if importlib.util.find_spec(name.replace("-", "_"))]
+    programs = ", ".join(f"{name} {version(name)}" for name in found)
     return (
         f"Made on {datetime.now(UTC):%Y-%m-%d} with crazysim {crazysim.__version__}{commit}, {programs}, Python "
         f"{platform.python_version()}, {platform.machine()}, on a CPU."

@@ -93,7 +93,9 @@ def page(sections: Sequence[Section], rows: dict[str, list[Row]], made: str) -> 
     parts = [
         "# Validation",
         "Comparisons of crazysim with closed forms, other simulators and real flights. "
-        "`crazysim validate` measures them and writes this page; rows with bad figures stay.",
+        "`crazysim validate --data FOLDER` measures them and writes this page; rows with bad figures stay. FOLDER has "
+        "logs of IDSIA's benchmark in `idsia/` and of NanoBench in `nanobench/`, as `.npz` files. Other programs are "
+        "compared where they are installed.",
         f"{made} {summary}",
         "A bound says what passes; where there is none, the row reports a figure. Each section says how to repeat it.",
     ]

@@ -1,9 +1,5 @@
 """The firmware's PID and Mellinger controllers, against the compiled firmware and against what they are for."""
 
-import dataclasses
-from pathlib import Path
-
-import firmware_flights as flown
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,43 +14,27 @@ from crazysim.control.power_distribution import PowerDistributionParams, distrib
 from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import curve
 from crazysim.errors import ConfigError
+from crazysim.validate import firmware_controllers as flown
 
 jitted = jax.jit(distribute, static_argnames="whole_numbers")
-# Torques in PWM amplify rounding: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree.
-FLOAT32_PWM = 3.0
-FILTERED = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
-CASES = {
-    "pid-state": (PID(hold_yaw=True), "state", "cf2x_L250"),
-    "pid-brushless": (PID(hold_yaw=True), "state", "cf21B_500"),
-    "pid-filters": (PID(hold_yaw=True), "state", FILTERED),
-    "pid-attitude": (PID(hold_yaw=True), "attitude", "cf2x_L250"),
-    "pid-rate": (PID(hold_yaw=True), "body_rate", "cf2x_L250"),
-    "mellinger": (Mellinger(), "state", "cf2x_L250"),
-    "m-attitude": (Mellinger(), "attitude", "cf2x_L250"),
-    "m-heavy": (Mellinger(), "state", "cf21B_500"),
-}
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", flown.CASES)
 def test_the_motors_are_those_of_the_firmware(name):
     """Those of the compiled C sources (docs/guides/controllers.md), whose integers differ by up to 5 PWM from reals.
 
     Roll, pitch, yaw and motor lose less than one each. Where all motors are lowered by the excess of the highest, the
     difference of two motors counts: twice two of the torques, and less than one.
     """
-    controller, mode, drone = CASES[name]
-    states, commands = (x.astype(np.float32) for x in flown.flights(mode, 8, 240, seed=11))
-    with np.load(Path(__file__).with_name("firmware_motors.npz")) as file:
-        expected = file[name].astype(float)
+    expected = flown.recorded(name)
     assert 0.05 < np.mean(expected == 0) < 0.5
     assert 0.05 < np.mean(expected == 65535) < 0.5
-    smooth = np.abs(flown.law(controller, mode, states, commands, drone) - expected)
-    assert smooth.max() < 5.0 + FLOAT32_PWM
+    smooth = flown.difference(name)
+    assert smooth.max() < flown.TRUNCATED + flown.FLOAT32
     assert np.mean(smooth < 4) > 0.998
-    whole = dataclasses.replace(controller, whole_numbers=True)
-    difference = np.abs(flown.law(whole, mode, states, commands, drone) - expected)
-    assert difference.max() < 4.0
-    assert np.mean(difference < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
+    whole = flown.difference(name, whole_numbers=True)
+    assert whole.max() < 1.0 + flown.FLOAT32
+    assert np.mean(whole < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
 
 
 @pytest.mark.usefixtures("x64")

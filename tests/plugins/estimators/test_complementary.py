@@ -1,7 +1,6 @@
 """The complementary filter: that of the compiled firmware, flown on, and honest about what it does not estimate."""
 
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,34 +10,13 @@ import pytest
 from crazysim import ConfigError, Sim, rotation
 from crazysim.plugins.estimators import Complementary, complementary
 from crazysim.plugins.sensors import IMU, Barometer, TimeOfFlight
-
-RECORDED = np.load(Path(__file__).with_name("firmware_complementary.npz"))
+from crazysim.validate import firmware_filters
 
 
 @pytest.mark.parametrize("kind", ["pressure", "ground"])
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
     """In 2 s of 1 ms: but for rounding of float32, in 500 updates of numbers around one."""
-    inputs, recorded = jnp.asarray(RECORDED[f"{kind}/inputs"]), RECORDED[f"{kind}/outputs"]
-
-    def tick(carry, x):
-        (quat, integral, climb, height, rate, over), (k, row) = carry, x
-        gyro, accel = jnp.radians(row[:3]), complementary.GRAVITY * row[3:6]
-        turned = complementary.mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
-        turned = *turned, complementary.inertial_climb(climb, turned[0], accel, 0.004)
-        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))
-        shift = 0.01 * climb
-        by_pressure = complementary.filtered_height(height, row[6:7], shift)
-        useful = row[8:] <= 1000 * complementary.OLDEST
-        risen, above = complementary.height_over_surface(height, by_pressure, row[7:8], useful, over, shift)
-        rises = k % 10 == 0
-        rate, over = jnp.where(rises, (risen - height) / 0.01, rate), jnp.where(rises, above, over)
-        height = jnp.where(rises, risen, height)
-        return (quat, integral, climb, height, rate, over), jnp.concatenate([quat, height, rate])
-
-    zero = jnp.zeros(1)
-    start = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), zero, inputs[0, 6:7], zero, zero
-    run = jax.jit(lambda start, x: jax.lax.scan(tick, start, (jnp.arange(len(x)), x))[1])
-    found = np.asarray(run(start, inputs))[19::20]
+    found, recorded = firmware_filters.complementary(kind)
     assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved: the run shows nothing"
     np.testing.assert_allclose(found[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
     np.testing.assert_allclose(found[:, 4], recorded[:, 4], rtol=0, atol=5e-6)

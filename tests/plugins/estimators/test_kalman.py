@@ -1,8 +1,5 @@
 """The Kalman filter: that of the compiled firmware, honest about its errors, and flown on."""
 
-import math
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,59 +12,15 @@ from crazysim.engine import Step
 from crazysim.envs import make
 from crazysim.plugins.estimators import Kalman, error_state
 from crazysim.plugins.sensors import IMU, UWB, Barometer, Lighthouse, MotionCapture, OpticalFlow, TimeOfFlight, Triad
+from crazysim.validate import firmware_filters
 
-RECORDED = np.load(Path(__file__).with_name("firmware_filter.npz"))
-KINDS = sorted({name.split("/")[0] for name in RECORDED.files})
-LEVEL = jnp.array([0.0, 0.0, 0.0, 1.0])
-ANCHORS = jnp.array([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
-STATION = jnp.array([-2.0, 1.0, 2.2]), jnp.asarray(RECORDED["sweep/frame"])
-DIODE = jnp.array([0.015, 0.0075, 0.0])
-NOISE = jnp.square(jnp.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4]))
+ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
 
 
-def measured(kind, k, m, gyro, estimate, rot):
-    """Return the estimate after the measurements of a loop, as ``record_filter.py`` takes them."""
-    find = error_state
-    if kind in ("position", "ground"):
-        return find.select(k % 10 == 5, find.update_pos(estimate, m[:3], 0.01), estimate)
-    if kind == "pose":
-        after = find.update_quat(find.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
-        return find.select(k % 10 == 0, after, estimate)
-    if kind == "flow":
-        after = find.update_flow(estimate, rot, 0.1 * m[:2], gyro, 0.01 * 35 / 0.71674, 0.2)
-        estimate = find.select(k % 10 == 3, after, estimate)
-        return find.select(k % 25 == 10, find.update_range(estimate, rot, m[2], 0.02), estimate)
-    if kind == "sweep":
-        estimate = find.select(k == 2, find.update_pos(estimate, m[:3], 0.01), estimate)
-        for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
-            after = find.update_sweep(estimate, rot, DIODE, STATION, tilt, m[0], 0.001)
-            estimate = find.select(k % 8 == first, after, estimate)
-        return estimate
-    a = m[1].astype(int)
-    if kind == "distance":
-        after = find.update_distance(estimate, ANCHORS[a], m[0], 0.25)
-    else:
-        after = find.update_difference(estimate, ANCHORS[a], ANCHORS[(a + 1) % 4], m[0], 0.15)
-    return find.select(k % 5 == 0, after, estimate)
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", firmware_filters.KINDS)
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
     """In 400 loops of 1 ms: but for rounding of float32, some 20 units in the last place of the largest numbers."""
-    inputs = jnp.asarray(RECORDED[f"{kind}/inputs"])
-
-    def loop(carry, x):
-        (estimate, rot), (k, row) = carry, x
-        accel, gyro, m = row[:3], row[3:6], row[6:]
-        predicted = error_state.predict(estimate, accel, gyro, 0.01, LEVEL if kind == "ground" else None)
-        estimate = error_state.add_noise(error_state.select(k % 10 == 0, predicted, estimate), NOISE)
-        estimate = error_state.finalize(measured(kind, k, m, gyro, estimate, rot))
-        state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
-        return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
-
-    start = error_state.start(jnp.array([0.3, -0.2, 1.0]), jnp.zeros(3), LEVEL, (100, 100, 1, *[0.01] * 6))
-    run = jax.jit(lambda start, x: jax.lax.scan(loop, (start, jnp.eye(3)), (jnp.arange(1, len(inputs) + 1), x))[1])
-    found, recorded = np.asarray(run(start, inputs))[19::20], RECORDED[f"{kind}/outputs"]
+    found, recorded = firmware_filters.kalman(kind)
     assert np.ptp(recorded[:, :3], axis=0).max() > 1e-3, "nothing moved: the run shows nothing"
     np.testing.assert_allclose(found[:, :9], recorded[:, :9], rtol=0, atol=2e-5)
     np.testing.assert_allclose(found[:, 9:13], recorded[:, 9:13], rtol=0, atol=2e-6)

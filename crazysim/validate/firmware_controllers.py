@@ -1,20 +1,79 @@
-"""Sequences of states and commands that drive the firmware's controllers into their limits, and our laws on them."""
+"""The firmware's controllers against recorded outputs of its compiled C sources."""
 
+from __future__ import annotations
+
+import dataclasses
 import functools
+from collections.abc import Iterable
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from numpy.typing import NDArray
 
+import crazysim
 from crazysim.control import Control, Setpoint
+from crazysim.control.mellinger import Mellinger
+from crazysim.control.pid import PID
+from crazysim.core.airframes import AirframeSource
 from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import curve
+from crazysim.validate.rows import Row
 
 RATE, POSITION_EVERY = 500, 5
+VECTORS = Path(crazysim.__file__).parents[1] / "tests"
+"""Folder with the recorded outputs; it exists in a checkout of the sources only."""
+FILTERED = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
+CASES: dict[str, tuple[Any, str, AirframeSource]] = {
+    "pid-state": (PID(hold_yaw=True), "state", "cf2x_L250"),
+    "pid-brushless": (PID(hold_yaw=True), "state", "cf21B_500"),
+    "pid-filters": (PID(hold_yaw=True), "state", FILTERED),
+    "pid-attitude": (PID(hold_yaw=True), "attitude", "cf2x_L250"),
+    "pid-rate": (PID(hold_yaw=True), "body_rate", "cf2x_L250"),
+    "mellinger": (Mellinger(), "state", "cf2x_L250"),
+    "m-attitude": (Mellinger(), "attitude", "cf2x_L250"),
+    "m-heavy": (Mellinger(), "state", "cf21B_500"),
+}
+"""Controller, command level and airframe, by name of the recording."""
+TRUNCATED = 5.0
+"""Most that the firmware's integers take from a motor, PWM: roll, pitch, yaw and motor lose less than one each, and
+where all motors are lowered by the excess of the highest, the difference of two motors counts."""
+FLOAT32 = 3.0
+"""Rounding, PWM: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
 
 
-def flights(mode, n, n_ticks, seed):
+def recorded(name: str) -> NDArray:
+    """Return the PWM of the motors by the compiled firmware. (n_ticks, n, 4)"""
+    with np.load(VECTORS / "control" / "firmware_motors.npz") as file:
+        return file[name].astype(float)
+
+
+def difference(name: str, whole_numbers: bool = False) -> NDArray:
+    """Return the differences from the compiled firmware in 8 flights of 240 ticks, PWM. (240, 8, 4)
+
+    Args:
+        name: Name of the recording.
+        whole_numbers: True to compute in integers where the firmware does.
+    """
+    controller, mode, drone = CASES[name]
+    states, commands = (x.astype(np.float32) for x in flights(mode, 8, 240, seed=11))
+    controller = dataclasses.replace(controller, whole_numbers=whole_numbers)
+    return np.abs(law(controller, mode, states, commands, drone) - recorded(name))
+
+
+def of_controllers() -> Iterable[Row]:
+    """Yield the largest differences of the motors from those of the compiled firmware."""
+    for name in CASES:
+        for whole, bound in ((False, TRUNCATED + FLOAT32), (True, 1.0 + FLOAT32)):
+            what = f"{name}, {'integers as the firmware' if whole else 'real numbers'}: motors"
+            yield Row(what, "compiled C, 240 ticks", float(difference(name, whole).max()), "PWM", (0, bound))
+
+
+def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArray]:
     """Return states (n_ticks, n, 13) and commands (n_ticks, n, k): from gentle to wild, across yaw +-180 degrees.
 
     A state is pos, vel, quat, ang_vel. Thrust is in PWM, and zero for a while in some flights. State commands change
@@ -23,7 +82,7 @@ def flights(mode, n, n_ticks, seed):
     rng = np.random.default_rng(seed)
     size = np.geomspace(0.02, 1.0, n)[:, None]  # the last flights turn upside down
 
-    def smooth(k, scale, period):
+    def smooth(k: int, scale: Any, period: float) -> NDArray:
         phase, slow = rng.uniform(0, 2 * np.pi, (3, n, k)), rng.uniform(0.3, 1.7, (3, n, k))
         t = np.arange(n_ticks)[:, None, None, None] / RATE
         return scale * np.sum(np.sin(2 * np.pi * t * slow / period + phase), axis=1) / 1.7
@@ -49,7 +108,7 @@ def flights(mode, n, n_ticks, seed):
     return states, commands
 
 
-def of_rpy(roll, pitch, yaw):
+def of_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
     """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), xyzw."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(np.array([roll, pitch, yaw]) / 2), np.sin(np.array([roll, pitch, yaw]) / 2)
     return (
@@ -60,35 +119,35 @@ def of_rpy(roll, pitch, yaw):
     )
 
 
-def law(controller, mode, states, commands, drone="cf2x_L250"):
+def law(controller: Any, mode: str, states: NDArray, commands: NDArray, drone: AirframeSource = "cf2x_L250") -> NDArray:
     """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
     return np.asarray(_compiled(controller, mode)(numbers_of(controller, drone), states, commands))
 
 
 @functools.cache
-def _compiled(controller, mode):
+def _compiled(controller: Any, mode: str) -> Any:
     return jax.jit(functools.partial(_flown, controller, mode))
 
 
-def numbers_of(controller, drone):
+def numbers_of(controller: Any, drone: AirframeSource) -> tuple:
     """Return parameters and memory of a controller for an airframe, N of full PWM, and the curve of the thrust."""
     airframe = load_airframe(drone)
     newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
     return controller.params(airframe), controller.memory(airframe), newton, airframe.value("rotors.thrust_curve")[None]
 
 
-def law_of(controller, mode, states, commands, drone="cf2x_L250"):
+def law_of(controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250") -> Array:
     """Return the same as ``law``, traceable."""
     return _flown(controller, mode, numbers_of(controller, drone), states, commands)
 
 
-def _flown(controller, mode, numbers, states, commands):
+def _flown(controller: Any, mode: str, numbers: tuple, states: Any, commands: Any) -> Array:
     params, rest, newton, thrust_curve = numbers
     rest = jax.tree.map(jnp.asarray, rest)
     if mode != "state":
         commands = commands * jnp.asarray([1, 1, 1, newton], commands.dtype)
 
-    def tick(memory, row):
+    def tick(memory: Any, row: tuple) -> tuple[Any, Array]:
         k, s, c = row
         controls = SimpleNamespace(mode=Control(mode), state=SimpleNamespace(cmd=c))
         states = SimpleNamespace(pos=s[:3], vel=s[3:6], quat=s[6:10], ang_vel=s[10:13])
@@ -101,7 +160,7 @@ def _flown(controller, mode, numbers, states, commands):
         thrust = jnp.where(rotor_vel > 0, curve(rotor_vel, thrust_curve), 0.0)
         return memory, 4 * thrust / newton
 
-    def fly(states, commands):
+    def fly(states: Array, commands: Array) -> Array:
         ticks = jnp.arange(len(states))
         return jax.lax.scan(tick, rest, (ticks, states, commands))[1]
 

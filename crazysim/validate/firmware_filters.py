@@ -1,0 +1,130 @@
+"""The firmware's filters against recorded outputs of its compiled C sources."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.plugins.estimators import complementary as law
+from crazysim.plugins.estimators import error_state
+from crazysim.validate.firmware_controllers import VECTORS
+from crazysim.validate.rows import Row
+
+FOLDER = VECTORS / "plugins" / "estimators"
+KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "sweep")
+"""Measurements of the recordings of the Kalman filter."""
+ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
+"""Positions of the anchors, m."""
+DIODE = np.array([0.015, 0.0075, 0.0], np.float32)
+NOISE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
+
+
+def measured(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, station: Any) -> Any:
+    """Return the estimate after the measurements of a loop, as tests/plugins/estimators/record_filter.py takes them."""
+    find = error_state
+    if kind in ("position", "ground"):
+        return find.select(k % 10 == 5, find.update_pos(estimate, m[:3], 0.01), estimate)
+    if kind == "pose":
+        after = find.update_quat(find.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
+        return find.select(k % 10 == 0, after, estimate)
+    if kind == "flow":
+        after = find.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
+        estimate = find.select(k % 10 == 3, after, estimate)
+        return find.select(k % 25 == 10, find.update_range(estimate, rot, m[2], 0.02), estimate)
+    if kind == "sweep":
+        estimate = find.select(k == 2, find.update_pos(estimate, m[:3], 0.01), estimate)
+        for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
+            after = find.update_sweep(estimate, rot, jnp.asarray(DIODE), station, tilt, m[0], 0.001)
+            estimate = find.select(k % 8 == first, after, estimate)
+        return estimate
+    anchors, a = jnp.asarray(ANCHORS), m[1].astype(int)
+    if kind == "distance":
+        after = find.update_distance(estimate, anchors[a], m[0], 0.25)
+    else:
+        after = find.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
+    return find.select(k % 5 == 0, after, estimate)
+
+
+def kalman(kind: str) -> tuple[NDArray, NDArray]:
+    """Return states and covariances of the Kalman filter in 400 loops of 1 ms, every 20, ours and the firmware's.
+
+    Args:
+        kind: One of ``KINDS``.
+
+    Returns:
+        Position, m, velocity, m/s, error of attitude, rad, quaternion wxyz, and covariance. (20, n)
+    """
+    level = jnp.array([0.0, 0.0, 0.0, 1.0])
+    with np.load(FOLDER / "firmware_filter.npz") as file:
+        inputs, recorded, frame = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"], file["sweep/frame"]
+    station = jnp.array([-2.0, 1.0, 2.2]), jnp.asarray(frame)
+
+    def loop(carry: Any, x: Any) -> tuple[Any, Array]:
+        (estimate, rot), (k, row) = carry, x
+        accel, gyro, m = row[:3], row[3:6], row[6:]
+        predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
+        estimate = error_state.add_noise(error_state.select(k % 10 == 0, predicted, estimate), jnp.asarray(NOISE))
+        estimate = error_state.finalize(measured(kind, k, m, gyro, estimate, rot, station))
+        state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
+        return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
+
+    start = error_state.start(jnp.array([0.3, -0.2, 1.0]), jnp.zeros(3), level, (100, 100, 1, *[0.01] * 6))
+    run = jax.jit(lambda start, x: jax.lax.scan(loop, (start, jnp.eye(3)), (jnp.arange(1, len(inputs) + 1), x))[1])
+    return np.asarray(run(start, inputs))[19::20], recorded
+
+
+def complementary(kind: str) -> tuple[NDArray, NDArray]:
+    """Return states of the complementary filter in 2 s of 1 ms, every 20 ms, ours and the firmware's.
+
+    Args:
+        kind: Source of the height: ``"pressure"`` or ``"ground"``.
+
+    Returns:
+        Quaternion xyzw, height, m, and climb rate, m/s. (100, 6)
+    """
+    with np.load(FOLDER / "firmware_complementary.npz") as file:
+        inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
+
+    def tick(carry: Any, x: Any) -> tuple[Any, Array]:
+        (quat, integral, climb, height, rate, over), (k, row) = carry, x
+        gyro, accel = jnp.radians(row[:3]), law.GRAVITY * row[3:6]
+        turned = law.mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
+        turned = *turned, law.inertial_climb(climb, turned[0], accel, 0.004)
+        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))
+        shift = 0.01 * climb
+        by_pressure = law.filtered_height(height, row[6:7], shift)
+        useful = row[8:] <= 1000 * law.OLDEST
+        risen, above = law.height_over_surface(height, by_pressure, row[7:8], useful, over, shift)
+        rises = k % 10 == 0
+        rate, over = jnp.where(rises, (risen - height) / 0.01, rate), jnp.where(rises, above, over)
+        height = jnp.where(rises, risen, height)
+        return (quat, integral, climb, height, rate, over), jnp.concatenate([quat, height, rate])
+
+    zero = jnp.zeros(1)
+    start = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), zero, inputs[0, 6:7], zero, zero
+    run = jax.jit(lambda start, x: jax.lax.scan(tick, start, (jnp.arange(len(x)), x))[1])
+    return np.asarray(run(start, inputs))[19::20], recorded
+
+
+def of_filters() -> Iterable[Row]:
+    """Yield the largest differences of states from those of the compiled firmware."""
+    for kind in KINDS:
+        found, recorded = kalman(kind)
+        difference = np.abs(found - recorded)
+        # some 20 units in the last place of the largest numbers
+        yield Row(f"Kalman filter, {kind}: position, velocity, attitude error", "compiled C, 400 loops",
+                  float(difference[:, :9].max()), "m, m/s, rad", (0, 2e-5))  # fmt: skip
+        yield Row(f"Kalman filter, {kind}: quaternion", "compiled C, 400 loops",
+                  float(difference[:, 9:13].max()), "", (0, 2e-6))  # fmt: skip
+    for kind in ("pressure", "ground"):
+        found, recorded = complementary(kind)
+        yield Row(f"complementary filter, {kind}: quaternion and height", "compiled C, 2 s",
+                  float(np.abs(found - recorded)[:, :5].max()), "and m", (0, 5e-6))  # fmt: skip
