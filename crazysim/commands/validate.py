@@ -67,7 +67,8 @@ def sections(data: Path | None) -> Sequence[Section]:
                 (peers.of_mujoco,)),
         Section("firmware", "The Crazyflie's firmware", "Recorded outputs of its compiled C sources, on the same "
                 "inputs, in float32; the recordings are in tests/control and tests/plugins/estimators. Figures "
-                "are the largest differences, of motors for 8 flights and a full scale of 65,535. Repeat: `crazysim validate --only firmware`.",
+                "are the largest differences, of motors for 8 flights and a full scale of 65,535. Repeat: `crazysim "
+                "validate --only firmware`.",
                 (firmware_controllers.of_controllers, firmware_filters.of_filters), absent=recorded),
         Section("crazyflow", "Crazyflow", "In float32, Crazyflow's controllers in both programs. Repeat: `crazysim "
                 "validate --only crazyflow`.", (peers.of_crazyflow,), "crazyflow", "crazyflow==0.4.0"),

@@ -90,7 +90,7 @@ def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArra
     pos, vel = smooth(3, 2 * size, 1.0), smooth(3, 3 * size, 0.7)
     # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
     tilt, yaw = smooth(2, 1.2 * size, 0.5) * [1.0, 0.5], 3.0 + smooth(1, 2.0, 0.9)
-    quat = np.array([[of_rpy(*tilt[i, j], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)])
+    quat = np.array([[of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)])
     ang_vel = smooth(3, 10 * size, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
