@@ -18,6 +18,8 @@ from crazysim.identify.logs import REPAIRABLE, Log
 
 SMOOTH = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
+GROUND = 1.0
+"""Duration after the rotors first carry the drone, and before they last do, that is left out, s."""
 SLOWEST, FASTEST = 2.0, 200.0
 """Rates between which the lag of motors is sought, 1/s."""
 LATEST = 0.04
@@ -31,7 +33,8 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays that. Motors and propellers differ by some
     percent, which would be a torque larger than that of most manoeuvres: each rotor's thrusts are scaled so that all
     rotors pull equally on average over the flight. So these logs show no centre of mass and no constant torque.
-    ``identify`` calls this itself, and estimates the lag of motors from measured speeds only: give it logs as read.
+    What precedes take-off and follows landing is left out. ``identify`` calls this itself, and estimates the lag of
+    motors from measured speeds only: give it logs as read.
 
     Args:
         log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.
@@ -63,7 +66,13 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     if not np.all(good):
         repairs.append(f"interpolated {np.sum(~good)} commands that were not from 0 to 1")
     speeds = _behind(wanted, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
-    return replace(log, command=command, rotor_vel=speeds, repairs=tuple(repairs))
+    flying, margin = np.flatnonzero(total > 0.75 * np.median(total)), round(GROUND / log.dt)
+    air = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
+    repairs.append(f"left out {air.start} samples at the start and {len(log.t) - air.stop} at the end, near the ground")
+    data = {key: x[air] for key, x in vars(log).items() if isinstance(x, np.ndarray) and key != "gaps"}
+    data |= {"command": command[air], "rotor_vel": speeds[air]}
+    gaps = log.gaps[(log.gaps > air.start) & (log.gaps < air.stop)] - air.start
+    return replace(log, **data, gaps=gaps, repairs=tuple(repairs))
 
 
 def _behind(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
