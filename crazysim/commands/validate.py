@@ -14,10 +14,10 @@ from pathlib import Path
 
 import crazysim
 from crazysim.commands.options import DefaultsFormatter
-from crazysim.validate import closed_forms, firmware_controllers, firmware_filters, flights, peers
+from crazysim.validate import closed_forms, firmware_controllers, firmware_filters, flights, logged_filter, peers
 from crazysim.validate.rows import Section, measure, page
 
-NAMES = ("closed", "mujoco", "firmware", "crazyflow", "idsia", "nanobench", "raptor")
+NAMES = ("closed", "mujoco", "firmware", "crazyflow", "idsia", "nanobench", "filter", "raptor")
 PEERS = ("crazyflow", "foundation-policy")
 """Other programs that are compared if they are installed, by their names for pip."""
 
@@ -80,6 +80,12 @@ def sections(data: Path | None) -> Sequence[Section]:
                 "simulated drone `cf2x_L250` follows the logged setpoints with the firmware's controller and filter. "
                 "The figure is its RMS distance from the setpoint over the real drone's. Repeat: `crazysim validate "
                 "--only nanobench --data FOLDER`.", (partial(flights.closed_loop, folder / "nanobench"),),
+                absent=absent),
+        Section("filter", "Real flights, the filter", "The firmware's Kalman filter on the logged "
+                "accelerometer, gyroscope and motion capture of NanoBench. The figure is its RMS error against motion "
+                "capture over that of the filter on board. Flights more than 2 m from their setpoint are left out. "
+                "Repeat: `crazysim validate --only filter --data FOLDER`.",
+                (partial(logged_filter.of_filter, folder / "nanobench"),),
                 absent=absent),
         Section("raptor", "The foundation policy RAPTOR", "`foundation-policy` 1.0.2, unchanged, commands rotors at "
                 "100 Hz. A drone is held if it stays within 0.3 m of its goal from 9 to 10 s. Repeat: `crazysim "

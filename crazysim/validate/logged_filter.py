@@ -1,0 +1,100 @@
+"""The firmware's filter on logged measurements, beside the filter that ran on board."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.errors import ConfigError
+from crazysim.plugins.estimators import error_state
+from crazysim.validate.closed_loop import LOST
+from crazysim.validate.flights import logs
+from crazysim.validate.rows import Row
+
+PERIOD, LOOPS = 0.01, 10
+"""Time between samples of a log, s, and the firmware's loops in it, each of which adds process noise."""
+PROCESS = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
+"""Deviations of the noise of a loop of 1 ms, m, m/s, rad: (0.5, 0.5, 1) m/s^2 and 0.1 rad/s of the firmware."""
+POS_DEVIATION, QUAT_DEVIATION = 0.01, 0.02
+"""Deviations of motion capture that the filter assumes: the firmware's of positions, m, and of attitudes, rad."""
+SETTLED = 2.0
+"""Time from the first setpoint, s, after which estimates are compared."""
+
+
+def read(path: Path) -> dict[str, NDArray]:
+    """Return a log of NanoBench from its first setpoint to its last: ``accel``, m/s^2, ``gyro``, rad/s, ``pos`` and
+    ``quat`` of motion capture, ``est_pos`` and ``est_quat`` of the filter on board, and ``goal``, m. (n, k)
+
+    Raises:
+        ConfigError: If a column is missing.
+    """
+    names = {
+        "accel": [f"imu_acc_{k}" for k in "xyz"],
+        "gyro": [f"imu_gyro_{k}" for k in "xyz"],
+        "pos": [f"p{k}" for k in "xyz"],
+        "quat": [f"q{k}" for k in "xyzw"],
+        "est_pos": [f"est_stateEstimate_{k}" for k in "xyz"],
+        "est_quat": [f"att_stateEstimate_q{k}" for k in "xyzw"],
+        "goal": [f"sp_ctrltarget_{k}" for k in "xyz"],
+    }
+    with np.load(path, allow_pickle=False) as file:
+        if missing := [k for columns in names.values() for k in columns if k not in file.files]:
+            raise ConfigError(f"{path.name}: expected a log of NanoBench, got no {', '.join(missing)}")
+        log = {k: np.stack([file[c] for c in columns], axis=-1).astype(np.float32) for k, columns in names.items()}
+    commanded = np.flatnonzero(log["goal"][:, 2] > 0)
+    log = {k: x[commanded[0] : commanded[-1]] for k, x in log.items()}
+    return log | {"accel": np.float32(error_state.GRAVITY) * log["accel"]}
+
+
+@jax.jit
+def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, Array]:
+    """Return positions, m, (n, 3), and attitudes, xyzw, (n, 4), of the filter on measurements at 100 Hz.
+
+    Args:
+        accel: Specific force, body frame, m/s^2. (n, 3)
+        gyro: Angular velocity, body frame, rad/s. (n, 3)
+        pos: Measured position, world frame, m. (n, 3)
+        quat: Measured attitude, body to world, xyzw. (n, 4)
+    """
+    noise = jnp.asarray(LOOPS * PROCESS**2, accel.dtype)
+
+    def tick(estimate: error_state.Estimate, x: Any) -> tuple[Any, Any]:
+        force, rate, where, attitude = x
+        estimate = error_state.add_noise(error_state.predict(estimate, force, rate, PERIOD), noise)
+        estimate = error_state.update_pos(estimate, where, POS_DEVIATION)
+        estimate = error_state.finalize(error_state.update_quat(estimate, attitude, QUAT_DEVIATION))
+        return estimate, (estimate.pos, estimate.quat)
+
+    start = error_state.start(pos[0], jnp.zeros(3), quat[0], (100, 100, 1, *[0.01] * 6))
+    return jax.lax.scan(tick, start, (accel, gyro, pos, quat))[1]
+
+
+def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float, float]:
+    """Return the RMS differences of estimates from motion capture, of position, m, and of attitude, degrees."""
+    after = round(SETTLED / PERIOD)
+    turn = np.asarray(rotation.multiply(rotation.conjugate(jnp.asarray(log["quat"])), jnp.asarray(quat)))[after:]
+    angle = 2 * np.arctan2(np.linalg.norm(turn[:, :3], axis=-1), np.abs(turn[:, 3]))
+    distance = np.linalg.norm(pos - log["pos"], axis=-1)[after:]
+    return float(np.sqrt(np.mean(distance**2))), float(np.degrees(np.sqrt(np.mean(angle**2))))
+
+
+def of_filter(folder: Path) -> Iterable[Row]:
+    """Yield errors of the filter over those of the filter on board, flight by flight, without crashed flights."""
+    for path in logs(folder, "*.npz"):
+        log = read(path)
+        if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > LOST:
+            continue
+        found = replay(log["accel"], log["gyro"], log["pos"], log["quat"])
+        ours = errors(log, *(np.asarray(x) for x in found))
+        board = errors(log, log["est_pos"], log["est_quat"])
+        for what, unit, one, other in zip(("position", "attitude"), ("m", "degrees"), ours, board, strict=True):
+            yield Row(f"{path.stem}: {what}", "filter on board", one / other, "", (0, 1.1),
+                      f"on board {other:.3g} {unit}, here {one:.3g} {unit}")  # fmt: skip
