@@ -15,9 +15,9 @@ def write(path, away=0.0, n=600):
     still |= {f"imu_gyro_{k}": np.zeros(n) for k in "xyz"} | {f"q{k}": np.zeros(n) for k in "xyz"}
     still |= {
         f"att_stateEstimate_q{k}": np.full(n, v)
-        for k, v in zip("xyzw", (0, 0, np.sin(np.radians(5)), np.cos(np.radians(5))), strict=False)
+        for k, v in zip("xyzw", (0, 0, np.sin(np.radians(5)), np.cos(np.radians(5))), strict=True)
     }
-    still |= {f"p{k}": v + 0.001 * RNG.normal(size=n) for k, v in zip("xyz", (0.0, 0.0, 1.0), strict=False)}
+    still |= {f"p{k}": v + 0.001 * RNG.normal(size=n) for k, v in zip("xyz", (0.0, 0.0, 1.0), strict=True)}
     still |= {f"est_stateEstimate_{k}": still[f"p{k}"] + (0.03 if k == "x" else 0.0) for k in "xyz"}
     still |= {"qw": np.ones(n), "imu_acc_z": np.ones(n), "sp_ctrltarget_z": np.ones(n) + away}
     np.savez(path, **still)
