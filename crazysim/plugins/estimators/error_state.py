@@ -68,7 +68,7 @@ class Estimate(PyTree):
 
 
 def covariance(upper: Array) -> Array:
-    """Return a covariance from its upper triangle. (..., n, n)"""
+    """Return the covariance, (..., n, n), from its upper triangle, row by row. (..., n (n + 1) / 2)"""
     n = _n_errors(upper)
     # Unsigned: to signed indices JAX 0.10 adds sizes of the precision in which it indexed first, float32 or float64.
     place = np.zeros((n, n), np.uint32)
@@ -90,7 +90,8 @@ def start(
         pos: Position, world frame, m. (3,)
         vel: Velocity, body frame, m/s. (3,)
         quat: Attitude, body to world, unit, xyzw. (4,)
-        deviations: Standard deviations of the errors, m, m/s, rad, and of biases, m/s^2, rad/s. (n,)
+        deviations: Standard deviations of the errors of position, velocity and attitude, m, m/s, rad, then of the
+            biases, m/s^2, rad/s. (9,) or (15,)
         accel_bias: Bias of the accelerometer, body frame, m/s^2; None to estimate none. (3,)
         gyro_bias: Bias of the gyroscope, body frame, rad/s; None to estimate none. (3,)
     """
@@ -150,11 +151,13 @@ def predict_biased(
     """Return the estimate with biases after an interval, with the noise of the inertial sensors.
 
     Position and velocity move with the mean specific force, turned by half of the rotation in the interval; the errors
-    are those of Solà (2017), section 5.4.3, with the velocity turned into the body frame: with a turn E, attitude R and
-    gravity g after the interval, force f, turn M of half the interval, and errors a of accelerometer and w of gyroscope
+    are those of Solà (2017), section 5.4.3, with the velocity turned into the body frame. R and v are attitude and
+    velocity before the interval, R' and v' after it, M is the rotation in its first half, E = R'^T R, g gravity in the
+    world frame, a and w are the errors of accelerometer and gyroscope, and [ ]x is the matrix of a cross product:
 
+        d_pos' = d_pos + dt R d_vel - dt R [v]x d_att
+        d_vel' = E d_vel + dt [R'^T g]x E d_att - dt [v']x w - dt E M a
         d_att' = E d_att - dt w
-        d_vel' = E d_vel + dt [R^T g]x E d_att - dt [v']x w - dt E M a
 
     Args:
         estimate: The estimate.
@@ -195,7 +198,7 @@ def predict_biased(
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
-    """Return the estimate with process noise: variances of the errors. (n,)"""
+    """Return the estimate with process noise, given as variances that are added to those of the errors. (n,)"""
     return estimate.replace(cov=_bounded(covariance(estimate.cov) + jnp.diag(variances)))
 
 
@@ -204,10 +207,10 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
 
     Args:
         estimate: The estimate.
-        rows: Errors that the measurement depends on.
+        rows: Indices of the errors that the measurement depends on, such as ``POS``.
         h: Its derivatives with respect to them. (len(rows),)
-        error: The measurement minus what the estimate predicts. ()
-        deviation: Standard deviation of the measurement.
+        error: The measurement minus its prediction by the estimate, in the unit of the measurement. ()
+        deviation: Standard deviation of the measurement, in the same unit. ()
     """
     p, rows = covariance(estimate.cov), list(rows)
     n = p.shape[0]
@@ -243,7 +246,7 @@ def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Esti
 
 
 def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured velocity, world frame, m/s, (3,), of a deviation, m/s. () or (3,)"""
+    """Return the estimate after a measured velocity, world frame, m/s, (3,), of a standard deviation. () or (3,)"""
     rot = rotation.matrix(estimate.quat)
     for k, std in enumerate(_each(deviation)):
         across = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
@@ -270,9 +273,9 @@ def update_direction(estimate: Estimate, direction: Array, known: Array, deviati
 
 
 def update_quat(estimate: Estimate, quat: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured attitude, body to world, unit, xyzw, (4,), of a deviation, rad.
+    """Return the estimate after a measured attitude, body to world, unit, xyzw, (4,).
 
-    The deviation is () or (3,).
+    Its standard deviation about each axis is in rad. () or (3,)
     """
     residual = rotation.multiply(rotation.conjugate(estimate.quat), quat)
     error = 2 * residual[:3] / residual[3]
@@ -400,7 +403,7 @@ def finalize(estimate: Estimate, least: float = SMALL_ANGLE) -> Estimate:
 
 
 def within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
-    """Return whether all coordinates, m, and velocities, m/s, are within bounds, by default the firmware's. ()"""
+    """Return True where all coordinates, m, and velocities, m/s, are within bounds, by default the firmware's. ()"""
     return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 

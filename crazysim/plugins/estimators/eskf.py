@@ -34,11 +34,11 @@ from crazysim.pytree import PyTree, leaf, on_device
 
 START = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad. Assumptions; the start is the truth."""
-ANEW = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
-"""The same where a filter that diverged begins again. Assumptions: some are the upper bound of a covariance."""
+RESTART = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
+"""The same where a filter that diverged begins again. Assumptions: 10 is the root of ``error_state.MAX_COVARIANCE``."""
 LEAST = 1e-3
-"""Least standard deviation assumed for a measurement, in m, m/s, rad, pixels, or of the field that a magnetometer
-measures; 0.1 Pa for pressures. An assumption, for sensors without noise and the rounding of float32."""
+"""Least standard deviation assumed for a measurement, in m, m/s, rad or pixels, and as a share of the field for a
+magnetometer; 100 times as much, 0.1 Pa, for pressures. An assumption for sensors without noise, and for float32."""
 
 
 class ESKFData(PyTree):
@@ -49,8 +49,8 @@ class ESKFData(PyTree):
     accel: Array = leaf("drone", 1, (3,))
     """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
     gyro: Array = leaf("drone", 1, (3,))
-    """Sum of the angular velocities since the last prediction, with half of that before, body frame, rad/s.
-    (n_worlds, n_drones, 3)"""
+    """Sum of the angular velocities since the last prediction and of half of the one at it, for the trapezoidal rule,
+    body frame, rad/s. (n_worlds, n_drones, 3)"""
     used: Array = leaf("drone", 1)
     """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
@@ -62,9 +62,9 @@ class ESKF(Estimator):
 
     The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
     velocity in the body frame. Its noise is that of the records of its sensors, so it has no gains to tune: densities,
-    random walk and spread of the biases of the ``IMU``, and the noise of the others. Errors that wander or stay the
-    same count as new in every measurement. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``,
-    ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, all as if at the centre of mass.
+    random walk and spread of the biases of the ``IMU``, and the noise of the others. Their errors that wander or are
+    constant are treated as white noise. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``,
+    ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, and assumes that they are at the centre of mass.
     """
 
     _: dataclasses.KW_ONLY
@@ -174,12 +174,12 @@ class ESKF(Estimator):
         estimate = record.estimate
         valid = error_state.within_bounds(estimate, self.max_pos, self.max_vel)
         zero, level = jnp.zeros_like(estimate.pos), jnp.zeros_like(estimate.quat).at[3].set(1.0)
-        estimate = error_state.select(valid, estimate, self._started(data, zero, zero, level, ANEW))
+        estimate = error_state.select(valid, estimate, self._started(data, zero, zero, level, RESTART))
         return self.write(data, record.replace(estimate=estimate, failures=record.failures + jnp.where(valid, 0, 1)))
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:
-    """Return the variance by which the bias of a sensor changes in an interval; the wandering part walks, too. (3,)"""
+    """Return the variance of the change of a bias in an interval, with the wandering part as a random walk. (3,)"""
     return dt * (triad.random_walk**2 + 2 * triad.instability**2 / triad.correlation_time)
 
 
@@ -188,7 +188,7 @@ def _finalized(estimate: Estimate) -> Estimate:
 
 
 def _size(*deviations: Array | float, least: float = LEAST) -> Array:
-    """Return the standard deviation of a sum of independent errors, not below ``LEAST``. (...)"""
+    """Return the standard deviation of a sum of independent errors, at least ``least``. (...)"""
     return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(least * least)))
 
 
@@ -246,4 +246,4 @@ UPDATES: dict[type, Callable[..., Estimate]] = {
     ),
     Lighthouse: _firmware(lambda record: {"sweep": _size(record.noise[0])}),
 }
-"""Functions that use the measurements of each kind of sensor."""
+"""Functions that update an estimate with a measurement, by the class of the sensor."""
