@@ -1,4 +1,4 @@
-"""Kernels of the derivatives of a program: tangents, which go ahead with the steps, and cotangents, which go back."""
+"""Kernels of the derivatives of a program: tangents, computed with the steps, and cotangents, computed backward."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class DerivativeKernels:
     """Kernels of the derivatives of one program, each compiled when it is first used."""
 
     def __init__(self, program: Program, location: Location, on_lanes: Run):
-        """Compile nothing yet.
+        """Prepare the kernels, without compiling any.
 
         Args:
             program: The program.
             location: Devices that it is planned for.
-            on_lanes: The program on lanes, for what has no kernel.
+            on_lanes: The program on lanes, for derivatives without a kernel.
         """
         self.program, self.location, self.on_lanes = program, location, on_lanes
         self.used: dict[str, None] = {}
@@ -49,11 +49,11 @@ class DerivativeKernels:
         self._launches: dict[Any, Launch | None] = {}
 
     def is_own(self, leaf: int) -> bool:
-        """Return True if each drone or world has numbers of its own of a leaf."""
+        """Return True for a leaf of which each drone or world has its own numbers."""
         return self.program.leaves[leaf].scope in ("drone", "world")
 
     def forward(self, changing: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
-        """Return the kernel that takes the tangents of some leaves along; None where there is none.
+        """Return the kernel of the steps and the tangents of some leaves; None where there is none.
 
         It takes all leaves, tangents by leaf, the number of steps, the number of batches, and shapes and types of the
         tangents after the steps, which it returns.

@@ -66,7 +66,7 @@ def differentiable(run: CountedRun, on_lanes: Run, kernels: DerivativeKernels) -
 
 
 def _float0(x: Any) -> np.ndarray:
-    """Return the tangent of an array that has none."""
+    """Return the tangent of an array that is not of floats."""
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
@@ -74,8 +74,8 @@ class Case(NamedTuple):
     """Derivative of a program: static parameters of the primitives.
 
     The operands are the leaves that are given, then the tangents of ``changing``, or the cotangents of the floats that
-    are written. Under ``vmap`` several batches of worlds follow each other in what each drone or world has of its own;
-    tangents and cotangents of other leaves have an axis for them in front. (size, ...)
+    are written. Under ``vmap`` arrays of drones or worlds hold ``size`` batches of worlds, one after another; tangents
+    and cotangents of shared leaves have a leading axis for the batches. (size, ...)
     """
 
     kernels: DerivativeKernels
@@ -105,7 +105,7 @@ class Case(NamedTuple):
 
     def over_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear: Sequence[int],
                      results: Sequence[int]) -> list[Array]:  # fmt: skip
-        """Return what a function of the leaves and of the linear operands of one batch gives for all batches."""
+        """Return the results for all batches of a function of the leaves and the linear operands of one batch."""
         fixed, own = self.is_own(self.present), self.is_own(linear)
 
         def split(x: Any) -> Any:

@@ -11,6 +11,7 @@ from crazysim.engine.backends.exchange import lanes_of_block
 from crazysim.engine.ir.blocks import Block
 
 UNBOUNDED = "1 /* blocks at least */"
+"""Text in a kernel for a GPU that ``Kernel.with_blocks`` replaces by a number of blocks."""
 
 BLOCK = 64
 """Threads of a block on a GPU."""
@@ -25,7 +26,7 @@ class Kernel:
     inputs: tuple[int, ...]
     """Leaves that it reads."""
     outputs: tuple[int, ...]
-    """Leaves that it writes; behind them comes one bool per drone, whether its world is flagged, if that is checked."""
+    """Leaves that it writes; if worlds are checked, a bool per drone follows: True where its world is flagged."""
     in_place: tuple[int, ...] = ()
     """Leaves of rows that it updates in place: input and output of each must be the same memory."""
     threads: int = BLOCK
@@ -33,8 +34,8 @@ class Kernel:
     lanes: int = BLOCK
     """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
     kept: int = 0
-    """Memory of the numbers of a lane that it keeps for each step of an interval, bytes; 0 for a kernel that only goes
-    ahead. The other takes the number of steps of an interval behind that of all steps."""
+    """Memory that a lane keeps for each step of an interval, bytes; 0 for a kernel that only goes forward. One that
+    goes back takes the number of steps of an interval after the number of all steps."""
 
     def aliases(self) -> dict[int, int]:
         """Return the result that each operand in place is, by number; two numbers precede the operands."""
@@ -46,14 +47,15 @@ class Kernel:
 
 
 def interval(n_steps: int, size: int, memory: int) -> int:
-    """Return how many steps a gradient goes back at once: all, if there is memory for what they begin with.
+    """Return how many steps a gradient goes back at once: all, if there is memory for what each begins with.
 
-    Otherwise it is the root of their number, which takes the least memory, as it also keeps what intervals begin with.
+    Otherwise it is the square root of their number: intervals keep their first numbers too, and this takes the least
+    memory.
 
     Args:
         n_steps: Number of steps.
-        size: Memory of what a step begins with, bytes.
-        memory: Memory that there is, bytes.
+        size: Memory of the numbers that a step begins with, bytes.
+        memory: Available memory, bytes.
     """
     return max(n_steps, 1) if n_steps * size <= memory else math.isqrt(n_steps - 1) + 1
 
@@ -101,7 +103,7 @@ def framed(
         in_place: Leaves that it updates in place.
         group: Drones of a world that read each other's numbers.
         in_memory: True where the numbers of a world are in memory, on the host.
-        kept: Numbers of a lane that it keeps for each step of an interval; None for a kernel that only goes ahead.
+        kept: Numbers that a lane keeps for each step of an interval; None for a kernel that only goes forward.
     """
     threads, lanes = lanes_of_block(group)
     lines, own = "\n".join(shared), "\n".join(code)
@@ -126,8 +128,9 @@ def _n_operations(block: Block) -> int:
 
 
 def _cuda(pointers: Sequence[str], shared: str, body: str, threads: int, lanes: int, keeps: bool) -> str:
-    """Return the kernel of a thread: it computes what all share once, and the rest for its lane, or where it keeps
-    numbers for one lane after the other, as there is memory for a part of them at once.
+    """Return the kernel of a thread: it computes the numbers that all lanes share once, and the rest for its lane.
+
+    A thread that keeps numbers of steps goes through several lanes, one after the other, to bound the memory.
     """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])
@@ -152,7 +155,7 @@ extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({ar
 
 
 def _host(pointers: Sequence[str], shared: str, body: str, in_memory: bool, keeps: bool) -> str:
-    """Return the function of a range of lanes: it computes what all share once, and the rest for each block of them."""
+    """Return the function of a range of lanes: shared numbers are computed once, the rest per block of lanes."""
     n_in = sum(p.startswith("const") for p in pointers)
     buffers = [f"in[{k}]" if k < n_in else f"out[{k - n_in}]" for k in range(len(pointers))]
     defined = []

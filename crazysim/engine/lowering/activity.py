@@ -1,4 +1,4 @@
-"""Numbers that some leaves change differentiably, for derivatives in either direction."""
+"""Activity analysis: the numbers that depend differentiably on some leaves, for derivatives in either direction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from crazysim.engine.ir.program import Program, Segment, Slot
 
 
 def differentiable(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
-    """Return a program without its check, and those of the perturbed leaves that are floats and take part.
+    """Return a program without its check, and the perturbed leaves that are floats and are used by it.
 
     Raises:
         UnsupportedError: If its derivatives have no kernel.
@@ -34,7 +34,7 @@ def differentiable(program: Program, perturbed: Collection[int]) -> tuple[Progra
 
 
 def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
-    """Return the numbers that depend differentiably on the perturbed leaves, and the hoisted ones that do."""
+    """Return the numbers that depend differentiably on the perturbed leaves, and such hoisted outputs by segment."""
     found = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     constants: dict[Segment, tuple[int, ...]] = {}
 
@@ -65,7 +65,7 @@ def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict
 
 
 def active(block: Block, wanted: Collection[Value]) -> set[Value]:
-    """Return the values of a block, those of inner blocks included, that some of its inputs change differentiably."""
+    """Return the values of a block and of its inner blocks that depend differentiably on some of its inputs."""
     found = set(wanted)
     _spread(block, found)
     return found

@@ -1,7 +1,7 @@
 """The smallest or largest number over other drones, in a form that has derivatives.
 
-Its derivative is that of the number of the first drone that has it, as ``crazysim.core.others`` defines it. To compare
-numbers with the smallest one would not do: computed twice, they may be rounded differently.
+Its derivative is that of the number of the first drone that has it, as ``crazysim.core.others`` defines it. That drone
+is found by its index, not by equality with the smallest number: numbers computed twice may be rounded differently.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ PLACES = {"min": "argmin", "max": "argmax"}
 
 
 def with_selections(block: Block) -> Block:
-    """Return a block in which two loops find such a number: which drone has it, and a sum of its number alone."""
+    """Return a block with two loops for each such number: one finds the drone that has it, one adds its number."""
     if not any(map(_selects, block.operations)):
         return block
     builder = Builder()

@@ -27,15 +27,15 @@ Values = dict[Value, Element]
 
 
 def with_tangents(program: Program, perturbed: Collection[int]) -> Program:
-    """Return the program that takes the tangents of a program's numbers along.
+    """Return the program that computes the tangents of a program's numbers besides the numbers.
 
-    Leaf ``len(program.leaves) + i`` is the tangent of leaf ``i``; of a leaf that all drones share, each world has its
-    own. Read are the tangents of the perturbed leaves, written those of the leaves that depend on them. The leaves
-    themselves are scratch: what the steps make of them is not kept.
+    Leaf ``len(program.leaves) + i`` is the tangent of leaf ``i``; each world has its own tangent of a leaf that all
+    drones share. The program reads the tangents of the perturbed leaves and writes those of the leaves that depend on
+    them. The leaves themselves are scratch: their values after the steps are not kept.
 
     Args:
         program: The program.
-        perturbed: Leaves whose tangents are given; those that are no floats have none.
+        perturbed: Leaves whose tangents are given; leaves that are not floats are ignored.
 
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
@@ -122,7 +122,7 @@ def _tangents_of(elements: Sequence[Element], tangents: Values) -> list[Element]
 
 
 def _tangent(x: Element, tangents: Values) -> Element:
-    zero = known_zero(x.dtype)  # takes its terms with it
+    zero = known_zero(x.dtype)  # terms with it are left out
     return tangents.get(x, zero) if isinstance(x, Value) else zero
 
 
@@ -132,8 +132,8 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
     Args:
         builder: Takes the operations.
         block: The block.
-        values: Elements that its inputs and the values around it are there, to which its own are added.
-        tangents: Their tangents, as far as they are not zero, to which those of its own values are added.
+        values: Elements of the builder for the block's inputs and the values around it; those of its results are added.
+        tangents: Tangents of these values that are not zero; those of its results are added.
     """
     for op in block.operations:
         builder.stage = op.stage
