@@ -8,17 +8,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, per_drone
-from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
-from crazysim.plugins.estimators.estimator import Estimator, arrivals, at_the_start
+from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter, origin_and_level
+from crazysim.plugins.estimators.estimator import at_the_start
 from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
 from crazysim.plugins.estimators.kalman import Std
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
@@ -30,7 +29,7 @@ from crazysim.plugins.sensors.magnetometer import Magnetometer
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.plugins.sensors.triad import TriadData
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, leaf
 
 START = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad. Assumptions; the start is the truth."""
@@ -57,7 +56,7 @@ class ESKFData(PyTree):
     """Number of times that the estimate left its bounds and the filter began again. (n_worlds, n_drones, 1)"""
 
 
-class ESKF(Estimator):
+class ESKF(ErrorStateFilter):
     """Error-state Kalman filter: position, velocity, attitude and biases of the ``IMU``, for any airframe.
 
     The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
@@ -68,18 +67,11 @@ class ESKF(Estimator):
     """
 
     _: dataclasses.KW_ONLY
-    freq: int = 100
-    """Predictions per second, Hz, a divisor of ``sim.freq``."""
     max_pos: float = 1e4
     """Coordinate beyond which the estimate has diverged, m."""
     max_vel: float = 100.0
     """Velocity along an axis beyond which the estimate has diverged, m/s."""
     name: str = "eskf"
-
-    @classmethod
-    def default(cls) -> ESKF:
-        """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
-        return cls([IMU.crazyflie(), MotionCapture()])
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
@@ -89,28 +81,19 @@ class ESKF(Estimator):
     def record(self, sim: Simulation) -> ESKFData:
         """Return the filter before its first step."""
         self.check_sensors(sim)
-        n, shape = error_state.N_BIASED, sim.data.states.pos.shape[:2]
+        n = error_state.N_BIASED
         level, still = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4), per_drone(sim, 0.0, 3)
-        return self.filled(
-            sim,
-            ESKFData,
-            estimate=Estimate(still, still, level, still, per_drone(sim, 0.0, n * (n + 1) // 2), still, still),
-            used=on_device(np.full((*shape, len(self.aids)), -1), np.int32),
-            failures=on_device(np.zeros((*shape, 1)), np.int32),
-        )
+        cov = per_drone(sim, 0.0, n * (n + 1) // 2)
+        return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still))
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         """Return the stages of the filter by name, in their order."""
-        period = freq // dividing_rate("freq", self.freq, freq)
-
-        def every(data: SimData) -> Any:
-            return (data.core.steps + 1) % period == 0
-
+        period, is_due = self.predictions(freq)
         return [
             ("begin", Stage(self._begin, "drone", at_the_start)),
-            ("sample", Stage(self._sample, "drone")),
-            ("predict", Stage(self._predict(period), "drone", every)),
-            *((s.name, Stage(self._fuse(k, s), "drone", arrivals(s))) for k, s in enumerate(self.aids)),
+            ("sample", Stage(self.sample, "drone")),
+            ("predict", Stage(self._predict(period), "drone", is_due)),
+            *self.fusions(),
             ("", Stage(self._check, "drone")),
         ]
 
@@ -135,12 +118,6 @@ class ESKF(Estimator):
         means = [rotation.rotate(imu.quat, triad.mean[:3]) for triad in (imu.accel, imu.gyro)]
         return error_state.start(pos, vel, quat, [*deviations, *spreads], *means)
 
-    def _sample(self, data: SimData) -> SimData:
-        """Add the latest inertial measurement of one drone to the sums."""
-        record = self.read(data)
-        gyro, accel = self.inertial(data)
-        return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
-
     def _predict(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
@@ -157,23 +134,16 @@ class ESKF(Estimator):
 
         return predict
 
-    def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
-        def fuse(data: SimData) -> SimData:
-            """Use a measurement of one sensor, if it is new."""
-            record, taken = self.read(data), sensor.read(data).samples.taken
-            new = taken[0] != record.used[k]
-            after = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, record.estimate))
-            estimate = error_state.select(new, after, record.estimate)
-            return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
-
-        return fuse
+    def updated(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
+        """Return the estimate of one drone after the latest measurement of a sensor."""
+        return _finalized(UPDATES[type(sensor)](sensor, self.imu, data, record.estimate))
 
     def _check(self, data: SimData) -> SimData:
         """Begin again at the origin, level, where the estimate of one drone left its bounds."""
         record = self.read(data)
         estimate = record.estimate
         valid = error_state.within_bounds(estimate, self.max_pos, self.max_vel)
-        zero, level = jnp.zeros_like(estimate.pos), jnp.zeros_like(estimate.quat).at[3].set(1.0)
+        zero, level = origin_and_level(estimate)
         estimate = error_state.select(valid, estimate, self._started(data, zero, zero, level, RESTART))
         return self.write(data, record.replace(estimate=estimate, failures=record.failures + jnp.where(valid, 0, 1)))
 

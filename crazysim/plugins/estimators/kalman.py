@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +13,12 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
-from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
-from crazysim.plugins.estimators.estimator import Estimator, arrivals, at_the_start
+from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter, origin_and_level
+from crazysim.plugins.estimators.estimator import at_the_start
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFlight, range_deviation
 from crazysim.plugins.sensors.imu import IMU
@@ -71,7 +70,7 @@ class KalmanData(PyTree):
     """Standard deviations that the filter assumes for the measurements, in the order of the sensors. (n,)"""
 
 
-class Kalman(Estimator):
+class Kalman(ErrorStateFilter):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
     It begins at the true state of a world's first step, uncertain as the firmware is after switching on. Predictions
@@ -84,8 +83,6 @@ class Kalman(Estimator):
     all_axes: bool = False
     """True to use the accelerometer along all axes, for any airframe and in wind; False as the firmware, which takes
     the force of the rotors to be the only one."""
-    freq: int = 100
-    """Predictions per second, Hz, a divisor of ``sim.freq``."""
     accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0), low=0.0)
     """Standard deviation of accelerations, body frame, m/s^2. (3,) or (n_worlds, n_drones, 3)"""
     gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
@@ -93,11 +90,6 @@ class Kalman(Estimator):
     deviations: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Standard deviations that differ from ``DEVIATIONS``, by its names."""
     name: str = "kalman"
-
-    @classmethod
-    def default(cls) -> Kalman:
-        """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
-        return cls([IMU.crazyflie(), MotionCapture()])
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
@@ -109,33 +101,27 @@ class Kalman(Estimator):
         self.check_sensors(sim)
         if unknown := self.deviations.keys() - DEVIATIONS.keys():
             raise ConfigError(f"expected deviations of {', '.join(DEVIATIONS)}, got {', '.join(map(repr, unknown))}")
-        deviations, shape = DEVIATIONS | dict(self.deviations), sim.data.states.pos.shape[:2]
+        deviations = DEVIATIONS | dict(self.deviations)
         level = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4)
         still = per_drone(sim, 0.0, 3)
         cov = np.diag(np.square(START))[np.triu_indices(error_state.N)]
-        return self.filled(
+        return self.record_of(
             sim,
             KalmanData,
-            estimate=Estimate(still, still, level, still, per_drone(sim, cov, *cov.shape), None, None),
+            Estimate(still, still, level, still, per_drone(sim, cov, *cov.shape), None, None),
             previous=level,
-            used=on_device(np.full((*shape, len(self.aids)), -1), np.int32),
-            failures=on_device(np.zeros((*shape, 1)), np.int32),
             deviations=on_device(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
         )
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         """Return the stages of the filter by name, in their order."""
-        period = freq // dividing_rate("freq", self.freq, freq)
-
-        def every(data: SimData) -> Any:
-            return (data.core.steps + 1) % period == 0
-
+        period, is_due = self.predictions(freq)
         return [
             ("begin", Stage(self._begin, "drone", at_the_start)),
-            ("sample", Stage(self._sample, "drone")),
-            ("predict", Stage(self._predict(period), "drone", every)),
+            ("sample", Stage(self.sample, "drone")),
+            ("predict", Stage(self._predict(period), "drone", is_due)),
             ("noise", Stage(self._add_noise, "drone")),
-            *((s.name, Stage(self._fuse(k, s), "drone", arrivals(s))) for k, s in enumerate(self.aids)),
+            *self.fusions(),
             ("", Stage(self._finish, "drone")),
         ]
 
@@ -150,12 +136,6 @@ class Kalman(Estimator):
         s, record = data.states, self.read(data)
         estimate = error_state.start(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)
         return self.write(data, record.replace(estimate=estimate, previous=s.quat))
-
-    def _sample(self, data: SimData) -> SimData:
-        """Add the latest inertial measurement of one drone to the sums."""
-        record = self.read(data)
-        gyro, accel = self.inertial(data)
-        return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
 
     def _predict(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
@@ -176,25 +156,16 @@ class Kalman(Estimator):
         deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * record.gyro_noise])
         return self.write(data, record.replace(estimate=error_state.add_noise(record.estimate, loops * deviations**2)))
 
-    def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
-        def fuse(data: SimData) -> SimData:
-            """Use a measurement of one sensor, if it is new."""
-            record, taken = self.read(data), sensor.read(data).samples.taken
-            new = taken[0] != record.used[k]
-            rot = rotation.matrix(record.previous)
-            std = dict(zip(DEVIATIONS, record.deviations, strict=True))
-            after = UPDATES[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
-            estimate = error_state.select(new, after, record.estimate)
-            return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
-
-        return fuse
+    def updated(self, sensor: Sensor, data: SimData, record: KalmanData) -> Estimate:
+        """Return the estimate of one drone after the latest measurement of a sensor."""
+        rot, std = rotation.matrix(record.previous), dict(zip(DEVIATIONS, record.deviations, strict=True))
+        return UPDATES[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
 
     def _finish(self, data: SimData) -> SimData:
         """Move the attitude error of one drone into its attitude; begin again where the estimate left its bounds."""
         record = self.read(data)
         estimate = error_state.finalize(record.estimate)
-        valid, zero = error_state.within_bounds(estimate), jnp.zeros_like(estimate.pos)
-        level = jnp.zeros_like(estimate.quat).at[3].set(1.0)
+        valid, (zero, level) = error_state.within_bounds(estimate), origin_and_level(estimate)
         estimate = error_state.select(valid, estimate, error_state.start(zero, zero, level, START))
         failures = record.failures + jnp.where(valid, 0, 1)
         return self.write(data, record.replace(estimate=estimate, previous=estimate.quat, failures=failures))

@@ -1,0 +1,93 @@
+"""Base class of filters with error states: sums of inertial measurements, and aids that are used once, on arrival."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Self, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.core.plugin import Simulation
+from crazysim.core.settings import dividing_rate
+from crazysim.core.stage import Stage
+from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators.error_state import Estimate
+from crazysim.plugins.estimators.estimator import Estimator, arrivals
+from crazysim.plugins.sensors.imu import IMU
+from crazysim.plugins.sensors.motion_capture import MotionCapture
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.pytree import PyTree, on_device
+
+R = TypeVar("R", bound=PyTree)
+
+
+class ErrorStateFilter(Estimator):
+    """Base class of filters with error states.
+
+    A subclass also defines ``updated``. Its record has the fields ``estimate``, ``accel`` and ``gyro``, sums of the
+    inertial measurements since the last prediction, ``used`` and ``failures``, which ``record_of`` describes.
+    """
+
+    _: dataclasses.KW_ONLY
+    freq: int = 100
+    """Predictions per second, Hz, a divisor of ``sim.freq``."""
+
+    @classmethod
+    def default(cls) -> Self:
+        """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
+        return cls([IMU.crazyflie(), MotionCapture()])
+
+    def updated(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
+        """Return the estimate of one drone after the latest measurement of a sensor."""
+        raise NotImplementedError
+
+    def record_of(self, sim: Simulation, kind: type[R], estimate: Estimate, **given: Any) -> R:
+        """Return the record before the first step.
+
+        No measurement was ``used``: the step in which the latest one was taken is -1 for each sensor. The filter has
+        had no ``failures``, in which its estimate left its bounds and it began again.
+
+        Args:
+            sim: The simulation.
+            kind: Class of the record.
+            estimate: Estimate of all drones.
+            given: Other fields, see ``filled``.
+        """
+        shape = sim.data.states.pos.shape[:2]
+        used = on_device(np.full((*shape, len(self.aids)), -1), np.int32)
+        failures = on_device(np.zeros((*shape, 1)), np.int32)
+        return self.filled(sim, kind, estimate=estimate, used=used, failures=failures, **given)
+
+    def predictions(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
+        """Return the steps between predictions, for ``freq`` steps per second, Hz, and when one is due."""
+        period = freq // dividing_rate("freq", self.freq, freq)
+        return period, lambda data: (data.core.steps + 1) % period == 0
+
+    def fusions(self) -> list[tuple[str, Stage]]:
+        """Return the stages that use the measurements of the sensors, by their names."""
+        return [(s.name, Stage(self._fuse(k, s), "drone", arrivals(s))) for k, s in enumerate(self.aids)]
+
+    def sample(self, data: SimData) -> SimData:
+        """Add the latest inertial measurement of one drone to the sums."""
+        record = self.read(data)
+        gyro, accel = self.inertial(data)
+        return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
+
+    def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
+        def fuse(data: SimData) -> SimData:
+            """Use a measurement of one sensor, if it is new."""
+            record, taken = self.read(data), sensor.read(data).samples.taken
+            new = taken[0] != record.used[k]
+            estimate = error_state.select(new, self.updated(sensor, data, record), record.estimate)
+            return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
+
+        return fuse
+
+
+def origin_and_level(like: Estimate) -> tuple[Array, Array]:
+    """Return zeros, (3,), and the attitude of a level drone, (4,), where a filter that diverged begins again."""
+    return jnp.zeros_like(like.pos), jnp.zeros_like(like.quat).at[3].set(1.0)
