@@ -107,6 +107,8 @@ def state_variable_filter(
     Returns:
         Filtered signals and derivatives, (n_signals, N_deriv + 1, n), without axes of length one.
     """
+    from scipy.linalg import expm  # a fifth of a second to import
+
     y, t = np.atleast_2d(np.asarray(y, np.float64)), np.asarray(t, np.float64)
     even = np.linspace(t[0], t[-1], len(t))
     if held:
@@ -122,7 +124,7 @@ def state_variable_filter(
     step = omega * (t[-1] - t[0]) / (len(t) - 1)
     a *= step
     a[order, order + 1] = 1.0
-    move = exponential(a)[:order]
+    move = expm(a)[:order]
 
     def passed(u: NDArray, change: NDArray) -> NDArray:
         x = np.zeros((len(u), order))
@@ -142,16 +144,3 @@ def state_variable_filter(
     states = passed(back, np.concatenate([np.diff(back, axis=1), zero], axis=1))
     found = [[np.interp(t, even, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
     return np.squeeze(np.array(found))
-
-
-def exponential(a: NDArray) -> NDArray:
-    """Return the exponential of a small matrix, by its series after halving it to a norm below 1/8. (k, k)"""
-    halvings = max(0, int(np.ceil(np.log2(max(np.linalg.norm(a, 1), 1e-12)))) + 3)
-    small = a / 2**halvings
-    total = term = np.eye(len(a))
-    for k in range(1, 12):  # (1/8)^12 / 12! is below the rounding of float64
-        term = term @ small / k
-        total = total + term
-    for _ in range(halvings):
-        total = total @ total
-    return total

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +111,8 @@ def fit_translation(
         raise ConfigError(f"expected dynamics as one of {', '.join(FITTED)}, got {dynamics!r}. Choose one of them.")
     if not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}. Weigh the drone.")
+    from scipy.optimize import minimize_scalar  # a fifth of a second to import
+
     kind = Dynamics(dynamics)
 
     def solved(rate: float) -> tuple[float, NDArray, NDArray, NDArray]:
@@ -124,12 +126,9 @@ def fit_translation(
     if kind != Dynamics.so_rpy:
         grid = np.geomspace(*RATES, 31)
         k = int(np.argmin([solved(x)[0] for x in grid]))
-        low, high = np.log(grid[max(0, k - 1)]), np.log(grid[min(len(grid) - 1, k + 1)])
-        golden = (np.sqrt(5) - 1) / 2
-        for _ in range(30):
-            a, b = high - golden * (high - low), low + golden * (high - low)
-            low, high = (low, b) if solved(np.exp(a))[0] < solved(np.exp(b))[0] else (a, high)
-        rate = float(np.exp((low + high) / 2))
+        near = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
+        found = minimize_scalar(lambda x: solved(np.exp(x))[0], bounds=near, method="bounded", options={"xatol": 1e-7})
+        rate = float(np.exp(found.x))
     _, coefs, terms, rest = solved(rate)
     names, values, jacobian = ["cmd_f_coef"], [coefs[0]], terms
     if kind != Dynamics.so_rpy:
@@ -144,6 +143,8 @@ def fit_translation(
 
 def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
     """Return the parameters of ``sys_id_rotation`` for several logs, and their standard deviations."""
+    from scipy.optimize import least_squares  # a fifth of a second to import
+
     groups = []
     for axes in ([0, 1], [2]):
         data = [_angles(log, axes) for log in logs]
@@ -161,7 +162,10 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
         ]
         guess = np.linalg.lstsq(np.stack(columns[:3], -1), columns[3], rcond=None)[0]
         start = np.where(np.sign(guess) == [-1, -1, 1], guess, [-100.0, -20.0, 100.0])
-        x = _levenberg_marquardt(rest, slope, start)
+        fit = least_squares(
+            lambda x, rest=rest: rest(x).ravel(), start, lambda x, slope=slope: -slope(x).reshape(-1, 3), method="lm"
+        )
+        x = fit.x
         groups.append((x, _deviations(slope(x), rest(x), _blocks(logs))))
     (tilt, tilt_spread), (turn, turn_spread) = groups
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
@@ -238,27 +242,6 @@ _rotation_slope = jax.jit(lambda x, *log: -jax.jacfwd(_rest)(x, *log))
 
 def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
     return np.asarray(_rest(jnp.asarray(x), *log), np.float64)
-
-
-def _levenberg_marquardt(rest: Callable, slope: Callable, x: NDArray) -> NDArray:
-    """Return the parameters of least squares; ``rest`` is data minus model, ``slope`` the model's derivative."""
-    damping, error = 1e-3, rest(x)
-    for _ in range(100):
-        jacobian = slope(x).reshape(-1, len(x))
-        normal, vector = jacobian.T @ jacobian, jacobian.T @ error.ravel()
-        move = np.linalg.lstsq(
-            normal + damping * np.diag(np.diag(normal)) + 1e-30 * np.eye(len(x)), vector, rcond=None
-        )[0]
-        new = rest(x + move)
-        better = np.all(np.isfinite(new)) and np.sum(new**2) < np.sum(error**2)
-        if better:
-            small = np.all(np.abs(move) < 1e-6 * np.abs(x))
-            x, error, damping = x + move, new, damping / 10
-            if small:
-                break
-        elif (damping := 10 * damping) > 1e8:
-            break
-    return x
 
 
 def _blocks(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
