@@ -91,20 +91,46 @@ def read_flight(path: str | Path) -> Flight:
         ConfigError: If a column is missing, or there is no setpoint.
     """
     path = Path(path)
-    with np.load(path, allow_pickle=False) as file:
-        if missing := [name for name in COLUMNS if name not in file.files]:
-            raise ConfigError(f"{path.name}: expected columns {', '.join(COLUMNS)}, got no {', '.join(missing)}")
-        t = np.asarray(file["t"], np.float64)
-        logged, given = (np.stack([file[k] for k in names]).astype(np.float64) for names in (COLUMNS[1:4], COLUMNS[4:]))
-    rest, commanded = logged[2, 0], np.flatnonzero(given[2] > 0)
-    if not len(commanded):
-        raise ConfigError(f"{path.name}: expected a setpoint above the floor, got none")
+    columns = columns_of(path, COLUMNS)
+    t, logged, given = columns[0], columns[1:4], columns[4:]
+    rest, commanded = logged[2, 0], commanded_samples(path.name, given[2])
     grid = np.arange(float(t[commanded[0]]), float(t[commanded[-1]]), 1 / FREQ)
     pos = np.stack([np.interp(grid, t, x) for x in logged], axis=-1)
     nearest = np.searchsorted((t[1:] + t[:-1]) / 2, grid)
     setpoint = given[:, nearest].T * [1, 1, 1, np.pi / 180]
     pos[:, 2], setpoint[:, 2] = pos[:, 2] - rest, setpoint[:, 2] - rest
     return Flight(path.stem, setpoint, pos)
+
+
+def columns_of(path: Path, names: Sequence[str]) -> NDArray:
+    """Return columns of a log of NanoBench. (len(names), n)
+
+    Raises:
+        ConfigError: If one is missing.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        if missing := [name for name in names if name not in file.files]:
+            raise ConfigError(
+                f"{path.name}: expected columns {', '.join(names)}, got no {', '.join(missing)}. "
+                "Give a log of NanoBench."
+            )
+        return np.stack([file[name] for name in names]).astype(np.float64)
+
+
+def commanded_samples(name: str, height: NDArray) -> NDArray:
+    """Return the indices of samples with a setpoint above the floor.
+
+    Args:
+        name: Name of the log, for messages.
+        height: Height of the setpoint, m. (n,)
+
+    Raises:
+        ConfigError: If there are none.
+    """
+    commanded = np.flatnonzero(height > 0)
+    if not len(commanded):
+        raise ConfigError(f"{name}: expected a setpoint above the floor, got none. Give the log of a flight.")
+    return commanded
 
 
 def laboratory(quat_deviation: float = 0.06) -> Estimator:

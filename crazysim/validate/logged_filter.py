@@ -13,9 +13,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
-from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state
-from crazysim.validate.closed_loop import LOST
+from crazysim.validate.closed_loop import LOST, columns_of, commanded_samples
 from crazysim.validate.flights import logs
 from crazysim.validate.rows import Row
 
@@ -34,7 +33,7 @@ def read(path: Path) -> dict[str, NDArray]:
     ``quat`` of motion capture, ``est_pos`` and ``est_quat`` of the filter on board, and ``goal``, m. (n, k)
 
     Raises:
-        ConfigError: If a column is missing.
+        ConfigError: If a column is missing, or there is no setpoint.
     """
     names = {
         "accel": [f"imu_acc_{k}" for k in "xyz"],
@@ -45,11 +44,8 @@ def read(path: Path) -> dict[str, NDArray]:
         "est_quat": [f"att_stateEstimate_q{k}" for k in "xyzw"],
         "goal": [f"sp_ctrltarget_{k}" for k in "xyz"],
     }
-    with np.load(path, allow_pickle=False) as file:
-        if missing := [k for columns in names.values() for k in columns if k not in file.files]:
-            raise ConfigError(f"{path.name}: expected a log of NanoBench, got no {', '.join(missing)}")
-        log = {k: np.stack([file[c] for c in columns], axis=-1).astype(np.float32) for k, columns in names.items()}
-    commanded = np.flatnonzero(log["goal"][:, 2] > 0)
+    log = {k: columns_of(path, columns).T.astype(np.float32) for k, columns in names.items()}
+    commanded = commanded_samples(path.name, log["goal"][:, 2])
     log = {k: x[commanded[0] : commanded[-1]] for k, x in log.items()}
     return log | {"accel": np.float32(error_state.GRAVITY) * log["accel"]}
 
@@ -88,13 +84,15 @@ def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float,
 
 def of_filter(folder: Path) -> Iterable[Row]:
     """Yield errors of the filter over those of the filter on board, flight by flight, without crashed flights."""
-    for path in logs(folder, "*.npz"):
-        log = read(path)
+    flights = {path.stem: read(path) for path in logs(folder, "*.npz")}
+    n = max(len(log["pos"]) for log in flights.values())
+    for name, log in flights.items():
         if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > LOST:
             continue
-        found = replay(log["accel"], log["gyro"], log["pos"], log["quat"])
-        ours = errors(log, *(np.asarray(x) for x in found))
+        size = len(log["pos"])  # all are continued to one length, so that the filter compiles once
+        longest = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
+        ours = errors(log, *(np.asarray(x)[:size] for x in replay(*longest)))
         board = errors(log, log["est_pos"], log["est_quat"])
         for what, unit, one, other in zip(("position", "attitude"), ("m", "degrees"), ours, board, strict=True):
-            yield Row(f"{path.stem}: {what}", "filter on board", one / other, "", (0, 1.1),
+            yield Row(f"{name}: {what}", "filter on board", one / other, "", (0, 1.1),
                       f"on board {other:.3g} {unit}, here {one:.3g} {unit}")  # fmt: skip

@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from crazysim import rotation
 from crazysim.core.airframes import AirframeSource
 from crazysim.drones import load_airframe
 from crazysim.plugins.effects import Latency
@@ -77,6 +77,7 @@ def of_crazyflow() -> Iterable[Row]:
 
 
 RAPTOR_AIRFRAMES = ("cf21B_500", "cf2x_L250", "crazyflie", "bumblebee")
+"""Airframes that RAPTOR flies."""
 
 
 def raptor_held(drone: AirframeSource, delay: int, n: int = 100, seconds: int = 10) -> float:
@@ -102,23 +103,16 @@ def raptor_held(drone: AirframeSource, delay: int, n: int = 100, seconds: int = 
     action, away = np.zeros((n, 4)), np.zeros(n)
     for k in range(100 * seconds):
         s = sim.data.states
-        pos, quat, vel, rate = (np.asarray(x, np.float64)[:, 0] for x in (s.pos, s.quat, s.vel, s.ang_vel))
-        seen = np.concatenate([pos - [0, 0, 3], _matrices(quat), vel, rate, action], axis=-1)
+        pos, turn, vel, rate = (
+            np.asarray(x, np.float64)[:, 0] for x in (s.pos, rotation.matrix(s.quat), s.vel, s.ang_vel)
+        )
+        seen = np.concatenate([pos - [0, 0, 3], turn.reshape(n, 9), vel, rate, action], axis=-1)
         action = policy.evaluate_step(seen)
         sim.rotor_vel_control(np.asarray(top * (action + 1) / 2, np.float32)[:, None])
         sim.step(5)
         if k >= 100 * (seconds - 1):
             away = np.maximum(away, np.linalg.norm(pos - [0, 0, 3], axis=-1))
     return float(np.mean(away < 0.3))
-
-
-def _matrices(quat: NDArray) -> NDArray:
-    """Return rotation matrices row by row. (n, 9)"""
-    x, y, z, w = quat.T
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    return np.stack(rows, axis=-1)
 
 
 def of_raptor() -> Iterable[Row]:
