@@ -69,12 +69,13 @@ def run(options: argparse.Namespace) -> None:
     every = [
         read_log(*x) for x in zip(paths, [columns] * len(paths), options.motion or [None] * len(paths), strict=True)
     ]
-    logs, base = every[: len(options.logs)], load_airframe(options.airframe)
+    base = load_airframe(options.airframe)
     if options.dynamics == "first_principles":
         every = [with_speeds(log, base) for log in every]
     for log in every:
         for repair in log.repairs:
             print(f"{log.name}: {repair}")
+    logs, held_out = every[: len(options.logs)], every[len(options.logs) :]
     source = f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {', '.join(log.name for log in logs)}"
     if options.dynamics != "first_principles":
         _, text = identify_attitude(logs, options.airframe, options.dynamics, source, mass=options.mass)
@@ -86,8 +87,8 @@ def run(options: argparse.Namespace) -> None:
         print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
     if result.doubtful:
         print(f"doubtful, more than three times from the airframe: {', '.join(result.doubtful)}")
-    logs = [aligned(log, result.delays[log.name]) for log in every[: len(logs)]]
-    held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in every[len(logs) :]]
+    logs = [aligned(log, result.delays[log.name]) for log in logs]
+    held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
     models = {
         options.airframe: Model.create(base, options.mass),
         "identified": result.model,

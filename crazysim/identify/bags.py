@@ -8,9 +8,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim import rotation
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
 from crazysim.identify.readers import QUAT, Stream, at_equal_times
@@ -178,6 +180,5 @@ def _turned(stream: Stream) -> Stream:
     if "vx" not in c:
         return stream
     q, v = np.stack([c[f"q{k}"] for k in XYZW], -1), np.stack([c[f"v{k}"] for k in XYZ], -1)
-    cross = 2 * np.cross(q[:, :3], v)
-    world = v + q[:, 3:] * cross + np.cross(q[:, :3], cross)
+    world = np.asarray(rotation.rotate(jnp.asarray(q), jnp.asarray(v)), np.float64)
     return Stream(stream.t, c | dict(zip(("vx", "vy", "vz"), world.T, strict=True)))

@@ -121,7 +121,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     base = load_airframe(airframe)
     if mass is not None and not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
-    measured, logs = logs, [with_speeds(log, base) for log in logs]
+    logs = [with_speeds(log, base) for log in logs]
     _check(logs, base)
     windows(logs, DURATION, DURATION)
     if base.n_rotors <= 4:
@@ -140,7 +140,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     values = named(force, torque, fast.values)
     deviations = named(force_spread, torque_spread, fast.deviations)
     changes = _changes(base, weight, values)
-    rates = motor_lag(measured)
+    rates = motor_lag(logs)
     if 2 * np.sum(np.isfinite(rates)) > rates.size:
         rates = rates[np.isfinite(rates)]
         values["motor lag"], deviations["motor lag"] = median(rates, np.ones(len(rates)))

@@ -111,6 +111,8 @@ class Log:
     """Indices of samples that follow a gap. (n_gaps,)"""
     repairs: tuple[str, ...] = ()
     """Descriptions of the repairs."""
+    modelled: bool = False
+    """True for rotor speeds that were not measured: see ``with_speeds``."""
 
     @property
     def dt(self) -> float:

@@ -33,8 +33,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays that. Motors and propellers differ by some
     percent, which would be a torque larger than that of most manoeuvres: each rotor's thrusts are scaled so that all
     rotors pull equally on average over the flight. So these logs show no centre of mass and no constant torque.
-    What precedes take-off and follows landing is left out. ``identify`` calls this itself, and estimates the lag of
-    motors from measured speeds only: give it logs as read.
+    What precedes take-off and follows landing is left out.
 
     Args:
         log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.
@@ -72,7 +71,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     data = {key: x[air] for key, x in vars(log).items() if isinstance(x, np.ndarray) and key != "gaps"}
     data |= {"command": command[air], "rotor_vel": speeds[air]}
     gaps = log.gaps[(log.gaps > air.start) & (log.gaps < air.stop)] - air.start
-    return replace(log, **data, gaps=gaps, repairs=tuple(repairs))
+    return replace(log, **data, modelled=True, gaps=gaps, repairs=tuple(repairs))
 
 
 def _behind(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
@@ -97,14 +96,16 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
     and delay are those that leave the least squares, so that noise of the speeds does not bias them.
 
     Args:
-        logs: Logs with commands and measured speeds; others are left out.
+        logs: Logs with commands and measured speeds; others, and modelled speeds, are left out.
 
     Returns:
         Rates, NaN where no rate from 2 to 200 1/s is best. (n_logs with both, n_rotors)
     """
     found = []
     for log in logs:
-        if log.command is None or not log.rotor_vel.shape[1] or log.command.shape != log.rotor_vel.shape:
+        if log.modelled or log.command is None or not log.rotor_vel.shape[1]:
+            continue
+        if log.command.shape != log.rotor_vel.shape:
             continue
         t = np.arange(log.t[0], log.t[-1], log.dt)
         at = [[np.interp(t, log.t, c) for c in x.T] for x in (log.command, log.rotor_vel)]
