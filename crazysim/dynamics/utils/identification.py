@@ -24,6 +24,7 @@ BLOCK = 5.0
 EDGE = 0.5
 """Duration at both ends of a log, s, that is left out: filters of 6 Hz start there, with a velocity that they lack."""
 FITTED = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
+"""Models that are fitted."""
 
 
 def sys_id_translation(
