@@ -197,7 +197,7 @@ def read_log(
     gaps = 1 + np.flatnonzero(np.diff(t) > 1.5 * np.median(np.diff(t)))
     if len(gaps):
         repairs.append(f"{len(gaps)} gaps, the longest {np.max(np.diff(t)):.3g} s; no prediction crosses them")
-    return Log(name, t, **data, gaps=gaps, repairs=tuple(repairs))
+    return Log(name, t, **data, gaps=gaps, repairs=tuple(repairs), modelled=False)
 
 
 def _table(

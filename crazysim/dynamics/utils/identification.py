@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -163,10 +164,9 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
         ]
         guess = np.linalg.lstsq(np.stack(columns[:3], -1), columns[3], rcond=None)[0]
         start = np.where(np.sign(guess) == [-1, -1, 1], guess, [-100.0, -20.0, 100.0])
-        fit = least_squares(
-            lambda x, rest=rest: rest(x).ravel(), start, lambda x, slope=slope: -slope(x).reshape(-1, 3), method="lm"
-        )
-        x = fit.x
+        error = lambda x, rest=rest: rest(x).ravel()  # noqa: E731
+        jacobian: Any = lambda x, slope=slope: -slope(x).reshape(-1, 3)  # noqa: E731
+        x = least_squares(error, start, jacobian, method="lm").x
         groups.append((x, _deviations(slope(x), rest(x), _blocks(logs))))
     (tilt, tilt_spread), (turn, turn_spread) = groups
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
