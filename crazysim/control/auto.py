@@ -156,8 +156,9 @@ def error_of_axes(x: Array, y: Array, z: Array) -> Array:
     plus = jnp.where(inverted, 1.0, plus)
     tilt = 1 / safe_sqrt(0.5 * plus)
     sin, cos = (x[..., 1:2] - y[..., :1]) / plus, (x[..., :1] + y[..., 1:2]) / plus
-    back = 1 + cos < INVERTED  # a yaw error of 180 degrees
-    yaw = jnp.where(back, 2.0, sin / safe_sqrt(0.5 * jnp.where(back, 1.0, 1 + cos)))
+    # Of half the yaw error: the cosine up to 90 degrees; beyond, where rounding spoils that, the sine.
+    half = safe_sqrt(0.5 * (1 + jnp.abs(cos)))
+    yaw = jnp.where(cos < 0, jnp.where(sin < 0, -2 * half, 2 * half), sin / half)
     roll = jnp.where(inverted, 2.0, -z[..., 1:2] * tilt)
     return jnp.concatenate([roll, z[..., :1] * tilt, jnp.where(inverted, 0.0, yaw)], axis=-1)
 

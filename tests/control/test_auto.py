@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import unit_quats, vectors, with_states
-from hypothesis import given
+from hypothesis import example, given
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe, rotation
@@ -173,6 +173,9 @@ def test_a_far_setpoint_is_approached_without_losing_height():
 
 @pytest.mark.fast
 @given(body=unit_quats(), desired=unit_quats())
+@example(
+    body=np.array([0.74740932, 0, 0, -0.66436384]), desired=np.array([0.10349082, 0.98124632, 0.1149898, 0.1149898])
+)
 def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
     """The error of SciPy's rotations: both forms agree, and their lengths are 2 sin(angle / 2)."""
     relative = Rotation.from_quat(body).inv() * Rotation.from_quat(desired)
