@@ -94,10 +94,18 @@ def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
     return Windows(**{key: jnp.asarray(np.stack(x), jnp.float32) for key, x in pieces.items()})
 
 
-def predict(model: Model, window: Windows, dt: float) -> tuple[Array, Array, Array, Array]:
+def predict(
+    model: Model, window: Windows, dt: float, constant_rates: bool = False
+) -> tuple[Array, Array, Array, Array]:
     """Return the predicted states of one window, which begin at its first sample: pos, quat, vel, ang_vel.
 
     Rotor speeds are interpolated linearly. Each sample is one Runge-Kutta step of order 4.
+
+    Args:
+        model: Model.
+        window: Window.
+        dt: Time between two samples, s.
+        constant_rates: True to keep the angular velocity of the first sample, so that only forces are modelled.
     """
     n = window.pos.shape[0]
     p = model.params
@@ -113,7 +121,7 @@ def predict(model: Model, window: Windows, dt: float) -> tuple[Array, Array, Arr
         torque = torque + reaction_torque(rotor_acc, sign, p.prop_inertia)
         force, torque = rotation.rotate(quat, force), rotation.rotate(quat, torque)
         _, acc, ang_acc, _ = first_principles.dynamics(pos, quat, vel, ang_vel, speed, speed, force, torque, params=p)
-        return vel, ang_vel, acc, ang_acc
+        return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc
 
     def moved(state: tuple, rates: tuple, duration: float) -> tuple:
         pos, quat, vel, ang_vel = state
@@ -158,11 +166,14 @@ def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[floa
 
     Returns:
         RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
-        name: ``position``, ``attitude``, ``position at constant velocity``, ``attitude unchanged``; and the mean
-        distance between predicted and measured position, ``position (mean)``, m. (len(horizons),) each
+        name: ``position``, ``attitude``, both ``... at constant body rates`` (forces of the model alone),
+        ``position at constant velocity``, ``attitude unchanged``; and the mean distance between predicted and
+        measured position, ``position (mean)`` and ``position at constant body rates (mean)``, m.
+        (len(horizons),) each
     """
     batch, dt = windows(logs, max(horizons), 0.05), logs[0].dt
     pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
+    pos_turning, quat_turning, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt, constant_rates=True)))(batch)
     at = np.asarray([round(h / dt) for h in horizons])
     times = jnp.asarray(at * dt, jnp.float32)[:, None]
     truth, turned = batch.pos[:, at], batch.quat[:, at]
@@ -170,12 +181,18 @@ def prediction_errors(logs: Sequence[Log], model: Model, horizons: Sequence[floa
     def rmse(x: Array, scale: float = 1.0) -> NDArray:
         return scale * np.sqrt(np.mean(np.sum(np.asarray(x, np.float64) ** 2, axis=-1), axis=0))
 
+    def mean(x: Array) -> NDArray:
+        return np.mean(np.linalg.norm(np.asarray(x, np.float64), axis=-1), axis=0)
+
     degrees = 180 / np.pi
     return {
         "position": rmse(pos[:, at] - truth),
-        "position (mean)": np.mean(np.linalg.norm(np.asarray(pos[:, at] - truth, np.float64), axis=-1), axis=0),
+        "position (mean)": mean(pos[:, at] - truth),
+        "position at constant body rates": rmse(pos_turning[:, at] - truth),
+        "position at constant body rates (mean)": mean(pos_turning[:, at] - truth),
         "position at constant velocity": rmse(batch.pos[:, :1] + times * batch.vel[:, :1] - truth),
         "attitude": rmse(attitude_error(quat[:, at], turned), degrees),
+        "attitude at constant body rates": rmse(attitude_error(quat_turning[:, at], turned), degrees),
         "attitude unchanged": rmse(attitude_error(jnp.broadcast_to(batch.quat[:, :1], turned.shape), turned), degrees),
     }
 

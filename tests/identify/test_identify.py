@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -93,8 +94,18 @@ def test_identification_finds_the_airframe_of_the_logs(result):
 def test_identified_model_predicts_held_out_flights(flights, result):
     errors = prediction_errors([read_log(flights[-1])], result.model)
     assert np.all(errors["position"] < 0.1 * errors["position at constant velocity"])
-    assert np.all(errors["attitude"] < 0.1 * errors["attitude unchanged"])
+    for name in ("unchanged", "at constant body rates"):
+        assert np.all(errors["attitude"] < 0.1 * errors[f"attitude {name}"])
     assert "attitude, degrees" in errors_table(errors)
+
+
+def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, result):
+    """Equal moments of inertia of 1,000 kg m^2: no gyroscopic torque, and 1e-9 rad/s^2 by the rotors."""
+    heavy = jnp.asarray(1e3 * np.eye(3), jnp.float32)
+    params = result.model.params.replace(J=heavy, J_inv=heavy / 1e6)
+    errors = prediction_errors([read_log(flights[-1])], result.model.replace(params=params))
+    for name in ("position", "attitude"):
+        np.testing.assert_allclose(errors[f"{name} at constant body rates"], errors[name], rtol=1e-4)
 
 
 def test_command_writes_an_airframe(flights, tmp_path, capsys):
