@@ -90,7 +90,7 @@ class Identification:
         if self.doubtful:
             lines.insert(0, f"# Doubtful, more than three times from the base: {', '.join(self.doubtful)}.")
         table = ""
-        for path, value in self.changes.items():
+        for path, value in sorted(self.changes.items(), key=lambda x: x[0].rpartition(".")[0]):
             owner, _, key = path.rpartition(".")
             if owner != table:
                 table = owner

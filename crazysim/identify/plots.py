@@ -32,11 +32,12 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Model], path: str | Pa
     errors = {name: prediction_errors(logs, model, horizons) for name, model in models.items()}
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots(1, 2)
-    naive = {"position": "position at constant velocity", "attitude": "attitude unchanged"}
+    naive = {"position": "at constant velocity", "attitude": "unchanged"}
     for ax, (key, other), unit in zip(axes, naive.items(), ("m", "degrees"), strict=True):
         for name, found in errors.items():
             ax.plot(horizons, found[key], label=name)
-        ax.plot(horizons, next(iter(errors.values()))[other], "k:", label=other.removeprefix(key).strip())
+        for kind, style in ((other, "k:"), ("at constant body rates", "k--")):
+            ax.plot(horizons, found[f"{key} {kind}"], style, label=kind)
         ax.set(xlabel="horizon, s", ylabel=f"RMSE of {key}, {unit}", xlim=(0, None), ylim=(0, None))
         ax.grid(alpha=0.3)
         ax.legend()

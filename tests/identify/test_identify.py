@@ -110,6 +110,8 @@ def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, r
 
 def test_command_writes_an_airframe(flights, tmp_path, capsys):
     table = {k: x for k, x in flights[0].items() if k != "t"} | {"seconds": flights[0]["t"]}
+    # Commands that these speeds follow with a lag of first order of 25 1/s.
+    table |= {f"command{k}": table[f"rpm{k}"] + np.gradient(table[f"rpm{k}"], 0.004) / 25 for k in range(1, 5)}
     path, out = tmp_path / "flight.csv", tmp_path / "mine.toml"
     options = ["--network", "4", "--iterations", "3", "--plot", str(tmp_path / "errors.png")]
     np.savetxt(path, np.stack(list(table.values()), -1), delimiter=",", header=",".join(table), comments="")
@@ -123,6 +125,7 @@ def test_command_writes_an_airframe(flights, tmp_path, capsys):
     sim.add(Residual())
     assert sim.data.plugins["residual"].output.shape == (6, 4)
     assert load_airframe(out).value("rigid_body.mass") == load_airframe("cf21B_500").value("rigid_body.mass")
+    np.testing.assert_allclose(load_airframe(out).value("rotors.lag"), [25, 0, 25, 0], rtol=0.05)
 
 
 def test_missing_columns_are_named(flights):
