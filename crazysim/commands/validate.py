@@ -14,11 +14,19 @@ from pathlib import Path
 
 import crazysim
 from crazysim.commands.options import DefaultsFormatter
-from crazysim.validate import closed_forms, firmware_controllers, firmware_filters, flights, logged_filter, peers
+from crazysim.validate import (
+    closed_forms,
+    firmware_controllers,
+    firmware_filters,
+    flights,
+    logged_filter,
+    peers,
+    raptor,
+)
 from crazysim.validate.rows import Section, measure, page
 
-NAMES = ("closed", "mujoco", "firmware", "crazyflow", "idsia", "nanobench", "filter", "raptor")
-PEERS = ("crazyflow", "foundation-policy")
+NAMES = ("closed", "mujoco", "firmware", "crazyflow", "idsia", "nanobench", "filter", "raptor", "l2f")
+PEERS = ("crazyflow", "foundation-policy", "l2f")
 """Other programs that are compared if they are installed, by their names for pip."""
 
 
@@ -87,9 +95,20 @@ def sections(data: Path | None) -> Sequence[Section]:
                 "Repeat: `crazysim validate --only filter --data FOLDER`.",
                 (partial(logged_filter.of_filter, folder / "nanobench"),),
                 absent=absent),
-        Section("raptor", "The foundation policy RAPTOR", "`foundation-policy` 1.0.2, unchanged, commands rotors at "
-                "100 Hz. A drone is held if it stays within 0.3 m of its goal from 9 to 10 s. Repeat: `crazysim "
-                "validate --only raptor`.", (peers.of_raptor,), "foundation_policy", "foundation-policy"),
+        Section("raptor", "The foundation policy RAPTOR", "`foundation-policy` 1.0.2, unchanged, commands rotors. It "
+                "is called every 10 ms, as in its training, or every 2 ms, with a recurrent state that advances every "
+                "10 ms; the authors' firmware calls it every 0.5 to 2.5 ms. A drone is held if it stays within 0.3 m "
+                "of its goal from 9 to 10 s. Method of Runge-Kutta of order 4, steps of 2 ms. The latency is added to "
+                "the lag of the motors. The policy was trained without latency, on thrusts of 1.5 to 5 weights and "
+                "time constants of rising rotor speeds of 30 to 100 ms. Only `cf21B_500` is within these ranges: "
+                "`cf2x_L250` has 1.49 weights and 136 ms, `crazyflie` 20 ms, `bumblebee` 10.1 weights. Repeat: "
+                "`crazysim validate --only raptor`.",
+                (raptor.of_airframes,), "foundation_policy", "foundation-policy"),
+        Section("l2f", "l2f, the simulator of RAPTOR's training", "RAPTOR flies the same 256 quadrotors, drawn from "
+                "the ranges of its training, in crazysim and in `l2f` 2.0.18, with methods of Runge-Kutta of order 4 "
+                "and steps of 2 ms in both. The figure is the difference of the shares that it holds; latency costs as "
+                "many quadrotors in the one as in the other. Repeat: `crazysim validate --only l2f`.",
+                (raptor.of_trained,), "l2f", "l2f foundation-policy"),
     )  # fmt: skip
 
 

@@ -10,11 +10,6 @@ import jax
 import mujoco
 import numpy as np
 
-from crazysim import rotation
-from crazysim.core.airframes import AirframeSource
-from crazysim.drones import load_airframe
-from crazysim.plugins.effects import Latency
-from crazysim.sim.sim import Sim
 from crazysim.validate.closed_forms import SPIN, free_body, state_of, with_states
 from crazysim.validate.rows import Row
 
@@ -74,52 +69,3 @@ def of_crazyflow() -> Iterable[Row]:
         # rounding of float32 in 1,000 steps, as between the peer's own precisions (tests/golden)
         yield Row(f"{level} commands, 2 s, {moved:.2f} m from the start: distance", "Crazyflow, `cf21B_500`",
                   float(np.linalg.norm(ends[0] - ends[1])), "m", (0, 1e-3))  # fmt: skip
-
-
-RAPTOR_AIRFRAMES = ("cf21B_500", "cf2x_L250", "crazyflie", "bumblebee")
-"""Airframes that RAPTOR flies."""
-
-
-def raptor_held(drone: AirframeSource, delay: int, n: int = 100, seconds: int = 10) -> float:
-    """Return the share of drones that RAPTOR holds within 0.3 m of a goal in the last second.
-
-    Args:
-        drone: Airframe.
-        delay: Delay of the commands, steps of 2 ms.
-        n: Number of drones, which start within 0.5 m of the goal along each axis.
-        seconds: Duration, s.
-    """
-    policy = importlib.import_module("foundation_policy").Raptor()
-    policy.reset()
-    sim = Sim(n, drone=drone, control="rotor_vel")
-    curve = np.asarray(load_airframe(drone).value("rotors.thrust_curve")).ravel()[:3]
-    most = float(np.max(load_airframe(drone).value("rotors.thrust_max")))
-    constant, linear, square = (float(x) for x in curve)
-    top = float(np.max(np.roots([square, linear, constant - most]).real))
-    start = np.random.default_rng(0).uniform(-0.5, 0.5, (n, 1, 3)) + [0, 0, 3]
-    sim.data = with_states(sim.data, pos=start, rotor_vel=np.full(4, top / 2))
-    sim.rotor_vel_control(np.full((n, 1, 4), top / 2, np.float32))
-    sim.add(Latency(delay))
-    action, away = np.zeros((n, 4)), np.zeros(n)
-    for k in range(100 * seconds):
-        s = sim.data.states
-        pos, turn, vel, rate = (
-            np.asarray(x, np.float64)[:, 0] for x in (s.pos, rotation.matrix(s.quat), s.vel, s.ang_vel)
-        )
-        seen = np.concatenate([pos - [0, 0, 3], turn.reshape(n, 9), vel, rate, action], axis=-1)
-        action = policy.evaluate_step(seen)
-        sim.rotor_vel_control(np.asarray(top * (action + 1) / 2, np.float32)[:, None])
-        sim.step(5)
-        if k >= 100 * (seconds - 1):
-            away = np.maximum(away, np.linalg.norm(pos - [0, 0, 3], axis=-1))
-    return float(np.mean(away < 0.3))
-
-
-def of_raptor() -> Iterable[Row]:
-    """Yield the share of drones that RAPTOR holds, with commands that arrive at once and late."""
-    for drone in RAPTOR_AIRFRAMES:
-        for delay in (0, 1, 3, 5):
-            held = raptor_held(drone, delay)
-            yield Row(
-                f"`{drone}`, commands {2 * delay} ms late: drones held", "100 starts within 0.5 m", 100 * held, "%"
-            )
