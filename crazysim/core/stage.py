@@ -107,6 +107,14 @@ def tick(data: SimData, freq: int) -> Array | None:
     return None if period == 1 else data.core.steps % period == 0
 
 
+def at_the_start(data: SimData) -> Array:
+    """Return True in the first step of an episode. (n_worlds, 1), or () for one
+
+    Leading stages of a step with this condition run before the first step of a call.
+    """
+    return data.core.steps == 0
+
+
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [

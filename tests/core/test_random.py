@@ -1,11 +1,12 @@
 """Keys for stages: one per world or drone, the same inside and outside of jit."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import shared_sim
 
-from crazysim.core.random import drone_keys
+from crazysim.core.random import drone_keys, normal, uniform
 
 pytestmark = pytest.mark.fast
 
@@ -38,3 +39,28 @@ def test_numbers_are_uniform_and_uncorrelated(data):
     centred = np.asarray(numbers) - 0.5
     for a, b in ((centred[1:], centred[:-1]), (centred[:, 1:], centred[:, :-1]), (centred[..., 1:], centred[..., :-1])):
         assert abs(np.mean(a * b)) * 12 < 4 / np.sqrt(a.size)
+
+
+def test_both_words_of_a_hash_give_independent_standard_numbers(data):
+    """108,000 normal numbers: first four moments, and products of neighbours, within 4 standard errors."""
+
+    def draw(step):
+        at = data.replace(core=data.core.replace(steps=data.core.steps + step))
+        return jax.vmap(jax.vmap(lambda key: normal(key, (6,))))(drone_keys(at, "imu"))
+
+    numbers = np.asarray(jax.jit(jax.vmap(draw))(np.arange(3000, dtype=np.int32)), np.float64)
+    moments = zip((0, 1, 0, 3), (1, 2, 15, 96), strict=True)  # of z, z^2, z^3, z^4: mean and variance
+    for power, (mean, variance) in enumerate(moments, 1):
+        assert abs((numbers**power).mean() - mean) < 4 * np.sqrt(variance / numbers.size)
+    for a, b in ((numbers[..., ::2], numbers[..., 1::2]), (numbers[..., 2:], numbers[..., :-2])):
+        assert abs(np.mean(a * b)) < 4 / np.sqrt(a.size)
+
+
+def test_numbers_of_other_types_and_generators_are_those_of_jax():
+    for key in (jax.random.key(1, impl="rbg"), jax.random.key(1)):
+        dtype = jnp.float32 if key.dtype != jax.random.key(0).dtype else jnp.float16
+        np.testing.assert_array_equal(normal(key, (3,), dtype), jax.random.normal(key, (3,), dtype))
+        np.testing.assert_array_equal(uniform(key, (3,), dtype), jax.random.uniform(key, (3,), dtype))
+    own = np.asarray(uniform(jax.random.key(1), (1000,)))
+    assert 0 <= own.min() < 0.01
+    assert 0.99 < own.max() < 1

@@ -11,7 +11,7 @@ import numpy as np
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.others import reduce_over_others_p
-from crazysim.core.stage import Axes, Stage
+from crazysim.core.stage import Axes, Stage, at_the_start
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
 from crazysim.engine.ir.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage, Zeros
@@ -59,7 +59,8 @@ def lower_stages(
     segments = []
     phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
     for phase, some in phases.items():
-        segments += [_lower_stage(axes.stage(stage), phase, axes, leaves, known, n_drones, tracer) for stage in some]
+        own = [_lower_stage(axes.stage(stage), phase, axes, leaves, known, n_drones, tracer) for stage in some]
+        segments += _before_the_steps(own, some, axes.numbers.core.steps) if phase == "each" else own
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
@@ -71,6 +72,22 @@ def lower_stages(
     checked = sorted((own | axes.views & set(program.written)) & set(watched(axes.numbers)))
     core = axes.numbers.core
     return dataclasses.replace(program, check=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
+
+
+def _before_the_steps(
+    segments: Sequence[Segment | UnfusedStage], stages: Sequence[Stage], clock: Any
+) -> list[Segment | UnfusedStage]:
+    """Return the segments of a step, of which leading ones that begin an episode run before the first step of a call.
+
+    An episode begins nowhere else as long as one stage alone writes the ``clock``, the leaf of step counts. What such
+    a stage writes is fixed in the steps, so that what follows from it can be computed once.
+    """
+    if sum(clock in s.written for s in segments) > 1:
+        return list(segments)
+    begins = [stage.when is at_the_start and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)]
+    n = (*begins, False).index(False)
+    first = [dataclasses.replace(s, phase="first") for s in segments[:n] if isinstance(s, Segment)]
+    return [*first, *segments[n:]]
 
 
 def _lower_stage(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
-from crazysim.core.random import drone_key
+from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
@@ -77,8 +76,8 @@ class MotorFailure(Plugin):
             due = (motors.fail_step >= 0) & (data.core.steps >= motors.fail_step)
             effectiveness = jnp.where(due, 0.0, effectiveness)
         if motors.rate is not None:
-            uniform = jax.random.uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
-            effectiveness = jnp.where(uniform < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
+            chance = uniform(drone_key(data, self.name), effectiveness.shape, effectiveness.dtype)
+            effectiveness = jnp.where(chance < jnp.exp(-motors.rate / data.core.freq), effectiveness, 0.0)
         return self.write(data, motors.replace(effectiveness=effectiveness))
 
     def fail(self, data: SimData, mask: ArrayLike | None) -> SimData:

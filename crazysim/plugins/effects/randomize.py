@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -14,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
-from crazysim.core.random import drone_key
-from crazysim.core.stage import Stage
+from crazysim.core.random import drone_key, uniform
+from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import BatteryData
 from crazysim.plugins.effects.latency import LatencyData
@@ -168,7 +167,7 @@ class Randomize(Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that draws, in the first step of an episode, before all others."""
         first = next(name for name in sim.step_pipeline if name != self.name)
-        return [Placement(Stage(self.begin, "drone", when=lambda data: data.core.steps == 0), before=first)]
+        return [Placement(Stage(self.begin, "drone", at_the_start), before=first)]
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the parameters of the drone that was drawn."""
@@ -200,7 +199,7 @@ class Randomize(Plugin):
         """Draw the factors of one drone for an episode."""
         record = self.read(data)
         n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
-        u = jax.random.uniform(drone_key(data, self.name), (len(FACTORS) + 5 + n_rotors,), dtype)
+        u = uniform(drone_key(data, self.name), (len(FACTORS) + 5 + n_rotors,), dtype)
 
         def drawn(limits: Array | None, share: Array) -> Array:
             return jnp.ones_like(share) if limits is None else limits[0] + share * (limits[1] - limits[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
-from crazysim.core.random import drone_key
+from crazysim.core.random import drone_key, normal
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import ground_below
@@ -130,7 +129,7 @@ class Wind(Plugin):
         airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
         step = airspeed / (data.core.freq * length)
 
-        noise = jax.random.normal(drone_key(data, self.name), (6,), s.vel.dtype)
+        noise = normal(drone_key(data, self.name), (6,), s.vel.dtype)
         begins = data.core.steps == 0
         first, second = wind.filters[:3], wind.filters[3:]
         first = jnp.where(begins, noise[3:], first)

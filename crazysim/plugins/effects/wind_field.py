@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.random import world_key
-from crazysim.core.stage import Stage
+from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import LARGEST_FUSED, Grid, interpolate
 from crazysim.plugins.effects.moving_air import Air, Exposed, require_drag, with_moving_air
@@ -94,7 +94,7 @@ class WindField(Plugin):
         found = [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True))]
         if self.spread is None:
             return found
-        begins = Stage(self.displace, "drone", when=lambda data: data.core.steps == 0)
+        begins = Stage(self.displace, "drone", at_the_start)
         return [Placement(begins, name=f"{self.name}_displacement"), *found]
 
     def influence(self, data: SimData) -> SimData:

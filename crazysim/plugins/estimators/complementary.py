@@ -15,10 +15,10 @@ from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import Stage
+from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators.error_state import GRAVITY
-from crazysim.plugins.estimators.estimator import Estimator, at_the_start
+from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.barometer import Barometer
 from crazysim.plugins.sensors.flow_deck import TimeOfFlight
 from crazysim.plugins.sensors.imu import IMU

@@ -103,7 +103,7 @@ def start(
 def predict(
     estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: Array | None = None, all_axes: bool = False
 ) -> Estimate:
-    """Return the estimate after an interval, without process noise.
+    """Return the estimate after an interval, without process noise, which bounds the variances.
 
     Args:
         estimate: The estimate.
@@ -136,7 +136,9 @@ def predict(
     shift = dt * vel + 0.5 * dt**2 * force
     pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY * dt**2], pos.dtype)
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
-    return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=p[_upper(N)])
+    upper = p[_upper(N)]
+    cov = jnp.where(_is_variance(N), upper, _at_most(upper))
+    return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=cov)
 
 
 def predict_biased(
@@ -199,7 +201,9 @@ def predict_biased(
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
     """Return the estimate with process noise, given as variances that are added to those of the errors. (n,)"""
-    return estimate.replace(cov=_bounded(covariance(estimate.cov) + jnp.diag(variances)))
+    n, cov = variances.shape[0], estimate.cov
+    variance = _is_variance(n)
+    return estimate.replace(cov=cov.at[variance].set(_variances(cov[variance] + variances, n)))
 
 
 def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, deviation: Array | float) -> Estimate:
@@ -216,7 +220,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     n = p.shape[0]
     ph = p[:, rows] @ h
     r = deviation * deviation
-    gain = ph / (jnp.dot(h, ph[jnp.asarray(rows)]) + r)
+    gain = ph * (1 / (jnp.dot(h, ph[jnp.asarray(rows)]) + r))
     # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns of I - K H that belong to rows are not trivial.
     left = jnp.eye(n, dtype=p.dtype)[:, rows] - gain[:, None] * h
     others = np.setdiff1d(np.arange(n), rows)
@@ -413,11 +417,28 @@ def select(which: Array, one: Estimate, other: Estimate) -> Estimate:
 
 
 def _bounded(p: Array) -> Array:
-    """Return the upper triangle of a covariance made symmetric and bounded; NaN becomes the upper bound."""
-    places = rows, columns = _upper(p.shape[0])
-    upper = 0.5 * p[places] + 0.5 * p.T[places]
-    least = np.where(rows == columns, MIN_VARIANCE[p.shape[0]], -np.inf)
-    return jnp.where(upper <= MAX_COVARIANCE, jnp.maximum(upper, least.astype(p.dtype)), MAX_COVARIANCE)
+    """Return the upper triangle of a covariance, bounded; NaN becomes the upper bound.
+
+    The firmware takes the mean of both triangles, which differ by rounding; with one, the engine computes half of them.
+    """
+    n = p.shape[0]
+    upper = p[_upper(n)]
+    return jnp.where(_is_variance(n), _variances(upper, n), _at_most(upper))
+
+
+def _at_most(covariances: Array) -> Array:
+    """Return covariances within their upper bound, which NaN becomes."""
+    return jnp.where(covariances <= MAX_COVARIANCE, covariances, MAX_COVARIANCE)
+
+
+def _variances(variances: Array, n: int) -> Array:
+    """Return variances within their bounds, of ``n`` errors; NaN becomes the upper bound."""
+    return jnp.where(variances <= MAX_COVARIANCE, jnp.maximum(variances, MIN_VARIANCE[n]), MAX_COVARIANCE)
+
+
+def _is_variance(n: int) -> np.ndarray:
+    """Return True for the variances of the upper triangle of a covariance of ``n`` errors. (n (n + 1) / 2)"""
+    return np.equal(*_upper(n))
 
 
 def _n_errors(upper: Array) -> int:

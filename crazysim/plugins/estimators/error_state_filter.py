@@ -16,7 +16,7 @@ from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
-from crazysim.plugins.estimators.estimator import Estimator, arrivals
+from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
@@ -28,8 +28,9 @@ R = TypeVar("R", bound=PyTree)
 class ErrorStateFilter(Estimator):
     """Base class of filters with error states.
 
-    A subclass also defines ``updated``. Its record has the fields ``estimate``, ``accel`` and ``gyro``, sums of the
-    inertial measurements since the last prediction, ``used`` and ``failures``, which ``record_of`` describes.
+    A subclass also defines ``updated`` and ``restarted``. Its record has the fields ``estimate``, ``accel`` and
+    ``gyro``, sums of the inertial measurements since the last prediction, ``used`` and ``failures``, which
+    ``record_of`` describes.
     """
 
     _: dataclasses.KW_ONLY
@@ -43,6 +44,20 @@ class ErrorStateFilter(Estimator):
 
     def updated(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor."""
+        raise NotImplementedError
+
+    def is_valid(self, estimate: Estimate) -> Array:
+        """Return True where the estimate of one drone is within its bounds. ()"""
+        return error_state.within_bounds(estimate)
+
+    def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
+        """Return the estimate with which the filter of one drone begins again, at rest.
+
+        Args:
+            data: Data of the drone.
+            pos: Position, world frame, m. (3,)
+            quat: Attitude, body to world, unit, xyzw. (4,)
+        """
         raise NotImplementedError
 
     def record_of(self, sim: Simulation, kind: type[R], estimate: Estimate, **given: Any) -> R:
@@ -69,7 +84,11 @@ class ErrorStateFilter(Estimator):
 
     def fusions(self) -> list[tuple[str, Stage]]:
         """Return the stages that use the measurements of the sensors, by their names."""
-        return [(s.name, Stage(self._fuse(k, s), "drone", arrivals(s))) for k, s in enumerate(self.aids)]
+        return [(s.name, Stage(self._fuse(k, s), "drone", self._is_new(k, s))) for k, s in enumerate(self.aids)]
+
+    def restart(self) -> Stage:
+        """Return the stage with which the filter begins again where its estimate left its bounds."""
+        return Stage(self._begin_again, "drone", lambda data: ~self.is_valid(self.read(data).estimate))
 
     def sample(self, data: SimData) -> SimData:
         """Add the latest inertial measurement of one drone to the sums."""
@@ -77,17 +96,20 @@ class ErrorStateFilter(Estimator):
         gyro, accel = self.inertial(data)
         return self.write(data, record.replace(accel=record.accel + accel, gyro=record.gyro + gyro))
 
+    def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
+        return lambda data: sensor.read(data).samples.taken[0] != self.read(data).used[k]
+
     def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
         def fuse(data: SimData) -> SimData:
-            """Use a measurement of one sensor, if it is new."""
+            """Use a new measurement of one sensor."""
             record, taken = self.read(data), sensor.read(data).samples.taken
-            new = taken[0] != record.used[k]
-            estimate = error_state.select(new, self.updated(sensor, data, record), record.estimate)
-            return self.write(data, record.replace(estimate=estimate, used=record.used.at[k].set(taken[0])))
+            used = record.used.at[k].set(taken[0])
+            return self.write(data, record.replace(estimate=self.updated(sensor, data, record), used=used))
 
         return fuse
 
-
-def origin_and_level(like: Estimate) -> tuple[Array, Array]:
-    """Return zeros, (3,), and the attitude of a level drone, (4,), where a filter that diverged begins again."""
-    return jnp.zeros_like(like.pos), jnp.zeros_like(like.quat).at[3].set(1.0)
+    def _begin_again(self, data: SimData) -> SimData:
+        """Begin again with one drone at the origin, level."""
+        record = self.read(data)
+        pos, quat = jnp.zeros_like(record.estimate.pos), jnp.zeros_like(record.estimate.quat).at[3].set(1.0)
+        return self.write(data, record.replace(estimate=self.restarted(data, pos, quat), failures=record.failures + 1))

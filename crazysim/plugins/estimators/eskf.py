@@ -13,11 +13,10 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, per_drone
-from crazysim.core.stage import Stage
+from crazysim.core.stage import Stage, at_the_start
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
-from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter, origin_and_level
-from crazysim.plugins.estimators.estimator import at_the_start
+from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
 from crazysim.plugins.estimators.kalman import Std
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
@@ -94,7 +93,7 @@ class ESKF(ErrorStateFilter):
             ("sample", Stage(self.sample, "drone")),
             ("predict", Stage(self._predict(period), "drone", is_due)),
             *self.fusions(),
-            ("", Stage(self._check, "drone")),
+            ("", self.restart()),
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
@@ -138,14 +137,13 @@ class ESKF(ErrorStateFilter):
         """Return the estimate of one drone after the latest measurement of a sensor."""
         return _finalized(UPDATES[type(sensor)](sensor, self.imu, data, record.estimate))
 
-    def _check(self, data: SimData) -> SimData:
-        """Begin again at the origin, level, where the estimate of one drone left its bounds."""
-        record = self.read(data)
-        estimate = record.estimate
-        valid = error_state.within_bounds(estimate, self.max_pos, self.max_vel)
-        zero, level = origin_and_level(estimate)
-        estimate = error_state.select(valid, estimate, self._started(data, zero, zero, level, RESTART))
-        return self.write(data, record.replace(estimate=estimate, failures=record.failures + jnp.where(valid, 0, 1)))
+    def is_valid(self, estimate: Estimate) -> Array:
+        """Return True where the estimate of one drone is within ``max_pos`` and ``max_vel``. ()"""
+        return error_state.within_bounds(estimate, self.max_pos, self.max_vel)
+
+    def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
+        """Return the estimate with which the filter of one drone begins again."""
+        return self._started(data, pos, jnp.zeros_like(pos), quat, RESTART)
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jax import Array
@@ -12,7 +11,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
-from crazysim.core.stage import Stage, as_stages, tick
+from crazysim.core.stage import Stage, as_stages
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor
@@ -121,14 +120,3 @@ class Estimator(Plugin):
             return controller.fn(with_measured_states([self], data)).replace(states=data.states)
 
         return Stage(blind, controller.scope, controller.when, controller.batched, controller.__name__)
-
-
-def at_the_start(data: SimData) -> Any:
-    """Return True in the first step of a world."""
-    return data.core.steps == 0
-
-
-def arrivals(sensor: Sensor) -> Callable[[SimData], Any] | None:
-    """Return when measurements of a sensor can arrive; None for every step."""
-    freq = sensor.freq
-    return None if freq is None or sensor.is_late else lambda data: tick(data, freq)

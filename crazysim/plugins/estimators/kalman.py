@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
-from crazysim.core.stage import Stage
+from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
-from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter, origin_and_level
-from crazysim.plugins.estimators.estimator import at_the_start
+from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFlight, range_deviation
 from crazysim.plugins.sensors.imu import IMU
@@ -122,6 +121,8 @@ class Kalman(ErrorStateFilter):
             ("predict", Stage(self._predict(period), "drone", is_due)),
             ("noise", Stage(self._add_noise, "drone")),
             *self.fusions(),
+            ("finalize", Stage(self._finalize, "drone", self._is_updated)),
+            ("restart", self.restart()),
             ("", Stage(self._finish, "drone")),
         ]
 
@@ -161,14 +162,23 @@ class Kalman(ErrorStateFilter):
         rot, std = rotation.matrix(record.previous), dict(zip(DEVIATIONS, record.deviations, strict=True))
         return UPDATES[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
 
-    def _finish(self, data: SimData) -> SimData:
-        """Move the attitude error of one drone into its attitude; begin again where the estimate left its bounds."""
+    def _is_updated(self, data: SimData) -> Array:
+        """Return True where measurements of this step have changed the attitude of one drone. ()"""
+        return jnp.any(self.read(data).estimate.att_error != 0)
+
+    def _finalize(self, data: SimData) -> SimData:
+        """Move the attitude error of one drone into its attitude."""
         record = self.read(data)
-        estimate = error_state.finalize(record.estimate)
-        valid, (zero, level) = error_state.within_bounds(estimate), origin_and_level(estimate)
-        estimate = error_state.select(valid, estimate, error_state.start(zero, zero, level, START))
-        failures = record.failures + jnp.where(valid, 0, 1)
-        return self.write(data, record.replace(estimate=estimate, previous=estimate.quat, failures=failures))
+        return self.write(data, record.replace(estimate=error_state.finalize(record.estimate)))
+
+    def _finish(self, data: SimData) -> SimData:
+        """Note the attitude of one drone at the end of the step."""
+        record = self.read(data)
+        return self.write(data, record.replace(previous=record.estimate.quat))
+
+    def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
+        """Return the estimate with which the filter of one drone begins again."""
+        return error_state.start(pos, jnp.zeros_like(pos), quat, START)
 
 
 def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:

@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import parameter
+from crazysim.core.random import normal
 from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, quantise
 from crazysim.pytree import PyTree, leaf
 
@@ -78,12 +78,12 @@ class Barometer(Sensor):
 
     def begin(self, data: SimData, record: BarometerData, key: Array) -> BarometerData:
         """Draw the offset of one barometer, and where its drift begins."""
-        noise = jax.random.normal(key, (2,), record.offset.dtype)
+        noise = normal(key, (2,), record.offset.dtype)
         return record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
 
     def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, BarometerData]:
         """Return the pressure and the height of one barometer, and the record after it."""
-        noise = jax.random.normal(key, (2,), record.offset.dtype)
+        noise = normal(key, (2,), record.offset.dtype)
         wander = correlated(record.wander, record.drift, record.drift_time, self.interval(data), noise[:1])
         pressure = self.ideal(data)[:1] + record.offset + wander + record.noise * noise[1:]
         pressure = quantise(pressure, record.resolution)

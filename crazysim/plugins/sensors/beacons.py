@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
+from crazysim.core.random import normal, uniform
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import Samples, Sensor
 from crazysim.pytree import PyTree, leaf, on_device
@@ -89,10 +90,10 @@ class UWB(Sensor):
     def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, UWBData]:
         """Return the distances of one drone, or their differences, m, and the record."""
         distance = self._distances(data)
-        keys, shape, dtype = jax.random.split(key, 3), distance.shape, distance.dtype
-        detour = -record.detour * jnp.log(1 - jax.random.uniform(keys[0], shape, dtype))
-        detour = jnp.where(jax.random.uniform(keys[1], shape, dtype) < record.outliers, detour, 0.0)
-        distance = distance + record.bias + detour + record.noise * jax.random.normal(keys[2], shape, dtype)
+        keys, shape, dtype = jax.random.split(key), distance.shape, distance.dtype
+        chance = uniform(keys[0], (*shape, 2), dtype)
+        detour = jnp.where(chance[:, 1] < record.outliers, -record.detour * jnp.log(1 - chance[:, 0]), 0.0)
+        distance = distance + record.bias + detour + record.noise * normal(keys[1], shape, dtype)
         return self._output(distance), record
 
     def _distances(self, data: SimData) -> Array:
@@ -177,7 +178,7 @@ class Lighthouse(Sensor):
         truth = self.ideal(data)
         n = truth.shape[0] // 3
         visible = jnp.repeat(truth[2 * n :], 2)
-        angle = truth[: 2 * n] + visible * record.noise * jax.random.normal(key, (2 * n,), truth.dtype)
+        angle = truth[: 2 * n] + visible * record.noise * normal(key, (2 * n,), truth.dtype)
         return jnp.concatenate([angle, truth[2 * n :]]), record
 
 

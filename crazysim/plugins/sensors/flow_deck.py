@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import parameter
+from crazysim.core.random import normal
 from crazysim.plugins.effects.ground import ground_below
 from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
 from crazysim.pytree import PyTree, leaf
@@ -84,7 +84,7 @@ class OpticalFlow(Sensor):
     def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, OpticalFlowData]:
         """Return the motion of the image of one camera, pixels, and the record."""
         truth = self.ideal(data)
-        value = truth + record.noise * jax.random.normal(key, (2,), truth.dtype)
+        value = truth + record.noise * normal(key, (2,), truth.dtype)
         return quantise(value, record.resolution), record
 
 
@@ -147,7 +147,7 @@ class TimeOfFlight(Sensor):
         truth = self.ideal(data)
         deviation = record.noise + range_deviation(truth, record.far_noise)
         near = truth < record.max_range
-        value = truth + deviation * jax.random.normal(key, (1,), truth.dtype)
+        value = truth + deviation * normal(key, (1,), truth.dtype)
         value = jnp.where(near, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
         return quantise(value, record.resolution), record
 

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import parameter
+from crazysim.core.random import normal
 from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated
 from crazysim.pytree import PyTree, leaf
 
@@ -70,11 +70,11 @@ class GPS(Sensor):
 
     def begin(self, data: SimData, record: GPSData, key: Array) -> GPSData:
         """Draw where the drift of one receiver begins."""
-        return record.replace(wander=record.drift * jax.random.normal(key, (3,), record.wander.dtype))
+        return record.replace(wander=record.drift * normal(key, (3,), record.wander.dtype))
 
     def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, GPSData]:
         """Return position and velocity from one receiver, and the record after it."""
-        noise = jax.random.normal(key, (9,), record.wander.dtype)
+        noise = normal(key, (9,), record.wander.dtype)
         wander = correlated(record.wander, record.drift, record.drift_time, self.interval(data), noise[:3])
         error = jnp.concatenate([wander + record.noise * noise[3:6], record.vel_noise * noise[6:]])
         return self.ideal(data) + error, record.replace(wander=wander)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Simulation, parameter, per_drone
+from crazysim.core.random import normal, uniform
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.plugins.effects.ground_effect import rotor_positions
@@ -196,17 +197,18 @@ class IMU(Sensor):
 
     def begin(self, data: SimData, record: IMUData, key: Array) -> IMUData:
         """Draw the errors of one unit, and the angles of its rotors."""
-        truth, keys = self.ideal(data), jax.random.split(key, 3)
-        gyro, accel = record.gyro.begin(truth[:3], keys[0]), record.accel.begin(truth[3:], keys[1])
+        truth, keys = self.ideal(data), jax.random.split(key)
+        noise = normal(keys[0], (12, 2), truth.dtype)
+        gyro, accel = record.gyro.begin(truth[:3], noise[:, 0]), record.accel.begin(truth[3:], noise[:, 1])
         record = record.replace(gyro=gyro, accel=accel)
         if record.phase is None:
             return record
-        phase = jax.random.uniform(keys[2], record.phase.shape, truth.dtype, 0.0, 2 * math.pi)
+        phase = 2 * math.pi * uniform(keys[1], record.phase.shape, truth.dtype)
         return record.replace(phase=phase)
 
     def measure(self, data: SimData, record: IMUData, key: Array) -> tuple[Array, IMUData]:
         """Return the angular velocity, rad/s, and the specific force, m/s^2, and the record after it."""
-        s, freq, dt, keys = data.states, data.core.freq, self.interval(data), jax.random.split(key)
+        s, freq, dt = data.states, data.core.freq, self.interval(data)
         ang_vel = s.ang_vel
         acc, ang_acc = freq * (s.vel - record.vel), freq * (s.ang_vel - record.ang_vel)
         if record.phase is not None:
@@ -221,8 +223,9 @@ class IMU(Sensor):
             record = record.replace(phase=phase)
         force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, record.pos)
         truth = _to_sensor(record.quat, ang_vel, force)
-        rates, gyro = record.gyro.measure(truth[:3], keys[0], dt)
-        forces, accel = record.accel.measure(truth[3:], keys[1], dt)
+        noise = normal(key, (9, 2), truth.dtype)
+        rates, gyro = record.gyro.measure(truth[:3], noise[:, 0], dt)
+        forces, accel = record.accel.measure(truth[3:], noise[:, 1], dt)
         return jnp.concatenate([rates, forces]), record.replace(gyro=gyro, accel=accel)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:

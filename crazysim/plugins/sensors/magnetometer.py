@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
+from crazysim.core.random import normal
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
@@ -61,9 +62,11 @@ class Magnetometer(Sensor):
 
     def begin(self, data: SimData, record: MagnetometerData, key: Array) -> MagnetometerData:
         """Draw the errors of one magnetometer."""
-        return record.replace(errors=record.errors.begin(self.ideal(data), key))
+        truth = self.ideal(data)
+        return record.replace(errors=record.errors.begin(truth, normal(key, (12,), truth.dtype)))
 
     def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, MagnetometerData]:
         """Return the field that one magnetometer measures, T, and the record after it."""
-        value, errors = record.errors.measure(self.ideal(data), key, self.interval(data))
+        truth = self.ideal(data)
+        value, errors = record.errors.measure(truth, normal(key, (9,), truth.dtype), self.interval(data))
         return value, record.replace(errors=errors)

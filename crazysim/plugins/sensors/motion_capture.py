@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
+from crazysim.core.random import normal
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.pytree import PyTree, leaf
 
@@ -85,7 +85,7 @@ class MotionCapture(Sensor):
     def measure(self, data: SimData, record: MotionCaptureData, key: Array) -> tuple[Array, MotionCaptureData]:
         """Return position, attitude and velocity of one tracked body, and the record after it."""
         truth, dt = self.ideal(data), self.interval(data)
-        noise = jax.random.normal(key, (6,), truth.dtype)
+        noise = normal(key, (6,), truth.dtype)
         pos = truth[:3] + record.noise * noise[:3]
         half = 0.5 * record.angle_noise * noise[3:]
         quat = rotation.multiply(truth[3:7], jnp.concatenate([half, jnp.ones_like(half[:1])]))

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
+from crazysim.core.random import normal
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import BatteryData
 from crazysim.plugins.effects.moving_air import require_rotors
@@ -50,7 +50,7 @@ class Noisy(Sensor):
     def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
         """Return the measurement of one drone, and the record."""
         truth = self.ideal(data)
-        value = truth + record.noise * jax.random.normal(key, truth.shape, truth.dtype)
+        value = truth + record.noise * normal(key, truth.shape, truth.dtype)
         return quantise(value, record.resolution), record
 
 

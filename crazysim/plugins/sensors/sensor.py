@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
-from crazysim.core.random import drone_key
+from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import Stage, tick
+from crazysim.core.stage import Stage, at_the_start, tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
 
@@ -138,7 +138,7 @@ class Sensor(Plugin):
         """Return the stages that draw a sensor's errors, measure, and deliver late measurements."""
         end, placements = "increment_steps", []
         if type(self).begin is not Sensor.begin:
-            begins = Stage(self._begin, "drone", lambda data: data.core.steps == 0)
+            begins = Stage(self._begin, "drone", at_the_start)
             placements.append(Placement(begins, before=end, name=f"{self.name}_begin"))
         when = None if steps_between(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
         placements.append(Placement(Stage(self._take, "drone", when), before=end))
@@ -200,7 +200,7 @@ class Sensor(Plugin):
         value, record = self.measure(data, self.read(data), key)
         samples, lost, late = record.samples, False, 0.0
         if samples.dropout is not None or samples.queue is not None:
-            chance = jax.random.uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
+            chance = uniform(drone_key(data, f"{self.name}_arrival"), (2,), value.dtype)
             lost = False if samples.dropout is None else chance[:1] < samples.dropout
             late = chance[1:]
         if samples.queue is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -49,9 +48,13 @@ class TriadData(PyTree):
     resolution: Array | None = leaf("parameter", 1, (3,))
     """Smallest difference of two measurements, u; None for none. (3,)"""
 
-    def begin(self, truth: Array, key: Array) -> TriadData:
-        """Return the errors drawn for an episode of one sensor whose first measurement is of ``truth``, (3,)."""
-        noise = jax.random.normal(key, (12,), truth.dtype)
+    def begin(self, truth: Array, noise: Array) -> TriadData:
+        """Return the errors of one sensor in an episode.
+
+        Args:
+            truth: True quantity of the first measurement, in the sensor's frame, u. (3,)
+            noise: Standard normal numbers. (12,)
+        """
         drawn = self.mean + self.spread * noise[:9]
         triad = self.replace(
             bias=drawn[:3], scale=drawn[3:6], misalignment=drawn[6:], wander=self.instability * noise[9:]
@@ -63,15 +66,14 @@ class TriadData(PyTree):
         turned = truth - rotation.cross(self.misalignment, truth)
         return turned + self.scale * turned + self.bias + self.wander
 
-    def measure(self, truth: Array, key: Array, dt: float) -> tuple[Array, TriadData]:
+    def measure(self, truth: Array, noise: Array, dt: float) -> tuple[Array, TriadData]:
         """Return the measurement of one sensor, u, (3,), an interval after the last one, and the errors after it.
 
         Args:
             truth: True quantity in the sensor's frame, u. (3,)
-            key: Random key. ()
+            noise: Standard normal numbers. (9,)
             dt: Time between measurements, s.
         """
-        noise = jax.random.normal(key, (9,), truth.dtype)
         bias = self.bias + self.random_walk * math.sqrt(dt) * noise[3:6]
         wander = correlated(self.wander, self.instability, self.correlation_time, dt, noise[6:])
         triad = self.replace(bias=bias, wander=wander)

@@ -214,7 +214,7 @@ def test_every_effect_is_fused(every):
     assert {*STAGES, "wind_field_displacement"} <= fused
     own = set(every.step_pipeline) - set(hovering(engine="interpret").step_pipeline)
     assert own == {*STAGES, "wind_field_displacement"} - {"integration"}, "an effect's stages are listed in STAGES"
-    assert [s.scope for s in program.fused_segments] == ["drone"]
+    assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "first"), ("drone", "each")]
 
 
 def test_effects_mean_the_same_on_every_engine(every, flown):

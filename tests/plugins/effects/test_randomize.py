@@ -7,6 +7,8 @@ import pytest
 from cases import FAST, hover_rotor_state, with_states
 
 from crazysim import Battery, ConfigError, Latency, Randomize, Sim, Wind
+from crazysim.core.pipeline import append_fn
+from crazysim.core.stage import stage
 from crazysim.engine import Step
 from crazysim.envs import AutoReset, make
 
@@ -179,3 +181,32 @@ def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
     sim.add(Latency(delay=2))
     with pytest.raises(ConfigError, match=r"Use Latency\(delay=np.zeros\(\(3, 1\), int\), max_delay=4\)"):
         sim.add(Randomize(delay=(0, 4)))
+
+
+def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
+    """What is drawn is fixed in a call then; a stage that begins episodes in the middle of one keeps its meaning."""
+
+    @stage("world")
+    def again(data):
+        steps = data.core.steps
+        return data.replace(
+            core=data.core.replace(steps=jnp.where(steps == 2, 0, steps), episode=data.core.episode + 1)
+        )
+
+    def flown(engine, *stages):
+        sim = Sim(n_worlds=2, control="rotor_vel", engine=engine)
+        sim.add(Randomize.crazyflie())
+        for one in stages:
+            append_fn(sim.step_pipeline, one)
+        sim.build_step_fn()
+        sim.step(5)
+        return sim
+
+    drawn, reset = flown("interpret"), flown("interpret", again)
+    phases = [[s.phase for s in sim.step_fn.plan(sim.data).program.fused_segments] for sim in (drawn, reset)]
+    assert phases[0] == ["first", "each"]
+    assert "first" not in phases[1]
+    for sim, stages in ((drawn, ()), (reset, (again,))):
+        factors = sim.data.plugins["randomize"].factors
+        np.testing.assert_array_equal(factors, flown("plain", *stages).data.plugins["randomize"].factors)
+    assert np.any(drawn.data.plugins["randomize"].factors != reset.data.plugins["randomize"].factors)
