@@ -85,8 +85,6 @@ def run(options: argparse.Namespace) -> None:
     result = identify(logs, options.airframe, mass=options.mass)
     for name, x in result.values.items():
         print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
-    if result.doubtful:
-        print(f"doubtful, more than three times from the airframe: {', '.join(result.doubtful)}")
     logs = [aligned(log, result.delays[log.name]) for log in logs]
     held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
     models = {
@@ -107,6 +105,8 @@ def run(options: argparse.Namespace) -> None:
     text = result.toml(source)
     options.out.write_text(text, encoding="utf-8")
     print(f"wrote {options.out}")
+    if result.doubtful:
+        print(f"DOUBTFUL, more than three times from the airframe: {', '.join(result.doubtful)}")
 
 
 def _check_fitted(options: argparse.Namespace) -> None:

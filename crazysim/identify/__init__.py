@@ -1,8 +1,9 @@
 """Identification of airframes from logs of real flights."""
 
 from crazysim.identify.attitude import identify_attitude
+from crazysim.identify.columns import Columns
 from crazysim.identify.fit import Identification, identify
-from crazysim.identify.logs import Columns, Log, read_log
+from crazysim.identify.logs import Log, read_log
 from crazysim.identify.motors import motor_lag, with_speeds
 from crazysim.identify.network import fit_residual
 from crazysim.identify.plots import plot_errors

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.identify.delimited import number, rows_of
 from crazysim.identify.readers import decimated
 
 POLES = 14
@@ -21,10 +22,10 @@ def header_of(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
     """Return number and cells of the line that names the columns, and the settings before it; None for other files."""
     settings: dict[str, str] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in zip(range(HEADER_WITHIN), file, strict=False):
+        for at, line in zip(range(HEADER_WITHIN), file, strict=False):
             cells = [x.strip().strip('"') for x in line.split(",")]
             if any(x.startswith("time") for x in cells) and any(x.startswith("gyroADC[") for x in cells):
-                return number, cells, settings
+                return at, cells, settings
             settings[cells[0]] = cells[-1]
     return None
 
@@ -71,27 +72,16 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)}. "
             "Log gyro and motors in Betaflight."
         )
-    at = [keys.index(key) for key in wanted]
-    rows, damaged = [], 0
     with path.open(encoding="utf-8", errors="replace") as file:
-        for line in list(file)[start + 1 :]:
-            cells = line.split(",")
-            if len(cells) == len(keys):
-                rows.append([_number(cells[k]) for k in at])
-            elif line.strip():
-                damaged += 1
-    if damaged > 0.05 * (len(rows) + damaged) or not rows:
-        raise ConfigError(
-            f"{path.name}: expected rows of {len(keys)} cells, got {damaged} others and {len(rows)} such rows. "
-            "Decode the log again."
-        )
-    if damaged:
-        repairs.append(f"dropped {damaged} rows that have another number of cells")
+        lines = [*file][start + 1 :]
+    cells = rows_of(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
+    at = [keys.index(key) for key in wanted]
+    rows = [[number(row[k]) for k in at] for row in cells]
     data = dict(zip(wanted, np.array(rows).T, strict=True))
 
-    high = 10.0 if int(_number(settings.get("blackbox_high_resolution", "0")) or 0) > 0 else 1.0
+    high = 10.0 if int(number(settings.get("blackbox_high_resolution", "0")) or 0) > 0 else 1.0
     per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)
-    poles = _number(settings.get("motor_poles", str(POLES)))
+    poles = number(settings.get("motor_poles", str(POLES)))
     if not poles >= 2:
         raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}
@@ -107,10 +97,3 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         scalar = np.sqrt(np.clip(1 - np.sum(vector**2, axis=0), 0, 1))
         table |= dict(zip(("qx", "qy", "qz", "qw"), [*vector, scalar], strict=True))
     return decimated(table, repairs)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text.strip().strip('"'))
-    except ValueError:
-        return math.nan

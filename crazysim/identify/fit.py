@@ -17,6 +17,7 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.errors import ConfigError
 from crazysim.identify.logs import Log
+from crazysim.identify.motion import integral
 from crazysim.identify.motors import motor_lag, with_speeds
 from crazysim.identify.prediction import Model, windows
 from crazysim.identify.rotation import BLOCK, aligned, fast_rotation, median
@@ -25,6 +26,9 @@ from crazysim.rotation import rotate, rotate_inverse
 
 DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
+LARGEST = 10.0
+"""Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
+checked, a thrust factor stays below 2.5 squared times that of the mass."""
 
 
 FACTORS = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
@@ -116,7 +120,8 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         mass: Mass in the flights, kg; None for that of the airframe.
 
     Raises:
-        ConfigError: If the mass is not positive, or if sample times, lengths or rotors of the logs do not fit.
+        ConfigError: If the mass is not positive, if sample times, lengths or rotors of the logs do not fit, or if a
+            factor is below 1/10 or above 10.
     """
     base = load_airframe(airframe)
     if mass is not None and not 0 < mass < np.inf:
@@ -139,6 +144,12 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
 
     values = named(force, torque, fast.values)
     deviations = named(force_spread, torque_spread, fast.deviations)
+    if wrong := [f"{name} {values[name]:.3g}" for name in FACTORS if not 1 / LARGEST < values[name] < LARGEST]:
+        raise ConfigError(
+            f"expected factors from {1 / LARGEST:g} to {LARGEST:g}, got {', '.join(wrong)}, which no body that flies "
+            f"like {base.name!r} explains. Check its mass and the logs, add flights that turn and climb more, or start "
+            "from an airframe file nearer to the drone (--airframe)."
+        )
     changes = _changes(base, weight, values)
     rates = motor_lag(logs)
     if 2 * np.sum(np.isfinite(rates)) > rates.size:
@@ -194,19 +205,13 @@ def _torques(
         momentum = log.ang_vel @ inertia + spin
         rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
         # Everything known, integrated, goes to the left side.
-        known = _integral(rotors - np.cross(log.ang_vel, momentum), log.t)
+        known = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
         vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
         columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
         columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
         return np.stack(columns, axis=-1), momentum - known
 
     return _regressed(logs, terms, np.zeros(len(TORQUES), bool))
-
-
-def _integral(x: NDArray, t: NDArray) -> NDArray:
-    """Return the integral over time from the first sample (trapezoidal rule). (n, ...)"""
-    steps = (x[1:] + x[:-1]) / 2 * np.diff(t).reshape(-1, *[1] * (x.ndim - 1))
-    return np.concatenate([np.zeros_like(x[:1]), np.cumsum(steps, axis=0)])
 
 
 def _body(log: Log, vector: NDArray) -> NDArray:
@@ -227,7 +232,7 @@ def _regressed(
     rates, changes, blocks = [], [], []
     for number, log in enumerate(logs):
         x, momentum = terms(log)
-        total, size = _integral(x, log.t), round(DURATION / log.dt)
+        total, size = integral(x, log.t), round(DURATION / log.dt)
         starts = np.arange(0, len(log.t) - size, max(1, size // 5))
         starts = starts[[not np.any((log.gaps > k) & (log.gaps <= k + size)) for k in starts]]
         rates.append(total[starts + size] - total[starts])
@@ -277,7 +282,7 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
     if not logs:
         raise ConfigError("expected at least one log, got none")
     params = first_principles.Params.create(airframe)
-    hover = float(np.mean(np.asarray(first_principles.hover_rotor_vel(params))))
+    hover = np.broadcast_to(np.asarray(first_principles.hover_rotor_vel(params)).ravel(), airframe.n_rotors)
     for log in logs:
         if abs(log.dt - logs[0].dt) > 1e-4:
             raise ConfigError(
@@ -289,12 +294,12 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
                 "Name their columns as rotor_vel; or log commands, as shares of the voltage, and the voltage, for an "
                 "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy)."
             )
-        ratio = float(np.median(log.rotor_vel)) / hover
-        if not 0.4 < ratio < 2.5:
+        found = np.median(log.rotor_vel, axis=0)
+        if np.any((found < 0.4 * hover) | (found > 2.5 * hover)):
             raise ConfigError(
-                f"{log.name}: expected rotor speeds near {hover:.0f} rpm, as in hover, got a median of "
-                f"{np.median(log.rotor_vel):.0f}. Give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole "
-                "pairs for electrical rpm."
+                f"{log.name}: expected each rotor near {hover.mean():.0f} rpm, as in hover, got medians of "
+                f"{', '.join(f'{x:.0f}' for x in found)}. Correct the column of a rotor that does not turn, or "
+                f"give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole pairs for electrical rpm."
             )
 
 

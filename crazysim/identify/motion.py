@@ -67,13 +67,17 @@ def joined(
     shift = first - second + lag * STEP
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
     streams = {
-        "the log": Stream(t, {k: np.asarray(x, np.float64) for k, x in table.items() if k != time}),
-        "motion capture": Stream(
-            other + shift, {k: np.asarray(x, np.float64) for k, x in motion.items() if k != time and k not in table}
-        ),
+        "the log": Stream(t, _numbers(table, len(t), (time,))),
+        "motion capture": Stream(other + shift, _numbers(motion, len(other), (time, *table))),
     }
     both = at_equal_times(name, streams, repairs, quat)
     return both | {time: both.pop("t")}
+
+
+def _numbers(table: Mapping[str, NDArray], n: int, without: Sequence[str]) -> dict[str, NDArray]:
+    """Return the columns of n numbers."""
+    columns = {key: np.asarray(x) for key, x in table.items() if key not in without}
+    return {key: x.astype(np.float64) for key, x in columns.items() if x.shape == (n,) and x.dtype.kind in "fiub"}
 
 
 def _lag(a: NDArray, b: NDArray) -> tuple[float, float]:
@@ -123,3 +127,9 @@ def ang_vel_of(t: NDArray, quat: NDArray) -> NDArray:
     kernel = np.ones(2 * half + 1) / (2 * half + 1)
     padded = np.pad(rates, ((half, half), (0, 0)), mode="edge")
     return np.stack([np.convolve(x, kernel, "valid") for x in padded.T], axis=-1)
+
+
+def integral(x: NDArray, t: NDArray) -> NDArray:
+    """Return the integral over time from the first sample (trapezoidal rule). (n, ...)"""
+    steps = (x[1:] + x[:-1]) / 2 * np.diff(t).reshape(-1, *[1] * (x.ndim - 1))
+    return np.concatenate([np.zeros_like(x[:1]), np.cumsum(steps, axis=0)])

@@ -14,7 +14,8 @@ from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_acceleration
 from crazysim.dynamics.utils.identification import lagged
 from crazysim.errors import ConfigError
-from crazysim.identify.logs import REPAIRABLE, Log
+from crazysim.identify.logs import Log
+from crazysim.identify.repairs import REPAIRABLE
 
 SMOOTH = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""

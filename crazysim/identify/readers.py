@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.identify.repairs import continuous
 
 LONGEST_HOLD = 3.0
 """Intervals of a stream, after which its interpolated values count as a gap."""
@@ -49,22 +50,23 @@ def at_equal_times(
     sorted_streams = {}
     for key, stream in streams.items():
         order = np.unique(stream.t, return_index=True)[1]
+        order = order[np.isfinite(stream.t[order])]
         if len(order) < len(stream.t) or np.any(np.diff(stream.t) <= 0):
-            repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples repeat a time")
+            repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples have no time of their own")
         if len(order) < 2:
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
         columns = {c: x[order] for c, x in stream.columns.items()}
         if quat and all(c in columns for c in quat):
-            turned = np.stack([columns[c] for c in quat], axis=-1)
-            # A quaternion and its negative are one attitude, and interpolation needs neighbours of one sign.
-            sign = np.cumprod(np.r_[1.0, np.where(np.sum(turned[1:] * turned[:-1], axis=-1) < 0, -1.0, 1.0)])
-            columns |= {c: sign * columns[c] for c in quat}
+            turned = continuous(np.stack([columns[c] for c in quat], axis=-1))
+            columns |= dict(zip(quat, turned.T, strict=True))
         sorted_streams[key] = Stream(stream.t[order], columns)
     steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
     start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
     dt = min(steps.values())
     if end - start < dt:
         raise ConfigError(f"{name}: expected messages at the same times, got none. Log all of them in one flight.")
+    if end - start > 100 * dt * max(len(s.t) for s in sorted_streams.values()):
+        raise ConfigError(f"{name}: expected one flight, got {end - start:.3g} s of pauses. Cut the log into flights.")
     t = start + dt * np.arange(int((end - start) / dt) + 1)
     table, keep = {}, np.ones(len(t), bool)
     for key, s in sorted_streams.items():

@@ -54,22 +54,7 @@ def flights():
         sim.step(2)
         s = sim.data.states
         rows.append(np.concatenate([np.asarray(x)[:, 0] for x in (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)], -1))
-    names = [
-        "x",
-        "y",
-        "z",
-        "qx",
-        "qy",
-        "qz",
-        "qw",
-        "vx",
-        "vy",
-        "vz",
-        "wx",
-        "wy",
-        "wz",
-        *(f"rpm{k}" for k in range(1, 5)),
-    ]
+    names = "x y z qx qy qz qw vx vy vz wx wy wz rpm1 rpm2 rpm3 rpm4".split()
     table = np.stack(rows[100:], axis=1).astype(np.float64)
     return [{"t": 0.004 * np.arange(len(x)), **dict(zip(names, x.T, strict=True))} for x in table]
 
@@ -174,13 +159,150 @@ def test_spikes_of_rotor_speeds_are_interpolated(flights):
     assert "interpolated 1 rotor speeds" in read.repairs[0]
 
 
-def test_wrong_units_are_refused(flights):
-    degrees = flights[0] | {k: np.degrees(flights[0][k]) for k in ("wx", "wy", "wz")}
-    with pytest.raises(ConfigError, match="degrees per second"):
-        read_log(degrees)
+def test_lost_values_are_gaps(flights):
+    """0.08 s of NaN, and of zero quaternions, as of a lost motion capture; 0.008 s are interpolated."""
+    for names, value in (("x",), np.nan), (("qx", "qy", "qz", "qw"), 0.0):
+        log = {k: x.copy() for k, x in flights[0].items()}
+        for name in names:
+            log[name][[*range(2), 60, *range(200, 220)]] = value
+        read = read_log(log)
+        assert len(read.t) == len(log["t"]) - 22
+        assert read.gaps.tolist() == [198]
+        assert [x.split(" of")[0].split(",")[0] for x in read.repairs[:2]] == [
+            "interpolated 1 samples",
+            "dropped 22 samples",
+        ]
+        np.testing.assert_allclose(read.quat[58], [flights[0][k][60] for k in ("qx", "qy", "qz", "qw")], atol=1e-3)
+    with pytest.raises(ConfigError, match="finite quat that is not zero"):
+        read_log(flights[0] | dict.fromkeys(("qx", "qy", "qz", "qw"), 0 * flights[0]["x"]))
+
+
+def test_jumps_of_the_time_cost_their_samples_alone(flights):
+    t = flights[0]["t"].copy()
+    t[[0, 150, 300, -1]] = -1e9, 1e6, -5.0, 1e9
+    read = read_log(flights[0] | {"t": t})
+    assert len(read.t) == len(t) - 4
+    assert "dropped 4 samples" in read.repairs[0]
+    assert read.gaps.tolist() == [149, 298]  # those of 0.008 s that are left
+
+
+def test_jitter_is_no_gap_and_lost_time_beside_it_is_one(flights):
+    rng, n = np.random.default_rng(0), len(flights[0]["t"])
+    t = flights[0]["t"] + rng.uniform(-0.0015, 0.0015, n)
+    assert np.sum(np.diff(t) > 0.006) > 20
+    read = read_log(flights[0] | {"t": t + np.where(np.arange(n) < 100, 0, 0.02)})
+    assert read.gaps.tolist() == [100]
+    assert "as jitter" in read.repairs[0]
+
+
+UNITS = [
+    ({"t": 1e3}, "in ms: give seconds_per_unit=0.001"),
+    ({"t": 1e6}, "in us: give seconds_per_unit=1e-06"),
+    (dict.fromkeys("xyz", 1e3), "position seems to be in mm: give metres_per_unit=0.001"),
+    (dict.fromkeys(("vx", "vy", "vz"), 1e3), "velocity seems to be in mm/s: give speed_per_unit=0.001"),
+    (dict.fromkeys(("wx", "wy", "wz"), 180 / np.pi), "degrees per second: give rad_per_unit=0.0174533"),
+    ({"vx": -1}, "velocity fits as vel=-vx,vy,vz"),
+    ({"wy": -1}, "angular velocity fits as ang_vel=wx,-wy,wz"),
+    ({"z": -1, "vz": -1}, "pos=x,y,-z vel=vx,vy,-vz"),
+    (dict.fromkeys("y z vy vz qy qz wy wz".split(), -1), "z seems to point down, in world and body"),
+    (dict.fromkeys(("qx", "qy", "qz"), -1), "world to body"),
+]
+"""Factors of columns, and the remedy that the error names."""
+
+
+@pytest.mark.parametrize(("factors", "remedy"), UNITS, ids=[x[1][-24:] for x in UNITS])
+def test_wrong_units_and_signs_are_refused(flights, factors, remedy):
+    for flight in flights[:2]:
+        with pytest.raises(ConfigError, match=remedy):
+            read_log(flight | {key: x * flight[key] for key, x in factors.items()})
+
+
+def test_factors_of_columns_are_applied(flights):
+    """Those that the errors name."""
+    log = {
+        k: x * {"t": 1e3, "x": 1e3, "y": 1e3, "z": 1e3, "vx": 10, "vy": 10, "vz": 10}.get(k, 1)
+        for k, x in flights[0].items()
+    }
+    read = read_log(log, Columns(seconds_per_unit=1e-3, metres_per_unit=1e-3, speed_per_unit=0.1))
+    for key, name in (("t", "t"), ("pos", "x"), ("vel", "vx")):
+        np.testing.assert_allclose(
+            np.reshape(getattr(read, key), (len(read.t), -1))[:, 0], flights[0][name], atol=1e-12
+        )
+
+
+def test_wrong_columns_are_refused(flights):
+    """Orders of quaternions, axes, positions alone, and rotors."""
+    quat = dict(zip(("qx", "qy", "qz", "qw"), (flights[0][k] for k in ("qw", "qx", "qy", "qz")), strict=True))
+    slow = {k: x for k, x in flights[0].items() if k[0] not in "vw"}
+    for log in (flights[0], slow):
+        with pytest.raises(ConfigError, match="order w, x, y, z"):
+            read_log(log | quat)
+    with pytest.raises(ConfigError, match="fits as vel=vy,vx,vz"):
+        read_log(flights[0] | {"vx": flights[0]["vy"], "vy": flights[0]["vx"]})
+    with pytest.raises(ConfigError, match="position seems to be in mm"):
+        read_log(slow | {k: 1e3 * slow[k] for k in "xyz"})
+    with pytest.raises(ConfigError, match="each rotor near"):
+        identify([read_log(flights[0] | {"rpm1": 0 * flights[0]["rpm1"]})])
     radians = flights[0] | {f"rpm{k}": flights[0][f"rpm{k}"] * 2 * np.pi / 60 for k in range(1, 5)}
     with pytest.raises(ConfigError, match="rpm_per_unit"):
         identify([read_log(radians)])
+
+
+def test_a_gyroscope_that_fails_is_left_out(flights):
+    """A rate that grows to 200 rad/s in the last 0.4 s, of pieces of 2 s of three flights in a row."""
+    log = {
+        k: np.concatenate([x[k] + (2.0 * i if k == "t" else 0) for i, x in enumerate(flights[:3])]) for k in flights[0]
+    }
+    log["wx"][1000:] += np.linspace(50, 200, 500)
+    read = read_log(log)
+    assert "without an angular velocity that turns the attitude" in read.repairs[0]
+    assert read.t[-1] == pytest.approx(log["t"][999], abs=0.2)
+
+
+def test_factors_that_no_body_explains_are_refused(flights):
+    with pytest.raises(ConfigError, match=r"thrust factor 18\.\d, inertia x"):
+        identify([read_log(x) for x in flights[:2]], mass=0.75)
+
+
+FILES = {
+    "": "expected names of columns in the first line",
+    "t;x;y\n0;1;2": "semicolons between them",
+    "0,1,2\n1,2,3": "got numbers: 0,1,2",
+    "t,x,x\n1,2,3": "got 'x' twice",
+    "t,x,y\n0,1,2\n0,1\n": "got 1 such rows and 1 others, the first with 2 in line 3. Export",
+    "t,x\nnoon,1\nlater,2\n": "one number a sample in column t, got noon in its first row",
+}
+
+
+@pytest.mark.parametrize("text", FILES, ids=lambda x: x[:6].strip())
+def test_bad_csv_files_are_refused_in_a_line(tmp_path, text):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(ConfigError, match=FILES[text]):
+        read_log(tmp_path / "log.csv")
+
+
+def test_csv_files_with_few_faults_are_repaired(flights, tmp_path):
+    """A byte order mark, a column of text, an empty cell and a torn last line."""
+    rows = [[f"{x:.9g}" for x in row] for row in np.stack(list(flights[0].values()), -1)]
+    rows[30][1] = ""
+    lines = [",".join(["mode", *flights[0]]), *(",".join(["ANGLE", *row]) for row in rows)]
+    lines[-1] = lines[-1][:30]
+    (tmp_path / "log.csv").write_text("\ufeff" + "\n".join(lines), encoding="utf-8")
+    read = read_log(tmp_path / "log.csv")
+    assert len(read.t) == len(rows) - 1
+    assert [" ".join(x.split()[:3]) for x in read.repairs] == ["dropped 1 rows", "interpolated 1 samples"]
+    with pytest.raises(ConfigError, match="one number a sample in column mode, got ANGLE"):
+        read_log(tmp_path / "log.csv", Columns(voltage=("mode",)))
+
+
+def test_arrays_that_are_no_columns_are_refused(flights, tmp_path):
+    with pytest.raises(ConfigError, match="equal length, got t of 500, x of 499"):
+        read_log(flights[0] | {"x": flights[0]["x"][1:]})
+    with pytest.raises(ConfigError, match=r"one number a sample in column rpm1, got shape \(500, 1\)"):
+        read_log(flights[0] | {"rpm1": flights[0]["rpm1"][:, None]})
+    (tmp_path / "log.npz").write_bytes(b"PK torn")
+    with pytest.raises(ConfigError, match="Write the file again"):
+        read_log(tmp_path / "log.npz")
 
 
 def test_logs_without_rotor_speeds_are_refused(flights):

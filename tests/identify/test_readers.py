@@ -14,6 +14,8 @@ T = 5.0 + 0.01 * np.arange(N)
 ANGLE = 0.3 * np.sin(T)
 """Roll, rad: the drones of these logs swing about their first axis."""
 RATE = 0.3 * np.cos(T)
+SIDE = 9.81 * ANGLE
+"""Position along y, m: roll accelerates a drone by ``-g roll``, which this is twice the integral of."""
 
 
 def crazyflie(path, version=2, pause=(), damaged=False):
@@ -42,7 +44,9 @@ def crazyflie(path, version=2, pause=(), damaged=False):
         if k % 2 == 0 and k not in pause:
             quat = np.sin(ANGLE[k] / 2), 0, 0, np.cos(ANGLE[k] / 2)
             body.append(
-                struct.pack("<H", 7) + time + struct.pack("<14f", T[k], 2, 3, 1, 0, 0, *quat, 1e4, 1e4, 1e4, 1e4)
+                struct.pack("<H", 7)
+                + time
+                + struct.pack("<14f", T[k], SIDE[k], 3, 1, 9.81 * RATE[k], 0, *quat, 1e4, 1e4, 1e4, 1e4)
             )
     data = head + b"".join(body)
     path.write_bytes((data + struct.pack("<I", crc32(data)))[: -7 if damaged else None])
@@ -114,9 +118,10 @@ def ulog(path, leave_out=()):
         quat = np.array([np.cos(ANGLE[k] / 2), np.sin(ANGLE[k] / 2), 0, 0]) * (-1 if k > N // 2 else 1)
         content = {
             "esc_status": stamp + b"".join(stamp + struct.pack("<i", 1000 * (i + 1)) for i in range(4)) + b"\x04",
-            "vehicle_local_position": stamp + struct.pack("<6f", 1, 2, -3, 0.1, 0.2, -0.3),
+            "vehicle_local_position": stamp
+            + struct.pack("<6f", 1 + 0.1 * t, -SIDE[k], -3 - 0.3 * t, 0.1, -9.81 * RATE[k], -0.3),
             "vehicle_attitude": stamp + struct.pack("<4f", *quat),
-            "vehicle_angular_velocity": stamp + struct.pack("<3f", RATE[k], 0.5, 0.25),
+            "vehicle_angular_velocity": stamp + struct.pack("<3f", RATE[k], 0.05, 0.025),
         }
         data += b"".join(message("D", struct.pack("<H", i) + content[name]) for i, name in enumerate(names))
     path.write_bytes(data)
@@ -126,9 +131,9 @@ def ulog(path, leave_out=()):
 def test_ulogs_are_read_with_axes_up_and_left(tmp_path):
     pytest.importorskip("pyulog")
     log = read_log(ulog(tmp_path / "flight.ulg"))
-    np.testing.assert_allclose(log.pos[5], [1, -2, 3])
-    np.testing.assert_allclose(log.vel[5], [0.1, -0.2, 0.3], rtol=1e-6)
-    np.testing.assert_allclose(log.ang_vel[:, 1:], [[-0.5, -0.25]] * len(log.t))
+    np.testing.assert_allclose(log.pos[5], [1 + 0.1 * T[5], SIDE[5], 3 + 0.3 * T[5]], rtol=1e-6)
+    np.testing.assert_allclose(log.vel[5], [0.1, 9.81 * RATE[5], 0.3], rtol=1e-6)
+    np.testing.assert_allclose(log.ang_vel[:, 1:], [[-0.05, -0.025]] * len(log.t), rtol=1e-6)
     np.testing.assert_allclose(log.quat[:, 0], np.sin(ANGLE / 2)[: len(log.t)], atol=1e-6)
     np.testing.assert_allclose(log.rotor_vel[5], [1000, 2000, 3000, 4000])
 
@@ -146,6 +151,14 @@ FAST = np.arange(5.0, 5.0 + 0.01 * N, 0.001)
 def swing(t):
     """Return roll, rad, and its rate, rad/s, of a swing that does not repeat itself."""
     return 0.3 * np.sin(t) + 0.1 * np.sin(2.7 * t), 0.3 * np.cos(t) + 0.27 * np.cos(2.7 * t)
+
+
+def drift(t):
+    """Return position, m, and velocity, m/s, along y that follow from that roll."""
+    return (
+        9.81 * (0.3 * np.sin(t) + 0.1 / 2.7**2 * np.sin(2.7 * t)),
+        9.81 * (0.3 * np.cos(t) + 0.1 / 2.7 * np.cos(2.7 * t)),
+    )
 
 
 def blackbox(path, explorer=False, damaged=0, leave_out=()):
@@ -178,7 +191,7 @@ def mocap(offset=0.0, reverse=False):
         angle = np.cumsum(np.random.default_rng(0).normal(size=N)) * 0.03
     columns = {
         "x": T,
-        "y": 2 * T,
+        "y": drift(T)[0],
         "z": T**2 / 2,
         "qx": np.sin(angle / 2),
         "qy": 0 * T,
@@ -196,7 +209,8 @@ def test_blackbox_logs_are_joined_with_motion_capture(tmp_path, explorer):
     np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=2e-3)
     # The clocks agree to a fraction of the 0.005 s of the search.
     np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]), angle, atol=3e-3)
-    np.testing.assert_allclose(log.vel[20:-20, 1], 2, atol=1e-3)  # differentiated
+    # Differentiated: lines through 0.06 s at jerks of up to 7 m/s^3, with clocks that agree to 2 ms.
+    np.testing.assert_allclose(log.vel[20:-20, 1], drift(log.t - log.t[0] + 5.0015)[1][20:-20], atol=0.02)
     np.testing.assert_allclose(log.vel[20:-20, 2], log.pos[20:-20, 0], atol=5e-3)
     poles = 12 if explorer else 14
     np.testing.assert_allclose(log.rotor_vel[0], np.arange(60, 64) * 200 / poles)
@@ -272,13 +286,17 @@ def bag(path, leave_out=(), odometry=True):
             if k % 2:
                 continue
             pose = make(
-                "geometry_msgs/msg/Pose", position=vector("Point", 1, t, 3), orientation=vector("Quaternion", *quat)
+                "geometry_msgs/msg/Pose",
+                position=vector("Point", 1, drift(t)[0], 3),
+                orientation=vector("Quaternion", *quat),
             )
             if odometry:
-                # 1 m/s along world y, in the frame of the body.
+                # The velocity along world y, in the frame of the body.
+                speed = drift(t)[1]
                 twist = make(
                     "geometry_msgs/msg/Twist",
-                    linear=vector("Vector3", 0, np.cos(angle), -np.sin(angle)), angular=vector("Vector3", 9, 9, 9),
+                    linear=vector("Vector3", 0, speed * np.cos(angle), -speed * np.sin(angle)),
+                    angular=vector("Vector3", 9, 9, 9),
                 )  # fmt: skip
                 message = make(
                     pose_kind, header=header(t), child_frame_id="body",
@@ -312,7 +330,9 @@ def test_ros_bags_are_read_by_the_types_of_their_topics(tmp_path, odometry):
     angle, rate = swing(log.t + 5.0)
     np.testing.assert_allclose(2 * np.arcsin(log.quat[:, 0]) * np.sign(log.quat[0, 3]), angle, atol=1e-3)
     np.testing.assert_allclose(log.ang_vel[:, 0], rate, atol=1e-6)
-    np.testing.assert_allclose(log.vel, [[0, 1, 0]] * len(log.t), atol=2e-3)  # linear interpolation of the twist
+    # Linear interpolation of the twist; the velocity that is differentiated lacks up to 0.06 s at both ends.
+    np.testing.assert_allclose(log.vel[12:-12, 1], drift(log.t + 5.0)[1][12:-12], atol=1e-2)
+    np.testing.assert_allclose(log.vel[:, ::2], 0, atol=2e-3)
     np.testing.assert_allclose(log.rotor_vel[7], np.arange(100, 500, 100) * 60 / (2 * np.pi))
 
 

@@ -1,0 +1,215 @@
+"""Checks that the columns of a log describe one motion: units, axes, signs and order follow from mechanics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.identify.columns import Columns
+from crazysim.identify.motion import body_rates, integral
+
+GRAVITY = 9.81
+RATIOS = (0.5, 2.0)
+"""Ratios of measured to expected motion that count as agreement, on each axis that moves. Of the logs of two public
+benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
+DIVERGED = 10.0
+"""Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
+PIECE = 2.0
+"""Duration of the pieces that are left out where a rate has diverged, s."""
+
+
+class Pair(NamedTuple):
+    """Changes over windows of equal duration that must be equal."""
+
+    what: str
+    """Property of the columns that makes them equal."""
+    measured: NDArray
+    """Measured changes. (n, 3)"""
+    expected: NDArray
+    """Changes that follow from other columns. (n, 3)"""
+    floor: float
+    """Change below which an axis does not move, in the unit of the changes."""
+
+    def ratios(self) -> NDArray:
+        """Return the median ratio of both on each axis where it moves most, NaN for axes that do not move. (3,)"""
+        found = np.full(3, np.nan)
+        for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
+            most = np.abs(y) >= np.quantile(np.abs(y), 0.75)
+            size, along = np.median(np.abs(y[most])), np.median(x[most] * np.sign(y[most]))
+            if max(size, np.median(np.abs(x[most]))) > self.floor:
+                found[k] = along / size if size > 0 else np.inf
+        return found
+
+    def agrees(self) -> bool:
+        """Return True if the ratios of all axes that move are those of one motion."""
+        ratios = self.ratios()
+        return bool(np.all(np.isnan(ratios) | ((ratios > RATIOS[0]) & (ratios < RATIOS[1]))))
+
+
+def check_motion(
+    name: str, t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...], repairs: list[str]
+) -> NDArray:
+    """Return True for the samples whose columns describe one motion. (n,)
+
+    The velocity must move the position, the angular velocity must turn the attitude, the thrust must point up on
+    average, and thrust and gravity must accelerate the drone. Pieces in which a measured rate has diverged, such as
+    that of a gyroscope that failed, are left out.
+
+    Args:
+        name: Name of the log, for messages.
+        t: Time, s. (n,)
+        data: Columns by field of ``Columns``, in the units of a log.
+        derived: Fields that were not measured but differentiated.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If they do not, with the change of the columns that mends it, if one does.
+    """
+    keep = np.ones(len(t), bool)
+    for pair, width in _rates(t, data, derived):
+        bad = _diverged(pair, round(PIECE / float(np.median(np.diff(t)))))
+        if 0 < np.sum(bad) <= len(bad) / 2:
+            keep[np.flatnonzero(bad)[:, None] + np.arange(width + 1)] = False
+            repairs.append(f"dropped {np.sum(~keep)} samples without {pair.what}, which the others have")
+    t, data = t[keep], {key: x[keep] for key, x in data.items()}
+    if (fault := _fault(t, data, derived)) is None:
+        return keep
+    for remedy, changed in _alternatives(data, derived):
+        if _fault(t, changed, derived) is None:
+            raise ConfigError(f"{name}: expected {fault}. {remedy}.")
+    raise ConfigError(
+        f"{name}: expected {fault}. Check units, signs and order of the columns: z up, quaternions xyzw and body to "
+        "world, angular velocities in the body frame, rad/s."
+    )
+
+
+def _fault(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> str | None:
+    """Return the first law that the columns break with what was found, None if they break none."""
+    up = float(np.median(_thrust_axis(data["quat"])[:, 2]))
+    if not up > 0:
+        return f"a thrust that points up in most samples, got {up:.2f} as the median of its z component"
+    for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
+        if not pair.agrees():
+            shown = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in pair.ratios())
+            return f"{pair.what}, got ratios of measured to expected changes of {shown} on x, y, z, where 1 is right"
+    return None
+
+
+def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
+    """Yield the rates that were measured, beside what they are the rates of, and the samples of a window."""
+    if "vel" not in derived:
+        width, (moved, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
+        yield Pair("a velocity that moves the position", moved, expected, 0.01), width
+    if "ang_vel" not in derived:
+        turned = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
+        turned = np.concatenate([np.zeros((1, 3)), turned])
+        width, (moved, expected) = _changes(t, 0.1, turned, integral(data["ang_vel"], t))
+        yield Pair("an angular velocity that turns the attitude", moved, expected, 0.01), width
+
+
+def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
+    """Return changes of the acceleration beside those that follow from attitude, rotor speeds and gravity.
+
+    The thrust over the mass is proportional to the squares of the speeds, with the weight as its median along z;
+    without speeds it balances the weight. Changes between windows leave out what is
+    constant, such as the drag of a cruise.
+    """
+    axis = _thrust_axis(data["quat"])
+    if data["rotor_vel"].shape[1]:
+        squares = np.sum(data["rotor_vel"] ** 2, axis=1)
+        middle = float(np.median(squares * axis[:, 2]))
+        thrust = GRAVITY * squares / middle if middle > 0 else np.zeros(len(t))
+        flying = squares > np.median(squares) / 2
+    else:
+        thrust, flying = GRAVITY / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
+    expected = integral(thrust[:, None] * axis - [0, 0, GRAVITY], t)
+    ground = np.cumsum(~flying)[:, None] * np.ones(3)
+    width, (measured, expected, ground) = _changes(t, 0.25, data["vel"], expected, ground)
+    air = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)
+    if not np.any(air):
+        return Pair("", np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
+    measured, expected = ((x[width:] - x[:-width])[air] for x in (measured, expected))
+    if not data["rotor_vel"].shape[1]:
+        measured = measured * [1, 1, 0]  # Nothing is expected of z without speeds.
+    return Pair("accelerations that follow from thrust and gravity", measured, expected, 0.1)
+
+
+def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
+    """Return the samples of a window, and the changes of series over all windows; zero for those that cross a gap."""
+    dt = float(np.median(np.diff(t)))
+    width = min(max(1, round(duration / dt)), len(t) - 1)
+    whole = t[width:] - t[:-width] < 1.5 * width * dt
+    return width, [(x[width:] - x[:-width]) * whole[:, None] for x in series]
+
+
+def _diverged(pair: Pair, size: int) -> NDArray:
+    """Return True for the windows of pieces in which the error exceeds ten times the motion. (n,)"""
+    motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
+    typical, bad = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
+    for k in range(0, len(motion), size):
+        part = slice(k, k + size)
+        bad[part] = np.median(error[part]) > DIVERGED * max(typical, float(np.median(motion[part])))
+    return bad
+
+
+def _thrust_axis(quat: NDArray) -> NDArray:
+    """Return the z axis of the body in the world. (n, 3)"""
+    x, y, z, w = quat.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+
+
+def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
+    """Yield columns as they would be if a common mistake were mended, with the change that mends it."""
+
+    def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
+        if "pos" in factors and "vel" in derived:
+            factors["vel"] = factors["pos"]
+        return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
+
+    for unit, x in (("mm", 1e-3), ("cm", 1e-2), ("feet", 0.3048)):
+        yield f"The position seems to be in {unit}: give metres_per_unit={x:g}", scaled(pos=x)
+        if "vel" not in derived:
+            yield f"The velocity seems to be in {unit}/s: give speed_per_unit={x:g}", scaled(vel=x)
+            both = f"give metres_per_unit={x:g} and speed_per_unit={x:g}"
+            yield f"Position and velocity seem to be in {unit}: {both}", scaled(pos=x, vel=x)
+    degrees = math.pi / 180
+    yield (
+        f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",
+        scaled(ang_vel=degrees),
+    )
+    first, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
+    yield (
+        "The quaternions seem to be in the order w, x, y, z: name them in the order x, y, z, w",
+        {**data, "quat": first},
+    )
+    yield "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw", scaled(quat=inverse)
+    yield (
+        "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw in this order",
+        {**data, "quat": first * np.array(inverse)},
+    )
+    down = (1, -1, -1)
+    yield (
+        "z seems to point down, in world and body: give the signs pos=x,-y,-z vel=vx,-vy,-vz quat=qx,-qy,-qz,qw "
+        "ang_vel=wx,-wy,-wz",
+        scaled(pos=down, vel=down, quat=(*down, 1), ang_vel=down),
+    )
+    yield "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz", scaled(pos=(1, 1, -1), vel=(1, 1, -1))
+    for key, word in (("vel", "velocity"), ("ang_vel", "angular velocity"), ("pos", "position")):
+        if key in derived:
+            continue
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+            fields = getattr(Columns(), key)
+            names = ",".join(("-" if sign < 0 else "") + fields[k] for k, sign in zip(order, signs, strict=True))
+            yield (
+                f"The {word} fits as {key}={names}, with names of your columns",
+                {
+                    **data,
+                    key: data[key][:, order] * signs,
+                },
+            )

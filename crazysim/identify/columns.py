@@ -1,0 +1,127 @@
+"""Names and units of the columns of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Names of a log's columns; ``-`` before a name changes the sign.
+
+    A log may lack columns of velocity and angular velocity, which are then differentiated; rotor speeds, commands and
+    voltage.
+    """
+
+    pos: tuple[str, ...] = ("x", "y", "z")
+    """Position, world frame, m."""
+    quat: tuple[str, ...] = ("qx", "qy", "qz", "qw")
+    """Attitude, body to world, xyzw."""
+    vel: tuple[str, ...] = ("vx", "vy", "vz")
+    """Velocity, world frame, m/s."""
+    ang_vel: tuple[str, ...] = ("wx", "wy", "wz")
+    """Angular velocity, body frame, rad/s."""
+    rotor_vel: tuple[str, ...] = ("rpm1", "rpm2", "rpm3", "rpm4")
+    """Rotor speeds in the order of the airframe's rotors."""
+    command: tuple[str, ...] = ("command1", "command2", "command3", "command4")
+    """Commands of the rotors in the order of the airframe's rotors, in any unit if their speeds were measured."""
+    attitude_command: tuple[str, ...] = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
+    """Commanded roll, pitch and yaw, rad, and collective thrust, N."""
+    voltage: tuple[str, ...] = ("voltage",)
+    """Voltage of the battery, V."""
+    time: str = "t"
+    """Time, s."""
+    seconds_per_unit: float = 1.0
+    """Factor from the logged times to s, of tables: other files state their unit."""
+    metres_per_unit: float = 1.0
+    """Factor from the logged positions to m."""
+    speed_per_unit: float = 1.0
+    """Factor from the logged velocities to m/s."""
+    rad_per_unit: float = 1.0
+    """Factor from the logged angular velocities to rad/s."""
+    rpm_per_unit: float = 1.0
+    """Factor from the logged rotor speeds to rpm."""
+    rad_per_command: float = 1.0
+    """Factor from the commanded angles to rad."""
+    newton_per_command: float = 1.0
+    """Factor from the commanded collective thrust to N."""
+    share_per_command: float = 1.0
+    """Factor from the commands of the rotors to shares of the battery's voltage."""
+
+
+KNOWN = {
+    "crazysim": Columns(),
+    "idsia": Columns(
+        pos=("x_mocap", "y_mocap", "z_mocap"),
+        rotor_vel=("m1_erpm", "m2_erpm", "m3_erpm", "m4_erpm"),
+        command=("m1_thrust", "m2_thrust", "m3_thrust", "m4_thrust"),
+        voltage=("Vbat",),
+        rpm_per_unit=1 / 6,
+    ),
+    "nanobench": Columns(
+        pos=("px", "py", "pz"),
+        ang_vel=("imu_gyro_x", "imu_gyro_y", "imu_gyro_z"),
+        rotor_vel=(),
+        command=("motor_motor_m1", "motor_motor_m2", "motor_motor_m3", "motor_motor_m4"),
+        voltage=("pwr_pm_vbat",),
+        share_per_command=1 / 65535,
+    ),
+}
+"""Columns of known logs: the default names, IDSIA's benchmark (arXiv 2512.14450; motors of six pole pairs), and
+NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
+OPTIONAL = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
+"""Fields whose columns a log may lack."""
+
+
+def plain(name: str) -> str:
+    """Return the name of a column without its sign."""
+    return name.removeprefix("-")
+
+
+def stacked(name: str, table: Mapping[str, NDArray], names: Sequence[str], factor: float = 1.0) -> NDArray:
+    """Return columns side by side, with their signs, times a factor. (n, len(names))
+
+    Raises:
+        ConfigError: If columns are missing, are not numbers, or differ in length.
+    """
+    if absent := [plain(x) for x in names if plain(x) not in table]:
+        raise ConfigError(
+            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them in a Columns."
+        )
+    columns = [_numbers(name, plain(x), table[plain(x)]) for x in names]
+    lengths = {plain(x): len(c) for x, c in zip(names, columns, strict=True)}
+    if len(set(lengths.values())) > 1:
+        raise ConfigError(
+            f"{name}: expected columns of equal length, got "
+            f"{', '.join(f'{x} of {n}' for x, n in lengths.items())} samples. Sample all of them at the same times."
+        )
+    signs = [factor * (-1.0 if x.startswith("-") else 1.0) for x in names]
+    return np.stack([s * c for s, c in zip(signs, columns, strict=True)], axis=-1)
+
+
+def _numbers(name: str, key: str, values: NDArray) -> NDArray:
+    """Return one column as numbers."""
+    x = np.asarray(values)
+    if x.dtype.kind not in "fiub" or x.ndim != 1:
+        got = f"{x.ravel()[0]!s:.40} in its first row" if x.ndim == 1 and x.size else f"shape {x.shape} of {x.dtype}"
+        raise ConfigError(
+            f"{name}: expected one number a sample in column {key}, got {got}. "
+            "Convert it to numbers, or name another column."
+        )
+    return x.astype(np.float64)
+
+
+def missing(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
+    """Return the columns that a log lacks; those of default names are optional as a whole."""
+    names = [columns.time, *columns.pos, *columns.quat]
+    for key in OPTIONAL:
+        given = getattr(columns, key)
+        if given != getattr(KNOWN["crazysim"], key) or any(plain(x) in table for x in given):
+            names += given
+    return [plain(x) for x in names if plain(x) not in table]

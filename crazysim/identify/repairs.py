@@ -1,0 +1,201 @@
+"""Repairs of logs, which are reported."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+
+REPAIRABLE = 0.05
+"""Largest share of samples that may be repaired; a log with more is an error."""
+UNIT = 1e-3
+"""Deviation of a quaternion's norm from 1 that counts as rounding."""
+BRIDGED = 0.03
+"""Longest time that is interpolated, s. A straight line over T differs from a sine of frequency f by at most
+``(2 pi f T)^2 / 8`` of its amplitude: by 11% at 5 Hz, about the fastest that a small drone follows."""
+PERIODS = (1e-4, 0.2)
+"""Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; at less than 5 Hz nothing
+is left of the rotation."""
+UNITS_OF_TIME = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+NEIGHBOURS = 10
+"""Samples on both sides of an interval that show if time was lost or only jitters."""
+
+
+def check_period(name: str, t: NDArray) -> None:
+    """Check that samples follow each other as in a log of a flight.
+
+    Args:
+        name: Name of the log, for messages.
+        t: Time, s. (n,)
+
+    Raises:
+        ConfigError: If they do not, with the unit that the time seems to have.
+    """
+    steps = np.diff(t[np.isfinite(t)])
+    steps = steps[steps > 0]
+    period, (least, most) = float(np.median(steps)) if len(steps) else 0.0, PERIODS
+    if not len(steps) or least <= period <= most:
+        return
+    units = [(unit, x) for unit, x in UNITS_OF_TIME.items() if least <= period * x <= most]
+    hint = f"The times seem to be in {units[0][0]}: give seconds_per_unit={units[0][1]:g}" if units else (
+        "Give seconds_per_unit, the factor from the logged times to s"
+    )  # fmt: skip
+    raise ConfigError(f"{name}: expected samples every {least:g} to {most:g} s, got every {period:.4g} s. {hint}.")
+
+
+def increasing(name: str, t: NDArray, repairs: list[str]) -> NDArray:
+    """Return the samples of the longest sequence whose time increases. (n,), True where a sample is kept.
+
+    A single time that is too early or too late is thus dropped alone.
+    """
+    keep = np.isfinite(t)
+    if not np.all(np.diff(t[keep]) > 0):
+        keep = _longest_increasing(t)
+    if np.sum(keep) > 2:  # A clock that is set at the start, or garbage at the end.
+        at, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
+        keep[[at[k] for k, step in ((0, 0), (-1, -2)) if t[at[step + 1]] - t[at[step]] > 100 * dt]] = False
+    lost = int(np.sum(~keep))
+    if len(t) < 20 or lost > REPAIRABLE * len(t):
+        raise ConfigError(
+            f"{name}: expected at least 20 samples whose time increases, got {len(t)} of which {lost} do not. "
+            "Cut the log into flights."
+        )
+    if lost:
+        repairs.append(f"dropped {lost} samples whose time is not between those of their neighbours")
+    return keep
+
+
+def _longest_increasing(t: NDArray) -> NDArray:
+    """Return True for the samples of the longest increasing sequence: patience sorting. (n,)"""
+    ends: list[float] = []
+    last: list[int] = []
+    before = np.full(len(t), -1)
+    for k, x in enumerate(t):
+        if np.isfinite(x):
+            length = bisect_left(ends, x)
+            before[k] = last[length - 1] if length else -1
+            ends[length : length + 1], last[length : length + 1] = [float(x)], [k]
+    keep, k = np.zeros(len(t), bool), last[-1] if last else -1
+    while k >= 0:
+        keep[k], k = True, int(before[k])
+    return keep
+
+
+def gaps_of(name: str, t: NDArray, repairs: list[str]) -> NDArray:
+    """Return the indices of samples that follow a gap. (n_gaps,)
+
+    A gap is an interval of over 1.5 times the median for which the next ones do not make up: time that only jitters
+    leaves none.
+    """
+    steps = np.diff(t)
+    dt = float(np.median(steps))
+    wide = 1 + np.flatnonzero(steps > 1.5 * dt)
+    over = min(5 * NEIGHBOURS, len(t) - 1)
+    late = t - t[0] - np.median(t[over:] - t[:-over]) / over * np.arange(len(t))
+    sides = [(late[max(k - NEIGHBOURS, 0) : k], late[k : k + NEIGHBOURS]) for k in wide]
+    lost = [np.median(b) - np.median(a) > dt / 2 and np.min(b) > np.max(a) for a, b in sides]
+    gaps = wide[np.array(lost, bool)]
+    if len(wide) > len(gaps):
+        repairs.append(
+            f"kept {len(wide) - len(gaps)} intervals of the time of up to {np.max(steps[wide - 1]):.3g} s that the "
+            "next ones make up for, as jitter"
+        )
+    if len(gaps):
+        longest = float(np.max(steps[gaps - 1]))
+        if longest > 10 * (t[-1] - t[0] - longest):
+            raise ConfigError(f"{name}: expected one flight, got a pause of {longest:.3g} s. Cut the log into flights.")
+        repairs.append(f"{len(gaps)} gaps, the longest {longest:.3g} s; no prediction crosses them")
+    return gaps
+
+
+def bridged(name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str]) -> tuple[NDArray, dict[str, NDArray]]:
+    """Return the data, interpolated where values are missing for up to ``BRIDGED``; the samples of longer times go.
+
+    Values are missing where they are not finite, and attitudes where a quaternion is zero, as of a lost motion capture.
+    """
+    keep, lost, whole = np.ones(len(t), bool), [], {}
+    for key, x in data.items():
+        good = np.all(np.isfinite(x), axis=-1)
+        if key == "quat":
+            good &= np.linalg.norm(np.where(np.isfinite(x), x, 0.0), axis=-1) > UNIT
+        if 2 * np.sum(good) < len(t):
+            raise ConfigError(
+                f"{name}: expected finite {key}{' that is not zero' if key == 'quat' else ''}, got {np.sum(~good)} "
+                f"samples of {len(t)} that are not. Cut the log to where it is whole."
+            )
+        if key == "quat":
+            x = x.copy()
+            x[good] = unit(name, x[good], repairs)
+            if not np.all(good):
+                x[good] = continuous(x[good])
+        at = np.flatnonzero(good)
+        pauses = np.flatnonzero((np.diff(at) > 1) & (np.diff(t[at]) > BRIDGED))
+        known = np.zeros(len(t), bool)
+        known[at[0] : at[-1] + 1] = True
+        for k in pauses:
+            known[at[k] + 1 : at[k + 1]] = False
+        if not np.all(known):
+            lost.append(key)
+            keep &= known
+        few = int(np.sum(known & ~good))
+        if few > REPAIRABLE * len(t):
+            raise ConfigError(
+                f"{name}: expected finite {key}, got {few} samples of {len(t)} that are not. "
+                "Cut the log to where it is whole, or leave the column out."
+            )
+        if few:
+            repairs.append(f"interpolated {few} samples of {key} that were not finite{' or zero' * (key == 'quat')}")
+        if not np.all(good):
+            x = np.stack([np.interp(t, t[good], c[good]) for c in x.T], axis=-1)
+            x = x / np.linalg.norm(x, axis=-1, keepdims=True) if key == "quat" else x
+        whole[key] = x
+    if lost:
+        repairs.append(
+            f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {BRIDGED:g} s"
+        )
+    return t[keep], {key: x[keep] for key, x in whole.items()}
+
+
+def without_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
+    """Return rotor speeds, interpolated where they are negative or more than three times their median. (n, n_rotors)"""
+    good = (x >= 0) & (x <= 3 * np.median(x, axis=0))
+    bad = int(np.sum(~good))
+    if bad > REPAIRABLE * x.size:
+        raise ConfigError(
+            f"{name}: expected rotor speeds from 0 to three times their median, got {bad} others. "
+            "Cut the log to the flight, and check that the columns are speeds."
+        )
+    if not bad:
+        return x
+    repairs.append(f"interpolated {bad} rotor speeds that were negative or more than three times the median")
+    index = np.arange(len(x))
+    return np.stack([np.interp(index, index[g], c[g]) for c, g in zip(x.T, good.T, strict=True)], axis=-1)
+
+
+def unit(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
+    """Return unit quaternions; a constant that was added to each component is found by fitting a unit sphere."""
+    norm = np.linalg.norm(quat, axis=-1)
+    if np.all(np.abs(norm - 1) < UNIT):
+        return quat / norm[:, None]
+    if not np.all(np.abs(norm - 1) < 0.2):
+        raise ConfigError(
+            f"{name}: expected unit quaternions, got norms from {norm.min():.3g} to {norm.max():.3g}. "
+            "Name four components, x, y, z and w in this order, as quat."
+        )
+    solution, *_ = np.linalg.lstsq(np.c_[2 * quat, np.ones(len(quat))], norm**2, rcond=None)
+    moved = quat - solution[:4]
+    moved_norm = np.linalg.norm(moved, axis=-1)
+    if np.all(np.abs(moved_norm - 1) < UNIT):
+        offset = ", ".join(f"{x:.4f}" for x in solution[:4])
+        repairs.append(f"subtracted ({offset}) from the quaternions, which makes them unit")
+        return moved / moved_norm[:, None]
+    repairs.append(f"normalised quaternions of norms from {norm.min():.4f} to {norm.max():.4f}")
+    return quat / norm[:, None]
+
+
+def continuous(quat: NDArray) -> NDArray:
+    """Return quaternions whose neighbours have one sign, as interpolation needs: q and -q are one attitude. (n, 4)"""
+    return quat * np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])[:, None]

@@ -1,0 +1,72 @@
+"""Files of logs as tables of columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.identify.bags import is_bag, read_bag
+from crazysim.identify.blackbox import header_of, read_blackbox
+from crazysim.identify.columns import KNOWN, OPTIONAL, Columns, plain, stacked
+from crazysim.identify.delimited import read_delimited
+from crazysim.identify.readers import read_crazyflie, read_ulog
+from crazysim.identify.repairs import check_period
+
+
+def read_table(
+    source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
+) -> tuple[str, Mapping[str, NDArray]]:
+    """Return the name of a log and its columns, with the time in s.
+
+    Args:
+        source: File, or columns by name.
+        repairs: List that descriptions of repairs are appended to.
+        columns: Names of the columns, None for the default ones.
+
+    Raises:
+        ConfigError: If the file cannot be read, or the interval of its samples is none of a flight.
+    """
+    if isinstance(source, Mapping):
+        return "log", _in_seconds("log", source, columns)
+    path = Path(source)
+    if is_bag(path) and path.exists():
+        every = [] if columns is None else [x for key in ("pos", "quat", *OPTIONAL) for x in getattr(columns, key)]
+        topics = [plain(x) for x in every if plain(x).startswith("/")]
+        return path.stem, read_bag(path, repairs, topics, () if columns is None else columns.quat)
+    if not path.is_file():
+        raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
+    if path.suffix == ".ulg":
+        return path.stem, read_ulog(path, repairs)
+    if path.suffix == ".npz":
+        return path.stem, _in_seconds(path.stem, _arrays(path), columns)
+    if path.suffix != ".csv":
+        return path.stem, read_crazyflie(path, repairs)
+    if header_of(path) is not None:
+        return path.stem, read_blackbox(path, repairs)
+    return path.stem, _in_seconds(path.stem, read_delimited(path, repairs), columns)
+
+
+def _arrays(path: Path) -> dict[str, NDArray]:
+    """Return the arrays of a .npz file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except (BadZipFile, ValueError, EOFError, OSError) as error:
+        raise ConfigError(
+            f"{path.name}: expected arrays of numbers as of numpy.savez, got {error}. Write the file again."
+        ) from error
+
+
+def _in_seconds(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:
+    """Return the table with its time in s."""
+    names = columns or KNOWN["crazysim"]
+    if names.time not in table:
+        return table
+    t = stacked(name, table, [names.time], names.seconds_per_unit)[:, 0]
+    check_period(name, t)
+    return {**table, names.time: t}
