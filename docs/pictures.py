@@ -1,7 +1,8 @@
 """Draw the pictures that the pages show: ``python docs/pictures.py [NAME ...]`` writes them to ``docs/pictures``.
 
-``flight`` is the moving picture of the README, and ``mixed`` that of the page on features. The plots are those of
-``crazysim demo`` (``tracks.png``), ``crazysim train`` (``training.png``) and ``benchmarks/scaling.py``.
+``flight`` is the moving picture of the README, ``mixed`` that of the page on features, ``allan`` and ``measured`` those
+of the page on sensors. The other plots are those of ``crazysim demo`` (``tracks.png``), ``crazysim train``
+(``training.png``) and ``benchmarks/scaling.py``.
 """
 
 from __future__ import annotations
@@ -11,14 +12,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import matplotlib as mpl
 import numpy as np
 from PIL import Image
 
 import crazysim.demos.mixed as demo
-from crazysim import Follow, Sim
+from crazysim import IMU, Follow, MotionCapture, Sim
 from crazysim.envs import flying
 from crazysim.media import View
+from crazysim.plugins import sensors
+from crazysim.plugins.sensors.imu import DEGREE, G
 from crazysim.trajectories import figure_eight
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
 
 FOLDER = Path(__file__).parent / "pictures"
 COLOURS = np.array(
@@ -62,9 +69,75 @@ def mixed() -> None:
     sim.close()
 
 
+def allan() -> None:
+    """Allan deviation of the gyroscope and accelerometer of simulated BMI088 at rest, beside that of their numbers."""
+    n, freq = 32, 100
+    sim = Sim(n, control="rotor_vel", freq=freq, rng_key=2)
+    gyro = sensors.Triad(noise=0.014 * DEGREE, instability=5.1e-5, correlation_time=20.0, random_walk=5e-6)
+    accel = sensors.Triad(noise=160e-6 * G, instability=3e-4, correlation_time=20.0, random_walk=3e-5)
+    sim.add(IMU(gyro=gyro, accel=accel))
+    kept = sim.rollout(
+        lambda _, data: data.controls.rotor_vel, None, 400 * freq, keep=lambda data: data.plugins["imu"].samples.value
+    )
+    samples = np.asarray(kept, np.float64)[freq:, :, 0]  # in the first second the drones come to rest on the floor
+    m = np.unique(np.logspace(0, 4.1, 24).astype(int))
+    t, fine = m / freq, np.logspace(-2, 2.1, 200)
+    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2), layout="constrained")
+    for axis, triad, first, unit in ((axes[0], gyro, 0, "rad/s"), (axes[1], accel, 3, "m/s²")):
+        total = np.cumsum(samples[..., first : first + 3], axis=0) / freq
+        steps = [total[2 * k :] - 2 * total[k:-k] + total[: -2 * k] for k in m]
+        found = [np.sqrt(np.mean(x**2) / 2) / (k / freq) for x, k in zip(steps, m, strict=True)]
+        ratio = fine / triad.correlation_time
+        wander = triad.instability**2 * (2 * ratio - 3 + 4 * np.exp(-ratio) - np.exp(-2 * ratio)) / ratio**2
+        white, walk = triad.noise**2 / (2 * fine), triad.random_walk**2 * fine / 3
+        axis.loglog(fine, np.sqrt(white + wander + walk), "k-", lw=1, label="of the parameters")
+        for part, name in ((white, "white noise"), (wander, "wandering bias"), (walk, "random walk")):
+            axis.loglog(fine, np.sqrt(part), "--", lw=0.8, label=name)
+        axis.loglog(t, found, "o", ms=4, mfc="none", label=f"simulated, {n} units")
+        axis.set(xlabel="averaging time, s", ylabel=f"Allan deviation, {unit}")
+        axis.set_ylim(min(found) / 4, max(found) * 2)
+        axis.grid(alpha=0.3)
+    axes[0].set_title("gyroscope")
+    axes[1].set_title("accelerometer")
+    axes[0].legend(fontsize=7)
+    figure.savefig(FOLDER / "allan.png", dpi=100)
+    plt.close(figure)
+
+
+def measured() -> None:
+    """A Crazyflie on a figure eight: what it does, and what its sensors measure."""
+    path = figure_eight(width=1.8, depth=1.1, period=4.0, height=0.6)
+    sim = Sim(control="state", rng_key=3)
+    sim.add(Follow(path))
+    at = path.evaluate(0.0)
+    sim.data = flying(sim.data, at.pos[None], vel=at.vel[None])
+    sim.add(MotionCapture(5e-3, delay=0.02, dropout=0.1, bandwidth=10.0))
+    sim.add(IMU.bmi088())
+    sim.add(sensors.TimeOfFlight())
+    truth, seen = [], []
+    for _ in range(4 * 100):
+        sim.step(sim.freq // 100)
+        s, found = sim.data.states, sim.plugins.observations(sim.data)
+        truth.append([s.vel[0, 0, 0], s.ang_vel[0, 0, 1], s.pos[0, 0, 2]])
+        names = ("motion_capture.vel", "imu.gyro", "time_of_flight.distance")
+        seen.append([found[name][0, 0, k] for name, k in zip(names, (0, 1, 0), strict=True)])
+    t, truth, seen = np.arange(1, 401) / 100, np.array(truth), np.array(seen)
+    figure, axes = plt.subplots(3, 1, figsize=(8.4, 5.4), sharex=True, layout="constrained")
+    labels = ("velocity x, m/s\nMotionCapture", "pitch rate, rad/s\nIMU.bmi088()", "height, m\nTimeOfFlight (slanted)")
+    for k, (axis, label) in enumerate(zip(axes, labels, strict=True)):
+        axis.step(t, seen[:, k], where="post", lw=0.9, color="tab:orange", label="measured")
+        axis.plot(t, truth[:, k], lw=1.2, color="tab:blue", label="true")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[0].legend(loc="upper center", fontsize=8)
+    axes[-1].set_xlabel("time, s")
+    figure.savefig(FOLDER / "measured.png", dpi=100)
+    plt.close(figure)
+
+
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all of them."""
-    for draw in (flight, mixed):
+    for draw in (flight, mixed, allan, measured):
         if not names or draw.__name__ in names:
             draw()
             print(f"drew {draw.__name__}", flush=True)

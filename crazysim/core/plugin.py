@@ -32,6 +32,7 @@ class Simulation(Protocol):
     data: SimData
     default_data: SimData
     step_pipeline: Pipeline
+    reset_pipeline: Pipeline
     airframes: tuple[Airframe, ...]
     integrator: Any
     n_worlds: int
@@ -268,9 +269,29 @@ class Plugin:
                 values[name] = checked
         return kind(**values)
 
+    def check_plugins(self, sim: Simulation) -> None:
+        """Check the simulation with all of its plugins, which may be added in any order, before it steps.
+
+        Raises:
+            ConfigError: If the plugin lacks another one that it needs, or does not go with one.
+        """
+
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of the plugin with their places, in the order in which they are inserted."""
         return ()
+
+    def begin_episode(self, data: SimData) -> SimData:
+        """Return the data of one drone at the beginning of an episode; ``data`` are those after a reset.
+
+        It may write leaves of drones, such as what is drawn for an episode. Random numbers of ``drone_key`` are those
+        of the first step.
+        """
+        return data
+
+    @property
+    def begins_episodes(self) -> bool:
+        """True if resets must call ``begin_episode``."""
+        return type(self).begin_episode is not Plugin.begin_episode
 
     def influence(self, data: SimData) -> SimData:
         """Return the data of one drone as the dynamics are to use it: other forces, commands or parameters.

@@ -12,7 +12,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, numbered, scopes
+from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, numbered, scopes, select_worlds
 
 T = TypeVar("T")
 
@@ -65,6 +65,15 @@ class Stage:
             return new if new is old else jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - mask.ndim)), new, old)
 
         return jax.tree.map(select, after, data)
+
+    def in_worlds(self, data: SimData, mask: Array | None) -> SimData:
+        """Return the data after the stage in the worlds of a mask, (n_worlds,), or in all for None."""
+        after = self(data)
+        return (
+            after
+            if mask is None
+            else jax.tree.map(lambda x, y: x if x is y else select_worlds(mask, x, y), after, data)
+        )
 
     def __repr__(self) -> str:
         return f"<stage {self.__name__} of one {self.scope}>"

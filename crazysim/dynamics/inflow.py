@@ -114,12 +114,13 @@ def ceiling_factor(gap: Array, radius: Array) -> Array:
     ``rho A v^2 (R / d)^2 / 16`` (Bernoulli). The momentum of the wake is thrust less suction,
     ``rho A v v_wake``, and ``T = rho A v_wake^2 / 2``.
     Hsiao and Chirarattananon (2019, arXiv 1905.04632) treat and measure propellers below a ceiling by momentum and
-    blade element theory. Gaps below a twentieth of the radius count as that, an assumption.
+    blade element theory. Gaps below a twentieth of the radius count as that, an assumption. Above the ceiling there is
+    none: the ratio is that of free air, 1.
 
     Args:
-        gap: Distance of the rotor to the ceiling, m. (...)
+        gap: Height of the ceiling over the rotor, m. (...)
         radius: Radius of the propeller, m. (...)
     """
     least = radius / 20
     ratio = radius / jnp.where(gap > least, gap, least)
-    return 0.5 + 0.5 * jnp.sqrt(1 + ratio * ratio / 8)
+    return jnp.where(gap < 0, 1.0, 0.5 + 0.5 * jnp.sqrt(1 + ratio * ratio / 8))

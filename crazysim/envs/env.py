@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -16,7 +16,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive
 from crazysim.core.sharding import beside, commit, put, shard
-from crazysim.core.stage import Stage, over_worlds
+from crazysim.core.stage import Axes, Stage, of_world, over_worlds
 from crazysim.core.stages import reset
 from crazysim.eager import is_traced
 from crazysim.engine.backends import fused
@@ -220,14 +220,13 @@ class DroneEnv(Env):
             self.measured = over_worlds(of_world) if task.batched else of_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
+        sim.plugins.check()
         self._step = sim.build_step_fn()
         self._foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))
-        self.batched_reset = self._foreign or list(sim.reset_pipeline.values()) != [reset]
+        first, *others = sim.reset_pipeline.values()
+        self.batched_reset = self._foreign or first is not reset or not all(isinstance(fn, Stage) for fn in others)
         """True if the reset pipeline has functions of all worlds, or a record of another library is reset."""
-        reset_all, worlds = sim.build_reset_fn().plain, np.ones(sim.n_worlds, bool)
-        self.reset_data: Callable[[SimData, SimData], SimData] = (
-            (lambda data, default: reset_all(data, default, worlds)) if self.batched_reset else reset_world
-        )
+        self.reset_data = self._reset_all() if self.batched_reset else self._reset_world(others)
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
         self._plugins = tuple(sim.plugins.values())
         self.zeros = self._step.zeros(sim.data)
@@ -236,6 +235,22 @@ class DroneEnv(Env):
         world_id = numbered(default).core.world_id
         self.default_varies = any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows)
         """True if episodes begin from different data in different worlds."""
+
+    def _reset_all(self) -> Callable[[SimData, SimData], SimData]:
+        reset_all, worlds = self.sim.build_reset_fn().plain, np.ones(self.sim.n_worlds, bool)
+        return lambda data, default: reset_all(data, default, worlds)
+
+    def _reset_world(self, stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]:
+        """Return a function that resets one world and applies stages of the reset pipeline to it."""
+        axes = Axes(self.sim.data)
+
+        def reset_one(data: SimData, default: SimData) -> SimData:
+            data = reset_world(data, default)
+            for stage in stages:
+                data = of_world(stage, axes)(data)
+            return data
+
+        return reset_one
 
     @property
     def base(self) -> DroneEnv:
@@ -300,7 +315,10 @@ class DroneEnv(Env):
         if self._foreign:
             return "a record in data.plugins is of another library, and is not divided among worlds"
         if self.batched_reset:
-            own = ", ".join(repr(name) for name in self.sim.reset_pipeline if name != "reset")
+            others = [
+                name for name, fn in self.sim.reset_pipeline.items() if not (fn is reset or isinstance(fn, Stage))
+            ]
+            own = ", ".join(map(repr, others))
             return f"{own} of the reset pipeline takes all worlds at once"
         return "episodes begin from different data in different worlds" if self.default_varies else None
 

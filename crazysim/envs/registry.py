@@ -31,7 +31,7 @@ from crazysim.envs.tasks.recover import Recover
 from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
 from crazysim.envs.tasks.transport import Transport
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, shown
 from crazysim.sim.sim import Sim
 
 
@@ -120,11 +120,30 @@ def make(
     settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}
     own = {k: v for k, v in options.items() if k in entry.options}
     task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
+    plugins = [*_plugins("effects", effects), *_plugins("sensors", sensors)]
     sim = Sim(n_worlds=n_worlds, **settings)
+    twice = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
+    if twice:
+        raise ConfigError(
+            f"expected no plugin {twice[0]!r} besides those that the simulation's settings add, got another. Leave it "
+            f"out, give it another name=, or use estimator=Kalman([...]) with sensors of your own."
+        )
     task.install(sim)
-    for plugin in (*effects, *sensors):
+    for plugin in plugins:
         sim.add(plugin)
     return DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
+
+
+def _plugins(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
+    """Return plugins that are given as a list.
+
+    Raises:
+        ConfigError: If they are not.
+    """
+    if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
+        example = "IMU()" if name == "sensors" else "Wind()"
+        raise ConfigError(f"expected {name} as a list of plugins, got {shown(plugins)}. Use {name}=[{example}], say.")
+    return plugins
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

@@ -14,11 +14,11 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integration
-from crazysim.core.pipeline import Pipeline, insert_fn_before
+from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import check_flags
-from crazysim.core.stage import Axes, over_drones, over_worlds
+from crazysim.core.stage import Axes, Stage, over_drones, over_worlds
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.sensors.sensor import Sensor
@@ -49,6 +49,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._installed: dict[str, _Installed] = {}
         self._placing: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
         self._observing: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
+        self._checked = True
 
     def __getitem__(self, name: str) -> Plugin:
         """Return a plugin.
@@ -94,9 +95,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         record, default = plugin.record(self._sim), plugin.default_record(self._sim)
         pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, plugin.stages(self._sim))
         pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
+        resets = dict(self._sim.reset_pipeline)
+        if plugin.begins_episodes:
+            append_fn(resets, Stage(plugin.begin_episode, "drone"), name)
         self._put(name, record, default)
         self._installed[name] = installed
-        self._build(pipeline)
+        self._build(pipeline, resets)
         return plugin
 
     def remove(self, plugin: Plugin | str) -> None:
@@ -105,9 +109,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         self[name]
         pipeline = _without(dict(self._sim.step_pipeline), self._installed[name])
         pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
+        resets = dict(self._sim.reset_pipeline)
+        if self[name].begins_episodes:
+            resets.pop(name, None)
         self._put(name, None, None)
         del self._installed[name]
-        self._build(pipeline)
+        self._build(pipeline, resets)
 
     def replace(self, plugin: P) -> P:
         """Replace the settings of a plugin; see ``Sim.replace``."""
@@ -124,6 +131,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         if _same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
             self._put(name, _continued(record, present), default)
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
+            self._checked = False
             return plugin
         present_pipeline = sim.step_pipeline
         sim.step_pipeline = _without(dict(present_pipeline), self._installed[name])
@@ -132,9 +140,12 @@ class PluginRegistry(Mapping[str, Plugin]):
             pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         finally:
             sim.step_pipeline = present_pipeline
+        resets = dict(self._sim.reset_pipeline)
+        if name in resets and plugin.begins_episodes:
+            resets[name] = Stage(plugin.begin_episode, "drone")
         self._put(name, _continued(record, present), default)
         self._installed[name] = installed
-        self._build(pipeline)
+        self._build(pipeline, resets)
         return plugin
 
     @staticmethod
@@ -160,6 +171,17 @@ class PluginRegistry(Mapping[str, Plugin]):
                 f"expected names that nothing else has, got {twice[0]!r} again. Use "
                 f"{type(plugin).__name__}([...]) with other names."
             )
+
+    def check(self) -> None:
+        """Check that the plugins have each other as they need, if they have changed since the last check.
+
+        Raises:
+            ConfigError: If one lacks another, or two do not go together.
+        """
+        if not self._checked:
+            for plugin in self.values():
+                plugin.check_plugins(self._sim)
+            self._checked = True
 
     def build_records(self) -> None:
         """Put a new record of every plugin into the simulation's data."""
@@ -217,7 +239,10 @@ class PluginRegistry(Mapping[str, Plugin]):
             )
         self._sim.data = _with_record(self._sim.data, name, record)
 
-    def _build(self, pipeline: Pipeline) -> None:
+    def _build(self, pipeline: Pipeline, resets: Pipeline) -> None:
+        self._checked = False
+        if resets != self._sim.reset_pipeline:
+            self._sim.reset_pipeline = resets
         self._sim.step_pipeline = pipeline
         self._sim.build_step_fn()
 

@@ -33,6 +33,8 @@ from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
+from crazysim.errors import ConfigError
+from crazysim.plugins.effects import Residual
 from crazysim.plugins.estimators import Estimator, find_estimator
 from crazysim.plugins.registry import P, PluginRegistry
 from crazysim.pytree import on_device
@@ -101,6 +103,7 @@ class Sim:
         controller: str | Controller | Sequence[str | Controller] = DEFAULT,
         switch: Callable[..., Array] | ArrayLike | None = None,
         estimator: str | Estimator | None = None,
+        aero: str | None = None,
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -134,6 +137,8 @@ class Sim:
                 ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with
                 sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``. It is added with its
                 sensors as plugins. None for the true state.
+            aero: ``"identified"`` to add the forces and torques that were identified from flights of the airframes, by
+                ``Residual``; None for those of the model alone.
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -172,6 +177,13 @@ class Sim:
             estimator = find_estimator(estimator)
             for plugin in (*estimator.sensors, estimator):
                 self.add(plugin)
+        if aero is not None:
+            if aero != "identified":
+                raise ConfigError(
+                    f"expected aero='identified' or None, got {aero!r}. Use sim.add(RotorAerodynamics()) for the "
+                    f"other forces of the air on rotors."
+                )
+            self.add(Residual())
 
     @classmethod
     def from_mjcf(
@@ -450,6 +462,7 @@ class Sim:
     @property
     def step_fn(self) -> Step:
         """The step of the pipeline as it is now, ``step(data, n_steps=1) -> data``, pure."""
+        self.plugins.check()
         return self._steps.fn()
 
     @property
@@ -477,6 +490,7 @@ class Sim:
         """
         n_steps = positive("n_steps", n_steps)
         self._adopt_scene()
+        self.plugins.check()
         self._steps.fn()
         self._stepper.advance(n_steps)
         self._scene.invalidate()

@@ -92,7 +92,7 @@ class Reset:
         """Return the same, without a compiled call."""
         for name, fn in self._stages:
             with jax.named_scope(name):
-                data = fn(data, default_data, mask)
+                data = fn.in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)
         return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
 
     def lower(self, data: SimData, default_data: SimData, mask: Any = None) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -35,11 +37,21 @@ class Air(PyTree):
         """Return the velocity of the air at one drone, world frame, m/s. (3,)"""
         raise NotImplementedError
 
+    @property
+    def drag_factor(self) -> Array | float:
+        """Factor of the drag of one drone, 1. (1,)"""
+        return 1.0
+
 
 def air_velocity(data: SimData) -> Array:
     """Return the velocity of the air at one drone, the sum of all effects that move it, world frame, m/s. (3,)"""
     moved = [record.at_drone(data) for record in data.plugins.values() if isinstance(record, Air)]
     return sum(moved, jnp.zeros_like(data.states.vel))
+
+
+def drag_factor(data: SimData) -> Array | float:
+    """Return the factor of the drag of one drone, the product of those of all effects, 1. (1,)"""
+    return math.prod([record.drag_factor for record in data.plugins.values() if isinstance(record, Air)])
 
 
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:
@@ -57,14 +69,19 @@ def with_moving_air(data: SimData, air_vel: Array) -> SimData:
     return data.replace(states=s.replace(force=force))
 
 
+def has_drag(sim: Simulation) -> bool:
+    """Return True if the model has drag, and the airframe's is not zero."""
+    drag = getattr(sim.data.params, "drag_matrix", None)
+    return drag is not None and bool(np.any(np.asarray(drag)))
+
+
 def require_drag(sim: Simulation, effect: str) -> None:
     """Check that moving air would push the drones.
 
     Raises:
         ConfigError: If the model has no drag, or the airframe's is zero.
     """
-    drag = getattr(sim.data.params, "drag_matrix", None)
-    if drag is None or not np.any(np.asarray(drag)):
+    if not has_drag(sim):
         raise ConfigError(
             f"{effect} acts through drag, and drone {sim.airframes[0].name!r} has none in this model. Use "
             f"dynamics='first_principles' or 'so_rpy_rotor_drag' and an airframe with drag coefficients."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -16,9 +17,10 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_d
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.battery import BatteryData
+from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
 from crazysim.plugins.effects.latency import LatencyData
-from crazysim.plugins.effects.moving_air import Air, require_drag, require_rotors, with_moving_air
+from crazysim.plugins.effects.moving_air import Air, has_drag, require_drag, require_rotors, with_moving_air
+from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import leaf
 
 FACTORS = ("mass", "inertia", "torque", "lag", "drag")
@@ -59,13 +61,19 @@ class RandomizeData(Air):
         """Return the mean wind at the drone."""
         return jnp.zeros_like(data.states.vel) if self.air_vel is None else self.air_vel
 
+    @property
+    def drag_factor(self) -> Array | float:
+        """Factor of the drag, 1. (..., 1)"""
+        return 1.0 if self.drag is None else self.factors[..., FACTORS.index("drag") :]
+
 
 class Randomize(Plugin):
     """Drones that differ from their airframe, in another way in every episode; needs rotors.
 
     Each setting is a range (low, high), for all drones, (2,), or for each, (n_worlds, n_drones, 2), from which a number
-    is drawn uniformly for every drone in the first step of an episode; a single number is fixed, None changes nothing.
-    Controllers keep the airframe's numbers. The numbers drawn do not depend on the other settings.
+    is drawn uniformly for every drone at every reset, or in the first step of a simulation that was not reset; two
+    equal numbers are fixed, None changes nothing. Controllers keep the airframe's numbers. The numbers drawn do not
+    depend on the other settings.
     ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges with sources.
     """
 
@@ -82,13 +90,16 @@ class Randomize(Plugin):
     lag: ArrayLike | None = parameter(default=None, positive=True)
     """Factor of the rates of the rotors' lag: their time constants are divided by it."""
     drag: ArrayLike | None = parameter(default=None, low=0.0)
-    """Factor of the linear drag."""
+    """Factor of the linear drag, or of the rotor drag and loss of thrust by inflow of ``RotorAerodynamics``."""
     wind: ArrayLike | None = parameter(default=None, low=0.0)
     """Speed of a mean wind of random horizontal direction, m/s; needs a model with drag."""
     charge: ArrayLike | None = parameter(default=None, low=0.0, high=1.0)
     """State of charge in which an episode begins, of simulations with ``Battery``."""
     delay: ArrayLike | None = parameter(default=None, low=0.0)
     """Delay of commands, steps, rounded down, of simulations with ``Latency``, whose delay must be one per drone."""
+    optional: Sequence[str] = ()
+    """Settings that do nothing, in place of an error, where a simulation lacks what they act on: ``charge``, ``drag``,
+    ``wind``, ``delay``. Those of the presets are optional."""
     name: str = "randomize"
     order: ClassVar[int] = -2  # before effects that change the same parameters
 
@@ -96,7 +107,7 @@ class Randomize(Plugin):
     def crazyflie(cls, **changes: ArrayLike | None) -> Randomize:
         """Return the spread between published identifications of Crazyflies 2.x, and between flights.
 
-        The page *Disturbances and randomisation* has the source of each range.
+        The page *Disturbances, randomisation, sim to real* has the source of each range.
 
         Args:
             changes: Other settings, by name.
@@ -108,10 +119,10 @@ class Randomize(Plugin):
             "rotor_thrust": (0.95, 1.05),
             "lag": (0.9, 1.9),
             "drag": (0.5, 1.6),
+            "wind": (0.05, 0.4),
             "charge": (0.1, 1.0),
         }
-        ranges.update(changes)
-        return cls(**ranges)
+        return cls._preset(ranges, changes)
 
     @classmethod
     def generic(cls, **changes: ArrayLike | None) -> Randomize:
@@ -121,20 +132,29 @@ class Randomize(Plugin):
             changes: Other settings, by name.
         """
         ranges: dict[str, Any] = dict.fromkeys((*FACTORS, "thrust"), (0.7, 1.3))
-        ranges.update({"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)} | changes)
-        return cls(**ranges)
+        return cls._preset(ranges | {"rotor_thrust": (0.95, 1.05), "charge": (0.1, 1.0)}, changes)
+
+    @classmethod
+    def _preset(cls, ranges: dict[str, Any], changes: dict[str, Any]) -> Randomize:
+        """Return a plugin of the ranges with changes, where the ranges that are not changed are optional."""
+        settings: dict[str, Any] = {"optional": tuple([name for name in ranges if name not in changes])}
+        return cls(**(settings | ranges | changes))
 
     def record(self, sim: Simulation) -> RandomizeData:
         """Return factors of one and no wind, until the first step of an episode."""
         require_rotors(sim, "randomisation of motors")
-        if self.wind is not None:
+        blows = self.wind is not None
+        if blows and "wind" in self.optional and not has_drag(sim):
+            blows = False
+        elif blows:
             require_drag(sim, "wind")
-        record = self.filled(
+        settings = self if blows or self.wind is None else dataclasses.replace(self, wind=None)
+        record = settings.filled(
             sim,
             RandomizeData,
             factors=per_drone(sim, 1.0, len(FACTORS)),
             thrust_factors=per_drone(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
-            air_vel=None if self.wind is None else per_drone(sim, 0.0, 3),
+            air_vel=per_drone(sim, 0.0, 3) if blows else None,
         )
         for name in (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay"):
             limits = getattr(record, name)
@@ -142,32 +162,55 @@ class Randomize(Plugin):
                 raise ConfigError(
                     f"expected {name} as (low, high), got {getattr(self, name)!r}. Use the smaller number first."
                 )
-        if self.delay is not None:
-            self._check_delay(sim)
         return record
 
-    def _check_delay(self, sim: Simulation) -> None:
-        """Check that delays are one per drone, and that the queues are long enough.
+    def check_plugins(self, sim: Simulation) -> None:
+        """Check that there is what the settings act on, and that delays are one per drone and queues long enough.
 
         Raises:
-            ConfigError: If they are not.
+            ConfigError: If there is not, or they are not.
         """
-        batch = (sim.n_worlds, sim.n_drones)
-        longest = int(np.max(np.asarray(self.delay)))
-        for name, latency in sim.data.plugins.items():
-            if not isinstance(latency, LatencyData):
-                continue
-            if latency.delay.shape[:-1] != batch or latency.queue.shape[-2] <= longest:
+        records = sim.data.plugins.values()
+        latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, LatencyData)}
+        has_battery = any(isinstance(x, BatteryData) for x in records)
+        drags = has_drag(sim) or any(isinstance(x, RotorAerodynamicsData) for x in records)
+        lacking = {
+            "charge": (has_battery, "a battery", "sim.add(Battery())"),
+            "drag": (drags, "an airframe with drag", "sim.add(RotorAerodynamics(...))"),
+            "delay": (bool(latencies), "late commands", f"sim.add({self._latency(sim)})"),
+        }
+        for setting, (exists, needs, remedy) in lacking.items():
+            if getattr(self, setting) is not None and not exists and setting not in self.optional:
                 raise ConfigError(
-                    f"expected plugin {name!r} with one delay per drone, of up to {longest} steps, got delay of shape "
-                    f"{latency.delay.shape} and queues of {latency.queue.shape[-2]} rows. Use "
-                    f"Latency(delay=np.zeros({batch}, int), max_delay={longest})."
+                    f"expected {needs} for Randomize({setting}=...), got a simulation without. Use {remedy} too, or "
+                    f"{setting}=None."
                 )
+        for name, latency in latencies.items() if self.delay is not None else ():
+            batch = (sim.n_worlds, sim.n_drones)
+            if latency.delay.shape[:-1] != batch or latency.queue.shape[-2] <= self._longest:
+                raise ConfigError(
+                    f"expected plugin {name!r} with one delay per drone, of up to {self._longest} steps, got delay of "
+                    f"shape {latency.delay.shape} and queues of {latency.queue.shape[-2]} rows. Use "
+                    f"{self._latency(sim)}."
+                )
+
+    @property
+    def _longest(self) -> int:
+        """Longest delay, steps."""
+        return 0 if self.delay is None else int(np.max(np.asarray(self.delay)))
+
+    def _latency(self, sim: Simulation) -> str:
+        """Return the expression of a ``Latency`` whose delays can be drawn."""
+        return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._longest})"
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that draws, in the first step of an episode, before all others."""
         first = next(name for name in sim.step_pipeline if name != self.name)
         return [Placement(Stage(self.begin, "drone", at_the_start), before=first)]
+
+    def begin_episode(self, data: SimData) -> SimData:
+        """Return the data with what is drawn for an episode, the same as in its first step."""
+        return self.begin(data)
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the parameters of the drone that was drawn."""
@@ -216,7 +259,8 @@ class Randomize(Plugin):
         others = dict(data.plugins)
         for name, other in data.plugins.items():
             if isinstance(other, BatteryData) and record.charge is not None:
-                others[name] = other.replace(charge=drawn(record.charge, rest[3:4]))
+                charge = drawn(record.charge, rest[3:4])
+                others[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
             if isinstance(other, LatencyData) and record.delay is not None:
                 steps = jnp.floor(drawn(record.delay, rest[4:5])).astype(other.delay.dtype)
                 others[name] = other.replace(delay=steps)

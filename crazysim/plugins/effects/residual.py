@@ -17,6 +17,7 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve, rotor_torque
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import require_rotors
+from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import PyTree, leaf, on_device
 
 N_INPUTS = 14
@@ -84,6 +85,18 @@ class Residual(Plugin):
         linear = check_parameter(sim, "linear", given["linear"], (6, N_INPUTS))
         return ResidualData(linear, checked("hidden", (n_hidden, N_INPUTS)), checked("output", (6, n_hidden)))
 
+    def check_plugins(self, sim: Simulation) -> None:
+        """Check that nothing else models what the airframe's coefficients were fitted to.
+
+        Raises:
+            ConfigError: If there is a ``RotorAerodynamics`` too.
+        """
+        if self.linear is None and any(isinstance(x, RotorAerodynamicsData) for x in sim.data.plugins.values()):
+            raise ConfigError(
+                "expected RotorAerodynamics or the airframe's residual, which was fitted without it, got both. Use one "
+                "of the two, or Residual(linear=...) with coefficients that were fitted with both."
+            )
+
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force and torque added."""
         s = data.states
@@ -149,6 +162,13 @@ def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array
 
 def _of_airframes(sim: Simulation) -> dict[str, Any]:
     """Return the coefficients of the airframes, of which all or none have a network of one size."""
+    lacking = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
+    if lacking is not None:
+        raise ConfigError(
+            f"expected a table [residual] of drone {lacking.name!r}, got none. {lacking.why_missing('residual.linear')}"
+            f"Use 'crazysim identify LOG --airframe {lacking.name} --out mine.toml' on flights of it, or "
+            f"drone='cf21B_500_idsia'."
+        )
     sizes = {len(airframe.values.get("residual.hidden", ())) for airframe in sim.airframes}
     if len(sizes) > 1:
         raise ConfigError(

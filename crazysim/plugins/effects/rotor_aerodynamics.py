@@ -20,7 +20,7 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground_effect import rotor_positions
-from crazysim.plugins.effects.moving_air import air_velocity, checked_propeller_radius, require_rotors
+from crazysim.plugins.effects.moving_air import air_velocity, checked_propeller_radius, drag_factor, require_rotors
 from crazysim.pytree import PyTree, leaf, on_device
 
 
@@ -54,10 +54,11 @@ class RotorAerodynamics(Plugin):
 
     drag: ArrayLike | None = parameter(default=None)
     """Drag of a rotor per velocity across its axis and rotor speed (k_d of RotorPy), N s^2/(m rad) = kg/rad; None for
-    that of the airframe's linear drag in hover, the mean of x and y. () or (n_worlds, n_drones)"""
+    that of the airframe's linear drag in hover, the mean of x and y; zero for none. () or (n_worlds, n_drones)"""
     inflow: ArrayLike | None = parameter(default=None)
     """Loss of thrust of a hovering rotor per axial velocity and rotor speed (k_z of RotorPy), N s^2/(m rad) = kg/rad;
-    None for that of the airframe's linear drag along z in hover. () or (n_worlds, n_drones)"""
+    None for that of the airframe's linear drag along z in hover; zero for the thrust of still air.
+    () or (n_worlds, n_drones)"""
     flapping: ArrayLike = parameter(default=0.0, low=0.0)
     """Moment of flapping blades at a hub per velocity across its axis and rotor speed, which tips the drone back,
     N s^2/rad = kg m/rad. Stiffness of blades and hubs is not part of airframes, so that there is no default but zero.
@@ -65,9 +66,9 @@ class RotorAerodynamics(Plugin):
     hub_height: ArrayLike | None = parameter(default=None)
     """Height of the hubs above the centre of mass, m, the lever arm of the drag; None for the airframe's
     ``shape.propeller_height`` above ``rotors.position``. () or (n_worlds, n_drones)"""
-    ceiling: ArrayLike | None = parameter(default=None)
-    """Height of a flat ceiling, below which rotors give more thrust, world frame, m; None for none.
-    () or (n_worlds, n_drones)"""
+    ceiling: ArrayLike | None = parameter(default=None, positive=True)
+    """Height of a flat ceiling, below which rotors give more thrust, world frame, m; rotors above it give the thrust of
+    free air. Needs ``inflow``; None for none. () or (n_worlds, n_drones)"""
     propeller_radius: ArrayLike | None = parameter(default=None)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
     air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
@@ -84,7 +85,12 @@ class RotorAerodynamics(Plugin):
         thrust, speed = of_airframes(sim, hover_thrust)[..., None], of_airframes(sim, hover_speed)[..., None]
         disc = np.asarray(disc_factor(radius, density), np.float64)
         blade = blade_coefficient(inflow * speed, thrust, speed, disc)
-        if not np.all((blade > 0) & np.isfinite(blade)):
+        if self.ceiling is not None and not np.all(inflow > 0):
+            raise ConfigError(
+                "expected inflow above zero with a ceiling, which acts through the inflow, got zero. Use another "
+                "inflow=, or ceiling=None."
+            )
+        if not np.all((blade >= 0) & np.isfinite(blade)):
             most = np.min(np.sqrt(thrust * disc) / speed)
             raise ConfigError(
                 f"expected inflow below {most:.3g} N s^2/(m rad), the limit of momentum theory at this propeller "
@@ -112,7 +118,7 @@ class RotorAerodynamics(Plugin):
                     f"would follow. Use RotorAerodynamics({name}=...); RotorPy has drag 1.0e-6 and inflow 7.6e-7 "
                     f"N s^2/(m rad) for the Crazyflie 2.0."
                 )
-        return check_parameter(sim, name, given, positive=True)
+        return check_parameter(sim, name, given, low=0.0)
 
     def _hub_positions(self, sim: Simulation) -> Array:
         """Return the positions of the hubs, body frame, m. (..., n_rotors, 3)"""
@@ -131,16 +137,17 @@ class RotorAerodynamics(Plugin):
         u, v, axial = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
         speed = RPM_TO_RAD_S * s.rotor_vel
         static = curve(s.rotor_vel, p.rpm2thrust)
+        blade, drag = drag_factor(data) * record.blade, drag_factor(data) * record.drag
         factor: Array | float = 1.0
         if record.ceiling is not None:
             height = s.pos[..., 2:] + rotation.rotate(s.quat[..., None, :], record.hub_pos)[..., 2]
             factor = ceiling_factor(record.ceiling - height, record.propeller_radius)
         thrust = thrust_in_flight(
-            static, speed, axial, u * u + v * v, record.blade, record.propeller_radius, record.air_density, factor
+            static, speed, axial, u * u + v * v, blade, record.propeller_radius, record.air_density, factor
         )
-        gain = thrust - jnp.where(static > 0, static, 0.0)
+        gain = jnp.where(blade > 0, thrust - jnp.where(static > 0, static, 0.0), 0.0)
 
-        loss, bend = record.drag * speed, record.flapping * speed
+        loss, bend = drag * speed, record.flapping * speed
         forces = jnp.stack([-loss * u, -loss * v, gain], axis=-1)
         moments = jnp.stack([bend * v, -bend * u, jnp.zeros_like(bend)], axis=-1)
         force = jnp.sum(forces, axis=-2) - rotation.matvec(p.drag_matrix, vel)

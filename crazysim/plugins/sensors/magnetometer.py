@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -12,9 +13,13 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal
+from crazysim.errors import ConfigError, shown
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
+
+STRONGEST = 1e-3
+"""Strongest field accepted, T, some fifteen times that of the earth, so that other units are noticed. An assumption."""
 
 
 class MagnetometerData(PyTree):
@@ -52,6 +57,12 @@ class Magnetometer(Sensor):
 
     def record(self, sim: Simulation) -> MagnetometerData:
         """Return the magnetometer before its first measurement."""
+        field = np.asarray(self.field)
+        if field.dtype.kind in "iuf" and np.any(np.abs(field) > STRONGEST):
+            raise ConfigError(
+                f"expected field in tesla, of at most {STRONGEST} T along an axis, got {shown(self.field)}. Use 20e-6 "
+                f"for 20 microtesla, 1e-4 for one gauss."
+            )
         errors, quat = self.errors.record(sim, "errors"), mounting(sim, self.rpy)
         return self.filled(sim, MagnetometerData, errors=errors, quat=quat)
 

@@ -19,7 +19,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter,
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage, at_the_start, tick
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.pytree import PyTree, leaf, on_device
 
 R = TypeVar("R", bound=PyTree)
@@ -188,6 +188,11 @@ class Sensor(Plugin):
         if self.max_delay is not None:
             return self.max_delay
         delay, jitter = np.asarray(self.delay), np.asarray(self.jitter)
+        for name, value in (("delay", delay), ("jitter", jitter)):
+            if value.dtype.kind not in "iuf":
+                raise ConfigError(
+                    f"expected {name} of {self.name!r} as seconds, got {shown(getattr(self, name))}. Use {name}=0.01."
+                )
         return float(np.max(delay) + np.max(jitter)) if delay.size and jitter.size else 0.0
 
     def _begin(self, data: SimData) -> SimData:

@@ -260,7 +260,11 @@ def test_a_reset_brings_every_record_back_in_its_worlds_alone(every):
     sim.step(40)
     flown, mask = sim.data.plugins, np.array([False, True, True])
     sim.reset(mask)
-    pairs = zip(*map(jax.tree.leaves, (scopes(flown), flown, sim.data.plugins, sim.default_data.plugins)), strict=True)
+    drawn, start = sim.data.plugins["randomize"], sim.default_data.plugins["randomize"]
+    found = {name: getattr(drawn, name) for name in ("factors", "thrust_factors", "air_vel")}
+    assert np.all(np.asarray(drawn.factors)[mask][..., 0] != 1), "drawn at the reset"
+    default = sim.default_data.plugins | {"randomize": start.replace(**found)}
+    pairs = zip(*map(jax.tree.leaves, (scopes(flown), flown, sim.data.plugins, default)), strict=True)
     for scope, before, after, default in pairs:
         if scope == "drone":
             np.testing.assert_array_equal(np.asarray(after)[mask], np.asarray(default)[mask])

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from cases import FAST, hover_rotor_state, with_states
 
-from crazysim import Battery, ConfigError, Latency, Randomize, Sim, Wind
+from crazysim import Battery, ConfigError, Latency, Randomize, RotorAerodynamics, Sim, Wind
 from crazysim.core.pipeline import append_fn
 from crazysim.core.stage import stage
 from crazysim.engine import Step
 from crazysim.envs import AutoReset, make
+from crazysim.plugins.effects.battery import open_circuit_voltage
 
 RANGES = {
     "mass": (0.9, 1.2),
@@ -150,14 +151,15 @@ def test_presets_fly_and_take_changes():
             errors.append(np.median(np.linalg.norm(np.asarray(sim.data.states.pos) - [0, 0, 1.0], axis=-1)))
         assert errors[0] > 3e-3 > errors[1], "the drones differ, and the controller corrects them"
         assert np.ptp(plugin.read(sim.data).factors[..., 0]) > 0.05
-        assert set(sim.plugins.observations(sim.data)) == {"randomize.factors", "randomize.thrust_factors"}
+        assert set(sim.plugins.observations(sim.data)) >= {"randomize.factors", "randomize.thrust_factors"}
     assert Randomize.crazyflie(mass=(1.0, 1.1)).mass == (1.0, 1.1)
 
 
 def test_a_task_flies_other_drones_in_every_episode():
     env = AutoReset(make("hover", 4, effects=[Randomize.crazyflie()], seconds=0.1))
+    assert "one kernel" in env.explain(), "draws at resets are fused too"
     state = jax.jit(env.reset)(jax.random.key(0))
-    step, seen = jax.jit(env.step), []
+    step, seen = jax.jit(env.step), [np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0]]
     for _ in range(8):
         state = step(state, jnp.zeros_like(state.action))
         seen.append(np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0])
@@ -179,8 +181,9 @@ def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
         Sim(drone="bumblebee").add(Randomize(wind=(0.0, 1.0)))
     sim = Sim(3)
     sim.add(Latency(delay=2))
+    sim.add(Randomize(delay=(0, 4)))
     with pytest.raises(ConfigError, match=r"Use Latency\(delay=np.zeros\(\(3, 1\), int\), max_delay=4\)"):
-        sim.add(Randomize(delay=(0, 4)))
+        sim.step()
 
 
 def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
@@ -210,3 +213,70 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
         factors = sim.data.plugins["randomize"].factors
         np.testing.assert_array_equal(factors, flown("plain", *stages).data.plugins["randomize"].factors)
     assert np.any(drawn.data.plugins["randomize"].factors != reset.data.plugins["randomize"].factors)
+
+
+@pytest.mark.parametrize("setting, remedy", [
+    ({"charge": (0.1, 0.5)}, r"Use sim.add\(Battery\(\)\)"),
+    ({"delay": (0, 4)}, r"Use sim.add\(Latency\(delay=np.zeros\(\(1, 1\), int\), max_delay=4\)\)"),
+    ({"drag": (0.5, 1.5)}, "Use sim.add.RotorAerodynamics"),
+])  # fmt: skip
+def test_law_09_ranges_that_would_do_nothing_are_errors(setting, remedy):
+    """Those of a preset do nothing; the same range given by hand is an error, before the first step."""
+    sim = Sim(drone="bumblebee", control="rotor_vel", engine="interpret")
+    sim.add(Randomize.generic())
+    sim.step()
+    sim.replace(Randomize.generic(**setting))
+    with pytest.raises(ConfigError, match=remedy):
+        sim.step()
+    with pytest.raises(ConfigError, match=remedy):
+        make("hover", drone="bumblebee", effects=[Randomize(**setting)])
+
+
+@pytest.mark.parametrize("latency_first", [True, False])
+def test_delays_are_drawn_in_any_order_of_adding(latency_first):
+    sim = Sim(20, control="rotor_vel", engine="interpret")
+    plugins = [Latency(delay=np.zeros((20, 1), int), max_delay=3), Randomize(delay=(0, 4 - 1e-3))]
+    for plugin in plugins if latency_first else reversed(plugins):
+        sim.add(plugin)
+    sim.step()
+    assert set(np.unique(sim.data.plugins["latency"].delay)) == {0, 1, 2, 3}
+
+
+def test_what_is_drawn_is_there_at_the_reset():
+    """Observations after a reset are those of the episode, in its worlds alone; law 10: in any number of worlds."""
+    seen = []
+    for n_worlds in (2, 3):
+        sim, plugin = build(n_worlds, charge=(0.2, 0.6), **RANGES)
+        battery = sim.add(Battery())
+        sim.reset()
+        first = sim.plugins.observations(sim.data)
+        assert np.ptp(first["battery.charge"]) > 0.01
+        expected = open_circuit_voltage(first["battery.charge"], battery.read(sim.data).n_cells)
+        np.testing.assert_allclose(first["battery.voltage"], expected, rtol=1e-6)
+        seen.append({key: np.asarray(x) for key, x in first.items() if key.startswith("randomize")})
+        sim.step()
+        for key, x in seen[-1].items():  # rounded by another engine
+            np.testing.assert_allclose(sim.plugins.observations(sim.data)[key], x, rtol=1e-6, atol=1e-6, err_msg=key)
+    assert np.unique(seen[1]["randomize.factors"][..., 0]).size == 6
+    for key, x in seen[0].items():
+        np.testing.assert_array_equal(x, seen[1][key][:2])
+    sim.reset(np.array([False, True, False]))
+    again = np.asarray(plugin.read(sim.data).factors)
+    np.testing.assert_allclose(again[::2], seen[1]["randomize.factors"][::2], rtol=1e-6)
+    assert np.all(again[1] != seen[1]["randomize.factors"][1])
+    sim.remove(plugin)
+    assert list(sim.reset_pipeline) == ["reset"]
+
+
+def test_a_factor_of_the_drag_acts_on_rotor_aerodynamics():
+    """A factor of two is that of twice the coefficient of rotor drag, whose moment tips the drone back."""
+    found = []
+    for factor, drag in ((2.0, 1e-6), (1.0, 2e-6)):
+        sim, _ = build(1, 1, drag=(factor, factor))
+        sim.add(RotorAerodynamics(drag=drag, inflow=0.0))
+        sim.data = with_states(sim.data, vel=[2.0, 0, 0])
+        sim.rotor_vel_control(sim.data.states.rotor_vel)
+        sim.step(10)
+        found.append(np.concatenate([sim.data.states.vel[0, 0], sim.data.states.ang_vel[0, 0]]))
+    assert found[0][0] < 2.0 - 1e-4
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-6)

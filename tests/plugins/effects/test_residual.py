@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim import ConfigError, Residual, Sim
+from crazysim import ConfigError, Residual, RotorAerodynamics, Sim
 from crazysim.plugins.effects.residual import N_INPUTS
 
 RNG = np.random.default_rng(3)
@@ -82,7 +82,7 @@ def test_wrench_is_that_of_the_coefficients():
 
 
 def test_airframe_without_residual_is_refused():
-    with pytest.raises(ConfigError, match=r"residual\.linear"):
+    with pytest.raises(ConfigError, match=r"table \[residual\].*Use 'crazysim identify LOG.*cf21B_500_idsia"):
         Sim(drone="cf21B_500").add(Residual())
 
 
@@ -100,3 +100,24 @@ def test_base_of_another_body_passes_no_residual_on():
 def test_network_without_its_other_half_is_refused():
     with pytest.raises(ConfigError, match="hidden and output together"):
         Sim(control="rotor_vel").add(Residual(linear=LINEAR, hidden=HIDDEN))
+
+
+def test_aero_identified_adds_the_residual_of_the_airframe():
+    sim = Sim(drone=drone(linear=LINEAR), aero="identified", control="rotor_vel")
+    np.testing.assert_allclose(sim.data.plugins["residual"].linear, LINEAR, rtol=1e-6)
+    with pytest.raises(ConfigError, match="crazysim identify LOG --airframe cf2x_L250"):
+        Sim(drone="cf2x_L250", aero="identified")
+    with pytest.raises(ConfigError, match=r"expected aero='identified' or None, got True. Use sim.add\(Rotor"):
+        Sim(aero=True)
+
+
+@pytest.mark.parametrize("residual_first", [True, False])
+def test_law_09_the_residual_of_an_airframe_and_rotor_aerodynamics_exclude_each_other(residual_first):
+    sim = Sim(drone=drone(linear=LINEAR), control="rotor_vel")
+    plugins = [Residual(), RotorAerodynamics()]
+    for plugin in plugins if residual_first else reversed(plugins):
+        sim.add(plugin)
+    with pytest.raises(ConfigError, match="fitted without it, got both"):
+        sim.step()
+    sim.replace(Residual(linear=LINEAR))
+    sim.step()

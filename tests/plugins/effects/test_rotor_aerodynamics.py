@@ -98,7 +98,7 @@ def test_a_ceiling_gives_thrust_by_mass_momentum_and_energy():
         wake = max(np.roots([0.5, -1.0, -((R / gap) ** 2) / 16]))
         found = float(inflow.ceiling_factor(np.float64(gap), np.float64(R)))
         np.testing.assert_allclose(found, wake / 2, rtol=1e-5)
-    assert inflow.ceiling_factor(np.float64(-1.0), R) == inflow.ceiling_factor(np.float64(0.0), R)
+    assert inflow.ceiling_factor(np.float64(-1.0), R) == 1.0, "a rotor above it is in free air"
 
 
 def test_near_hover_the_rotors_give_the_linear_drag_of_the_airframe(quad):
@@ -251,3 +251,25 @@ def test_law_09_what_is_missing_or_impossible_is_an_error():
     with pytest.raises(ConfigError, match=r"expected inflow below 1\.49e-05"):
         Sim().add(RotorAerodynamics(inflow=2e-5))
     Sim(drone="bumblebee").add(RotorAerodynamics(drag=1e-5, inflow=1e-5))
+    for ceiling in (-1.0, 0.0):
+        with pytest.raises(ConfigError, match="ceiling to be finite and positive"):
+            Sim().add(RotorAerodynamics(ceiling=ceiling))
+    with pytest.raises(ConfigError, match="expected inflow above zero with a ceiling"):
+        Sim().add(RotorAerodynamics(inflow=0.0, ceiling=2.0))
+
+
+def test_each_term_can_be_alone_and_a_ceiling_lies_above_the_drone():
+    """At 2 m/s: the drag of the airframe alone, the thrust alone, neither; above a ceiling as without one."""
+    vel = [2.0, 0, 0]
+    for settings, drag, lift in (
+        ({"inflow": 0.0}, 2 * DRAG_XY, 0.0),
+        ({"drag": 0.0}, 0.0, 4 * thrust(WEIGHT / 4, HOVER, 0.0, 2.0, blade()) - WEIGHT),
+        ({"drag": 0.0, "inflow": 0.0}, 0.0, 0.0),
+    ):
+        force, torque = wrench(*hover(**settings), vel=vel)
+        # the linear drag of the dynamics is taken off; 0.4 N in float32
+        np.testing.assert_allclose(force[0], [2 * DRAG_XY - drag, 0, lift], rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(torque[0, 1], -0.014 * drag, rtol=1e-3, atol=1e-8)
+    above, below = (wrench(*hover(ceiling=z), vel=vel) for z in (0.5, 1.05))
+    np.testing.assert_array_equal(above[0], wrench(*hover(), vel=vel)[0])
+    assert below[0][0, 2] > above[0][0, 2] + 1e-4

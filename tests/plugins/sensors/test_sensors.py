@@ -84,6 +84,30 @@ def test_optical_flow_by_hand():
     np.testing.assert_allclose(found / 0.1, np.round(found / 0.1), atol=1e-4)
 
 
+@pytest.mark.parametrize("plugin, channel, expected", [
+    # yaw 90 degrees: the body's x axis is the world's y axis, and a place 0.2 m ahead is at (0, 0.2, 1)
+    (sensors.GPS(pos=(0.2, 0, 0), freq=None), "gps.pos", [0, 0.2, 1]),
+    # it turns about z at 2 rad/s: 0.4 m/s to the left, the world's -x; and 3 rad/s about x moves nothing ahead
+    (sensors.GPS(pos=(0.2, 0, 0), freq=None), "gps.vel", [-0.4, 0, 0]),
+    # from (0, 0.2, 1) to (0, 2.2, 1) and (1.5, 0.2, 3)
+    (sensors.UWB([(0, 2.2, 1), (1.5, 0.2, 3)], pos=(0.2, 0, 0), freq=None), "uwb.distance", [2.0, 2.5]),
+    # 0.3 m below the centre of mass, 0.7 m above ground
+    (sensors.TimeOfFlight(pos=(0, 0, -0.3), far_noise=0.0, freq=None), "time_of_flight.distance", [0.7]),
+    # 0.2 m ahead the camera moves at 0.4 m/s to the left, 0.4 rad/s; the roll adds 3 rad/s; 35 / 0.71674 / 500 pixels
+    (sensors.OpticalFlow(pos=(0.2, 0, 0), freq=None), "optical_flow.flow", [0, 3.4 * 35 / 0.71674 / 500]),
+    # 0.5 m below, a roll rate of 3 rad/s moves it at 1.5 m/s to the left, 3 rad/s over 0.5 m of height
+    (sensors.OpticalFlow(pos=(0, 0, -0.5), freq=None), "optical_flow.flow", [0, 6 * 35 / 0.71674 / 500]),
+    # north is ahead of the drone; a sensor turned by 90 degrees about x has the body's z axis as its y axis
+    (sensors.Magnetometer((0, 2e-5, -4e-5), rpy=(np.pi / 2, 0, 0)), "magnetometer.field", [2e-5, -4e-5, 0]),
+])  # fmt: skip
+def test_mounting_by_hand(plugin, channel, expected):
+    """Yaw 90 degrees, turning at (3, 0, 2) rad/s; the motion of one step: 6 mrad, and 2 cm/s of fall."""
+    sim = build(plugin, quat=[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], ang_vel=[3.0, 0, 2.0])
+    sim.step()
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(read(sim, channel)[0, 0], expected, rtol=0.02, atol=0.06 * scale)
+
+
 def test_time_of_flight_by_hand():
     """Height over the cosine of the tilt up to the range; noise grows as the firmware's filter assumes."""
     angle = np.array([0, 0.5, 0.5, 3.0])[:, None, None]
@@ -234,6 +258,8 @@ def test_satellite_navigation_wanders():
     (sensors.TimeOfFlight(max_range=0.0), "expected max_range"),
     (sensors.Barometer(altitude=2e4), "expected altitude"),
     (sensors.Magnetometer(1e-5), "expected field"),
+    (sensors.Magnetometer((0, 20, -45)), r"expected field in tesla.*Use 20e-6 for 20 microtesla"),
+    (sensors.IMU(delay="late"), r"expected delay of 'imu' as seconds, got 'late'. Use delay=0.01"),
 ])  # fmt: skip
 def test_law_09_wrong_settings(plugin, message):
     with pytest.raises(ConfigError, match=message):
@@ -279,6 +305,17 @@ def test_a_task_observes_measurements_by_one_argument():
         np.testing.assert_array_equal(states[0].reward, states[1].reward)
         states = [env.step(state, action) for env, state in zip(envs, states, strict=True)]
     assert "imu" in str(envs[1].explain())
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"sensors": sensors.IMU()}, r"expected sensors as a list of plugins, got IMU.*Use sensors=\[IMU"),
+    ({"sensors": "imu"}, "expected sensors as a list of plugins, got 'imu'"),
+    ({"effects": Battery()}, "expected effects as a list of plugins"),
+    ({"sensors": [sensors.MotionCapture()], "estimator": "kalman"}, r"no plugin 'motion_capture'.*estimator=Kalman"),
+])  # fmt: skip
+def test_law_09_wrong_sensors_of_a_task(options, message):
+    with pytest.raises(ConfigError, match=message):
+        make("hover", **options)
 
 
 def test_law_09_measured_needs_a_sensor():
