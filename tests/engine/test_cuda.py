@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import shared_sim
 
-from crazysim import ConfigError, Downwash, FreeBodies, Sim, jaxcompat
+from crazysim import ConfigError, Downwash, FreeBodies, Kalman, Sim, jaxcompat
 from crazysim.engine import Step, explain
 from crazysim.engine.backends import cuda, kernel, native
 from crazysim.engine.backends.exchange import exchange_for
@@ -87,6 +87,25 @@ def test_worlds_whose_drones_act_on_each_other_fill_warps_or_blocks(n_drones, th
     in_block = n_drones > 32
     assert ("ld.shared.v4.f32" in code, "shfl.sync" in code) == (in_block, not in_block)
     assert code.count("bar.sync") == (2 if in_block else 0)
+
+
+def test_a_wider_block_has_more_whole_worlds():
+    """Worlds of three drones: 20 of them in 64 threads, 80 in 256."""
+    sim = Sim(n_worlds=2, n_drones=3, control="attitude", engine="lanes")
+    sim.add(Downwash())
+    made = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    wide = made.with_threads(256)
+    assert (wide.threads, wide.lanes) == (256, 240)
+    assert ".maxntid 256" in cuda.ptx(wide, cuda.DEFAULT_ARCHITECTURE)
+
+
+def test_a_gpu_reads_what_drones_share_where_it_is_used_if_registers_are_too_few(source):
+    """So with an estimator; in a short kernel each such read would cost more than a register."""
+    sim = Sim(2, 1, control="state", estimator=Kalman.default(), engine="lanes")
+    long = kernel.write(sim.build_step_fn().plan(sim.data).program, "cuda")
+    texts = [k.text[k.text.index(" advance(") :] for k in (long, source)]
+    assert ["SHARED(p" in text for text in texts] == [True, False]
+    assert cuda.ptx(long, cuda.DEFAULT_ARCHITECTURE).count("ld.global.nc.f32 %f") > 100
 
 
 def test_a_world_that_does_not_fit_into_a_block_runs_on_lanes():

@@ -19,12 +19,14 @@ from crazysim import (
     FreeBodies,
     GroundEffect,
     Hook,
+    Kalman,
     Latency,
     MotorFailure,
     Radar,
     RangeFinder,
     RotorJet,
     SharedLoad,
+    Sim,
     SlungLoad,
     Terrain,
     Wind,
@@ -166,6 +168,18 @@ def test_impacts_are_those_of_the_cpu(plugin, height, tolerance):
         return sim.data.states.pos, sim.data.states.vel
 
     agree(*both(run), tolerance)
+
+
+def test_law_01_many_worlds_on_wide_blocks_fly_as_few():
+    """A kernel longer than the instruction cache has blocks of 256 threads from 65,536 drones on."""
+    few, many = (
+        Sim(n, control="state", device=ACCELERATOR, estimator=Kalman.default(), rng_key=4) for n in (40, 2**16 + 7)
+    )
+    assert "64 threads a block, 256 from 65,536 drones on" in many.explain()
+    few.step(N_STEPS)
+    many.step(N_STEPS)
+    assert trees_equal(few.data.states, jax.tree.map(lambda x: x[:40], many.data.states))
+    assert float(jnp.abs(many.data.states.pos - many.default_data.states.pos).max()) < 0.5
 
 
 def test_law_01_one_world_flies_as_among_many():

@@ -21,7 +21,8 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.engine.backends.frame import Kernel, interval
+from crazysim.engine.backends.exchange import WARP
+from crazysim.engine.backends.frame import UNBOUNDED, Kernel, interval
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
@@ -34,6 +35,13 @@ OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false"
 
 THREADS_AT_ONCE = (512, 384)
 """Numbers of threads of a multiprocessor to try, the most first: they leave 128 or 168 registers to each thread."""
+
+WIDE = 256
+"""Threads of a block of a kernel with more than ``CODE`` of code, where there are at least ``LANES`` lanes: those of a
+block take the same way, so more of them wait for the same instructions."""
+
+CODE = 96 * 2**10
+"""Compiled kernel that the instruction cache of a multiprocessor has no room for, bytes; measured on an H100."""
 
 KEPT = 2**30
 """Most memory for what the steps begin with that a gradient goes back through at once, bytes."""
@@ -53,6 +61,8 @@ class Resources:
     """Number of registers."""
     spilled: int
     """Local memory, bytes: variables that did not fit into registers."""
+    code: int
+    """Size of the compiled kernel, bytes."""
 
 
 def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Launch:
@@ -66,10 +76,12 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
         KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
     device = weakest(devices)
-    kernel = kernel if device is None else fitted(kernel, device)
-    text = ptx(kernel, architecture(device))
+    few = kernel if device is None else fitted(kernel, device)
+    many = few if device is None else widened(few, device)
+    ptx(few, architecture(device))  # raises here what it would raise at the first launch
 
     def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
+        kernel = few if n_lanes < LANES else many
         n_blocks, memory = -(-n_lanes // kernel.lanes), []
         if kernel.kept:
             n_blocks, count, memory = _with_memory(kernel, n_lanes, int(count[0]))
@@ -83,7 +95,7 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
                 *inputs,
                 name="advance",
                 kernel_type="ptx",
-                kernel_data=text,
+                kernel_data=ptx(kernel, architecture(device)),
                 shared_mem_bytes=np.int32(0),
                 **{name: np.int32(size) for name, size in (grid | block).items()},
             )
@@ -143,6 +155,15 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
     return next(suitable, kernel)
 
 
+def widened(kernel: Kernel, device: jax.Device) -> Kernel:
+    """Return a kernel with blocks for many lanes: wider ones if its code is long.
+
+    Those of gradients, of large worlds, and with few registers for each thread stay as they are.
+    """
+    stays = kernel.kept or kernel.group > WARP or UNBOUNDED not in kernel.text
+    return kernel if stays or resources(kernel, device).code <= CODE else kernel.with_threads(WIDE)
+
+
 @functools.cache
 def ptx(kernel: Kernel, arch: str) -> str:
     """Return a kernel's PTX.
@@ -180,7 +201,8 @@ def resources(kernel: Kernel, device: jax.Device) -> Resources:
     finally:
         driver.cuCtxPopCurrent_v2(ctypes.byref(context))
         driver.cuDevicePrimaryCtxRelease(handle)
-    return Resources(*found)
+    registers, spilled = found
+    return Resources(registers, spilled, code=len(image))
 
 
 def _check(result: int) -> None:

@@ -13,6 +13,9 @@ from crazysim.engine.ir.blocks import Block
 UNBOUNDED = "1 /* blocks at least */"
 """Text in a kernel for a GPU that ``Kernel.with_blocks`` replaces by a number of blocks."""
 
+BLOCK_THREADS = "#define BLOCK_THREADS {}\n"
+"""Text in a kernel for a GPU that ``Kernel.with_threads`` replaces."""
+
 BLOCK = 64
 """Threads of a block on a GPU."""
 
@@ -33,6 +36,8 @@ class Kernel:
     """Threads of a block on a GPU."""
     lanes: int = BLOCK
     """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
+    group: int = 1
+    """Drones of a world that read each other's numbers."""
     kept: int = 0
     """Memory that a lane keeps for each step of an interval, bytes; 0 for a kernel that only goes forward. One that
     goes back takes the number of steps of an interval after the number of all steps."""
@@ -44,6 +49,11 @@ class Kernel:
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
         return dataclasses.replace(self, text=self.text.replace(UNBOUNDED, f"{n}"))
+
+    def with_threads(self, n: int) -> Kernel:
+        """Return the kernel with blocks of ``n`` threads on a GPU, a multiple of those that it has."""
+        text = self.text.replace(BLOCK_THREADS.format(self.threads), BLOCK_THREADS.format(n))
+        return dataclasses.replace(self, text=text, threads=n, lanes=self.lanes * n // self.threads)
 
 
 def interval(n_steps: int, size: int, memory: int) -> int:
@@ -108,17 +118,17 @@ def framed(
     threads, lanes = lanes_of_block(group)
     lines, own = "\n".join(shared), "\n".join(code)
     if target == "cuda":
-        frame = _cuda(pointers, lines, own, threads, lanes, kept is not None)
+        frame = _cuda(pointers, lines, own, kept is not None)
     else:
         frame = _host(pointers, lines, own, in_memory, kept is not None)
     widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
-    defines = f"#define WIDEST {widest}\n#define GROUP {group}\n#define BLOCK_THREADS {threads}\n"
+    defines = f"#define WIDEST {widest}\n#define GROUP {group}\n" + BLOCK_THREADS.format(threads)
     defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
     before = "".join(f"{line}\n" for line in declared)
     if kept is not None:
         before = f"#define N_KEPT {kept}\n{_preamble(target + '_kept')}{before}"
     text = defines + _preamble(target) + before + frame + _epilogue(target)
-    return Kernel(text, inputs, outputs, in_place, threads, lanes, (kept or 0) * widest)
+    return Kernel(text, inputs, outputs, in_place, threads, lanes, group, (kept or 0) * widest)
 
 
 def _n_operations(block: Block) -> int:
@@ -127,17 +137,19 @@ def _n_operations(block: Block) -> int:
     return len(block.operations) + sum(inner)
 
 
-def _cuda(pointers: Sequence[str], shared: str, body: str, threads: int, lanes: int, keeps: bool) -> str:
+def _cuda(pointers: Sequence[str], shared: str, body: str, keeps: bool) -> str:
     """Return the kernel of a thread: it computes the numbers that all lanes share once, and the rest for its lane.
 
     A thread that keeps numbers of steps goes through several lanes, one after the other, to bound the memory.
     """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])
-    each = f"for (int first = blockIdx.x * {lanes}; first < n_lanes; first += gridDim.x * {lanes})"
-    interval, each = (", interval = count[1]", each) if keeps else ("", f"const int first = blockIdx.x * {lanes};")
+    interval, each = "", "const int first = blockIdx.x * BLOCK_LANES;"
+    if keeps:
+        each = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
+        interval = ", interval = count[1]"
     return f"""
-extern "C" __global__ void __launch_bounds__({threads}, {UNBOUNDED}) advance({arguments}) {{
+extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {UNBOUNDED}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0]{interval};
   const int nothing = n_steps >> 31;
   const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;

@@ -15,6 +15,9 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE, Phase, Program, Segment, Slot
 
+REGISTERS = 255
+"""Registers of a thread of a GPU."""
+
 
 def write(program: Program, target: str) -> Kernel:
     """Return the source of a program for ``cuda`` or ``host``.
@@ -30,7 +33,7 @@ def write(program: Program, target: str) -> Kernel:
     """
     require_source(program)
     body = Body(program, target)
-    hoisted = body.write_loads()
+    hoisted = body.write_loads(REGISTERS if target == "cuda" else None)
     body.write_loop(hoisted)
     body.write_stores()
 
@@ -58,10 +61,16 @@ class Body:
         """Expression of each number that stages write, before the first of them."""
         self._n_shared = 0
 
-    def write_loads(self) -> list[list[str]]:
-        """Write loads and the stages before the steps; return the hoisted values of each segment of the loop."""
+    def write_loads(self, registers: int | None = None) -> list[list[str]]:
+        """Write loads and the stages before the steps; return the hoisted values of each segment of the loop.
+
+        Args:
+            registers: Registers of a lane; where the numbers are more, those that all lanes share are read where they
+                are used. None to read them before the steps.
+        """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()
+        at_use = registers is not None and len(slots) > registers
         loaded, rank = _loaded(program), program.ranks
         deferred = set() if exchange.depth else _deferred(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
@@ -69,10 +78,10 @@ class Body:
         for slot in shared:
             if slot[1] == TABLE:
                 names[slot] = f"p{rank[slot[0]]}"
-            elif slot in self.stored or slot not in deferred:
+            elif slot in self.stored or not (at_use or slot in deferred):
                 writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
             else:
-                names[slot] = _load(program, slot)
+                names[slot] = f"SHARED(p{rank[slot[0]]}, {slot[1]})" if at_use else _load(program, slot)
         self._n_shared = len(writer.lines)
         exchange.begin(writer, 1)
         own = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]

@@ -35,5 +35,7 @@ def described(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | Non
     device = cuda.weakest(devices)
     if device is None:
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
-    used = cuda.resources(cuda.fitted(kernel, device), device)
-    return f"{kernel.threads} threads a block, {used.registers} registers, {used.spilled} bytes spilled"
+    few = cuda.fitted(kernel, device)
+    many, used = cuda.widened(few, device), cuda.resources(few, device)
+    wide = f", {many.threads} from {cuda.LANES:,} drones on" if many is not few else ""
+    return f"{few.threads} threads a block{wide}, {used.registers} registers, {used.spilled} bytes spilled"

@@ -7,6 +7,7 @@
 #define THREADS BLOCK_THREADS
 #define LANES (THREADS / GROUP * GROUP)
 #endif
+#define BLOCK_LANES (BLOCK_THREADS / THREADS * LANES)
 #define UNROLL _Pragma("unroll 4")
 #define FN static __device__ __forceinline__
 #define RSQRTF(x) rsqrtf(x)
@@ -37,6 +38,13 @@ FN b1 b1_lanes(b1 x) { return x; }
 // A number of the drone with number d of the same world.
 template <class T> FN T of_drone(T x, int d) { return GROUP == 1 ? x : __shfl_sync(0xffffffffu, x, threadIdx.x % 32 / GROUP * GROUP + d); }
 FN b1 of_drone(b1 x, int d) { return of_drone(i32(x), d) != 0; }
+
+// A read of what all lanes share, where it is used. The compiler moves it out of the loop of steps, but out of no branch;
+// a load that it knows it would move out of both, and keep in a register.
+#define SHARED(p, k) read(p + k)
+#define READ(T, type, to) FN T read(const T* p) { T x; asm("ld.global.nc." type " %0, [%1];" : to(x) : "l"(p)); return x; }
+READ(f32, "f32", "=f") READ(f64, "f64", "=d") READ(i32, "s32", "=r") READ(u32, "u32", "=r")
+FN b1 read(const b1* p) { return *p; }
 
 #define ROWS(T, SIZE, DRONES, p)
 #define RESULT(T, SIZE, p)
