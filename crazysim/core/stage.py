@@ -37,13 +37,14 @@ class Stage:
         batched: bool = False,
         name: str | None = None,
         fixed: bool = False,
+        why: str = "it is not declared for one drone or one world",
     ):
         """Declare a stage; see ``stage``.
 
         ``batched`` declares that the functions also take any leading axes. ``fixed`` declares that they always do the
-        same, for any numbers of worlds and drones, so that an engine traces them once in a process.
+        same, for any numbers of worlds and drones, so that an engine traces them once in a process. ``why`` is the reason of the scope ``"batch"``.
         """
-        self.fn, self.when, self.batched, self.fixed = fn, when, batched, fixed
+        self.fn, self.when, self.batched, self.fixed, self.why = fn, when, batched, fixed, why
         self.scope: StageScope = scope
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
         self.__doc__ = fn.__doc__
@@ -127,7 +128,7 @@ def at_the_start(data: SimData) -> Array:
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [
-        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed)
+        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed, fn.why)
         if isinstance(fn, Stage)
         else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()

@@ -187,8 +187,8 @@ class Planner(NamedTuple):
             return ""
         if self.location.mesh is None:
             return f"the data is spread over devices by a {type(data.states.pos.sharding).__name__}, not over a mesh"
-        undeclared = [s.__name__ for s in self.stages if s.scope == "batch"]
-        return f"with a mesh every stage must be declared, and {undeclared[0]!r} is not" if undeclared else ""
+        whole = next((s for s in self.stages if s.scope == "batch"), None)
+        return "" if whole is None else f"a mesh needs stages of one drone or world; {whole.__name__!r}: {whole.why}"
 
     def _plain(self, data: SimData, why: str) -> Plan:
         run, written = plain.build(self.stages, data)

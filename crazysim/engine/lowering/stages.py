@@ -101,7 +101,7 @@ def _lower_stage(
 ) -> Segment | UnfusedStage:
     try:
         if stage.scope == "batch":
-            raise LimitError("it is not declared for one drone or one world")
+            raise LimitError(stage.why)
         traced = tracer(stage, axes, leaves)
         # Where no leaf of a drone takes part, every drone can do it for its world.
         of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))

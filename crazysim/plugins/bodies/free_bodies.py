@@ -176,8 +176,9 @@ class FreeBodies(Population):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of the integration and of the contacts."""
         touching = Touching(sim, self)
-        contact = Stage(lambda data: touching.respond(data), "batch", name=f"{self.name}_contacts")
-        return [*super().stages(sim), Placement(contact, before="increment_steps", name=f"{self.name}_contacts")]
+        name, why = f"{self.name}_contacts", "it solves the contacts of all worlds at once"
+        contact = Stage(lambda data: touching.respond(data), "batch", name=name, why=why)
+        return [*super().stages(sim), Placement(contact, before="increment_steps", name=name)]
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
         """Return the rates of one body under gravity and the external wrench (Newton and Euler)."""

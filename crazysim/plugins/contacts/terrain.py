@@ -18,7 +18,7 @@ from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR, stopped_at
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
-from crazysim.plugins.effects.grid import LARGEST_FUSED
+from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE
 from crazysim.plugins.effects.ground import TerrainData, ground_height
 from crazysim.pytree import on_device
 from crazysim.storage import read_bytes
@@ -73,7 +73,7 @@ class Terrain(Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that stops drones at the ground."""
         scope = "drone" if self._checked(sim)[0].size <= LARGEST_FUSED else "batch"
-        stop = Stage(self.stop, scope, batched=True)
+        stop = Stage(self.stop, scope, batched=True, why=TOO_LARGE)
         return [Placement(stop, before="increment_steps", replaces="clip_floor_pos")]
 
     def stop(self, data: SimData) -> SimData:

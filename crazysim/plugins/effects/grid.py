@@ -19,6 +19,8 @@ from crazysim.tables import LARGEST
 
 LARGEST_FUSED = 400_000
 """Most numbers of a table that a fused kernel reads; compiling the step takes 8 µs for each."""
+TOO_LARGE = f"its table has more than {LARGEST_FUSED:,} numbers"
+"""Reason why a stage that reads a table is not fused."""
 MAX_FILE = 2**30
 """Largest file of a grid, bytes."""
 UNEVEN = 1e-3

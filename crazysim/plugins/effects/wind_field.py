@@ -14,7 +14,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_d
 from crazysim.core.random import world_key
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.grid import LARGEST_FUSED, Grid, interpolate
+from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, Grid, interpolate
 from crazysim.plugins.effects.moving_air import Air, Exposed, require_drag, with_moving_air
 from crazysim.pytree import leaf, on_device
 
@@ -91,7 +91,7 @@ class WindField(Plugin):
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages that displace the grid at the beginning of an episode, and look up the air."""
         is_small = np.size(self.field.values) <= LARGEST_FUSED
-        found = [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True))]
+        found = [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True, why=TOO_LARGE))]
         if self.spread is None:
             return found
         begins = Stage(self.displace, "drone", at_the_start)

@@ -18,7 +18,7 @@ from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.downwash import collective_thrust, jet, mean_rotor_vel, stream_diameter
-from crazysim.plugins.effects.grid import LARGEST_FUSED, interpolate, is_inside
+from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, interpolate, is_inside
 from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
 from crazysim.plugins.payloads.body import Colliding
 from crazysim.plugins.payloads.jet_table import JetTable
@@ -115,7 +115,7 @@ class RotorJet(Plugin):
 
         numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
         scope = "world" if self.all_drones else "drone" if numbers <= LARGEST_FUSED else "batch"
-        return [Placement(Stage(press, scope, batched=not self.all_drones))]  # type: ignore[arg-type]
+        return [Placement(Stage(press, scope, batched=not self.all_drones, why=TOO_LARGE))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the force of the jet on the load, world frame, N."""
