@@ -1,11 +1,13 @@
 """Environment steps per second, with random actions and with a policy, in one compiled rollout with automatic resets.
 
     python benchmarks/envs.py [--device gpu] [--tasks hover race] [--worlds 4096 1048576] [--randomize] [--depth 16 12]
+                              [--actions random policy bfloat16 training]
 
 An environment step at 50 Hz is ten physics steps at 500 Hz. Worlds that crash are reset, as in training; every line
 contains the fraction of worlds whose episode ends per step. With ``--randomize`` the same rollouts with
 ``Randomize.crazyflie()`` are timed in turn with them. With ``--depth`` the policies receive a depth image of each
-drone's camera at every environment step, too.
+drone's camera at every environment step, too. ``training`` times the iterations of ``crazysim train`` by PPO, rollout
+and updates, without compilation and evaluation; its batches grow with the number of worlds.
 """
 
 from __future__ import annotations
@@ -23,10 +25,13 @@ import crazysim.envs as envs
 from crazysim import Randomize
 from crazysim.envs.state import bare, flatten
 from crazysim.envs.statistics import RunningStats
+from crazysim.train import ppo
+from crazysim.train.config import TrainConfig
 from crazysim.train.networks import Policy, init_mlp
 
 MAX_DEPTH = 5.0
 """Largest distance that a policy receives, m."""
+ACTIONS = ("random", "policy", "bfloat16")
 SIZES = {"cpu": (1024, 16384), "gpu": (4096, 65536, 1048576)}
 
 
@@ -39,16 +44,25 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--randomize", action="store_true", help="time the same with Randomize.crazyflie() in turn")
     parser.add_argument("--depth", type=int, nargs=2, help="width and height of images that the policies receive")
+    parser.add_argument("--actions", nargs="+", default=ACTIONS, choices=(*ACTIONS, "training"), help="what is timed")
     args = parser.parse_args()
     for task in args.tasks:
         for n_worlds in args.worlds or SIZES["cpu" if args.device == "cpu" else "gpu"]:
-            rollouts(task, n_worlds, args.steps, args.device, args.repeats, args.randomize, args.depth)
+            sizes = task, n_worlds, args.steps, args.device, args.repeats
+            rollouts(*sizes, args.randomize, args.depth, args.actions)
 
 
 def rollouts(
-    task: str, n_worlds: int, n_steps: int, device: str, repeats: int, randomize: bool, size: Sequence[int] | None
+    task: str,
+    n_worlds: int,
+    n_steps: int,
+    device: str,
+    repeats: int,
+    randomize: bool,
+    size: Sequence[int] | None,
+    actions: Sequence[str],
 ) -> None:
-    """Print the rates of both kinds of rollout."""
+    """Print the rates of rollouts and of training."""
     base = envs.make(task, n_worlds, device=device)
     places = {"as the airframe": envs.AutoReset(base)}
     if randomize:
@@ -84,17 +98,23 @@ def rollouts(
     acts = {
         "random": lambda state, key: jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3),
         "policy": flying(policy),
-        "policy in bfloat16": flying(
+        "bfloat16": flying(
             policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))
         ),
     }
-    for name, act in acts.items():
+    recipe = TrainConfig.create(task, "ppo", n_worlds=n_worlds).algorithm_config()
+    for name in actions:
         measures: dict[str, Any] = {}
         compile_s, lasts = {}, {}
         for drones, env in places.items():
-            carry = (bare(starts[drones]), jax.device_put(jax.random.key(2), place))
+            if name == "training":
+                carry = ppo.init(env, recipe, key)
+                lowered = ppo.iterate.lower(carry, env, recipe)
+            else:
+                carry = (bare(starts[drones]), jax.device_put(jax.random.key(2), place))
+                lowered = jitted(env, acts[name]).lower(carry)
             begin = time.perf_counter()
-            run = jitted(env, act).lower(carry).compile()
+            run = lowered.compile()
             compile_s[drones] = time.perf_counter() - begin
             carry, _ = run(carry)
             last: list[Any] = [carry]
@@ -107,7 +127,9 @@ def rollouts(
                 return time.perf_counter() - begin
 
             measures[drones], lasts[drones] = measure, last
+        steps = recipe.n_steps if name == "training" else n_steps
         for drones, seconds in medians(measures, repeats).items():
+            ended = {} if name == "training" else {"ended": digits(float(jnp.mean(lasts[drones][1][1])))}
             report(
                 device,
                 benchmark="envs",
@@ -115,12 +137,12 @@ def rollouts(
                 actions=name,
                 drones=drones,
                 n_worlds=n_worlds,
-                n_steps=n_steps,
+                n_steps=steps,
                 depth=size,
                 engine=engine_of(base.sim),
                 compile_s=round(compile_s[drones], 2),
-                env_steps_per_s=digits(n_worlds * base.sim.n_drones * n_steps / seconds),
-                ended=digits(float(jnp.mean(lasts[drones][1][1]))),
+                env_steps_per_s=digits(n_worlds * base.sim.n_drones * steps / seconds),
+                **ended,
             )
 
 
