@@ -98,9 +98,7 @@ def rollouts(
     acts = {
         "random": lambda state, key: jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3),
         "policy": flying(policy),
-        "bfloat16": flying(
-            policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))
-        ),
+        "bfloat16": flying(policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))),
     }
     recipe = TrainConfig.create(task, "ppo", n_worlds=n_worlds).algorithm_config()
     for name in actions:

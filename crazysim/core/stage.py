@@ -42,7 +42,8 @@ class Stage:
         """Declare a stage; see ``stage``.
 
         ``batched`` declares that the functions also take any leading axes. ``fixed`` declares that they always do the
-        same, for any numbers of worlds and drones, so that an engine traces them once in a process. ``why`` is the reason of the scope ``"batch"``.
+        same, for any numbers of worlds and drones, so that an engine traces them once in a process. ``why`` is the
+        reason of the scope ``"batch"``.
         """
         self.fn, self.when, self.batched, self.fixed, self.why = fn, when, batched, fixed, why
         self.scope: StageScope = scope

@@ -32,6 +32,7 @@ from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
 from crazysim.envs.tasks.transport import Transport
 from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.plugins.effects.randomize import Randomize
 from crazysim.sim.sim import Sim
 
 
@@ -75,6 +76,8 @@ BUILT_IN = frozenset(TASKS)
 PLUGINS = "crazysim.tasks"
 """Group of entry points in which an installed package lists its classes of tasks by name."""
 
+RANGES = {"crazyflie": Randomize.crazyflie, "generic": Randomize.generic}
+"""Ready-made ranges of randomisation, by name."""
 SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
 """Options of ``make`` that belong to the simulation."""
 
@@ -86,6 +89,7 @@ def make(
     actions: Actions | None = None,
     sensors: Sequence[Plugin] = (),
     effects: Sequence[Plugin] = (),
+    randomize: str | None = None,
     **options: Any,
 ) -> DroneEnv:
     """Return an environment of many worlds of a task, with a simulation of its own.
@@ -99,6 +103,8 @@ def make(
             true states, or for those that ``estimator``, a setting of ``Sim``, estimates.
         effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. ``reset`` refuses those that
             ``env.sim.add`` adds later.
+        randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
+            ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
 
@@ -121,6 +127,13 @@ def make(
     own = {k: v for k, v in options.items() if k in entry.options}
     task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
     plugins = [*_plugins("effects", effects), *_plugins("sensors", sensors)]
+    if randomize is not None:
+        if randomize not in RANGES:
+            raise ConfigError(
+                f"expected randomize as one of {', '.join(map(repr, RANGES))}, got {shown(randomize)}. Use "
+                f"effects=[Randomize(...)] for ranges of your own."
+            )
+        plugins.append(RANGES[randomize]())
     sim = Sim(n_worlds=n_worlds, **settings)
     twice = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
     if twice:

@@ -252,13 +252,14 @@ def _meta(config: TrainConfig) -> dict[str, Any]:
     Raises:
         ConfigError: If JSON cannot hold the options.
     """
-    meta = {"crazysim": crazysim.__version__, "settings": dataclasses.asdict(config), "code": code_digest(config.task)}
+    settings = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
     try:
         return json.loads(json.dumps(meta))
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f"expected options that a checkpoint can hold, got {config.options!r}: {error}. Use numbers, texts and "
-            f"lists."
+            f"lists, and add plugins in install of a task of your own."
         ) from error
 
 

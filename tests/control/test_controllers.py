@@ -174,6 +174,7 @@ def test_rates_of_the_simulation_replace_those_of_the_controller():
     "settings, message",
     [
         ({"controller": "pd"}, r"expected controller as one of 'auto', 'crazyflow', .*got 'pd'"),
+        ({"controller": "mine.so"}, r"got 'mine.so'. Use CFirmware\('mine.so'\) for a compiled"),
         ({"controller": 3}, r"expected a controller as a name or a Controller, got 3"),
         ({"controller": "mellinger", "control": "body_rate"}, r"'mellinger' follows, state or attitude.*body_rate"),
         ({"controller": "pid", "dynamics": "so_rpy"}, r"expected dynamics with rotors for controller 'pid'"),

@@ -16,7 +16,7 @@ import pytest
 from pictures import frames_of
 
 import crazysim
-from crazysim import ConfigError
+from crazysim import ConfigError, Randomize
 from crazysim.__main__ import main
 from crazysim.envs import AutoReset, DroneEnv, make
 from crazysim.envs.state import bare, flatten
@@ -306,6 +306,8 @@ def test_invalid_settings_of_a_run_are_refused(tmp_path):
         trained(tmp_path / "run", small_config(config={"n_steps": 16, "minibatches": 7}))
     with pytest.raises(ConfigError, match="expected options that a checkpoint can hold"):
         trained(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
+    with pytest.raises(ConfigError, match=r"not JSON serializable.* add plugins in install of a task of your own"):
+        trained(tmp_path / "run", small_config(options={"effects": [Randomize.crazyflie()]}))
     with pytest.raises(ConfigError, match="evaluation_worlds is 0"):
         train(small_config(), tmp_path / "run", evaluation_worlds=0)
     with pytest.raises(ConfigError, match="n_worlds is 0"):

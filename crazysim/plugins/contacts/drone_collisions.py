@@ -92,4 +92,5 @@ class DroneCollisions(Plugin):
             states = moved(data.states, solved, slice(n))
             return self.write(data.replace(states=states), record.replace(**changes))
 
-        return [Placement(Stage(over_worlds(of_world), "batch", why="it solves the contacts of all worlds at once"), before="increment_steps")]
+        solve = Stage(over_worlds(of_world), "batch", why="it solves the contacts of all worlds at once")
+        return [Placement(solve, before="increment_steps")]

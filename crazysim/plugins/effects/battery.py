@@ -1,4 +1,4 @@
-"""Battery with a charge, a voltage that sags under load, and rotor speeds limited by that voltage."""
+"""Battery with a charge, a voltage that sags under load, and rotor speeds that the voltage limits or scales."""
 
 from __future__ import annotations
 
@@ -45,6 +45,8 @@ class BatteryData(PyTree):
     """Least voltage at which the rotors reach the airframe's largest speed, V. (1,)"""
     n_cells: Array = leaf("parameter", 1, (1,))
     """Number of cells in series. (1,)"""
+    command_voltage: Array | None = leaf("parameter", 1, (1,))
+    """Voltage at which the rotors turn as commanded, V; None if they do at any. (1,)"""
 
 
 class Battery(Plugin):
@@ -70,6 +72,9 @@ class Battery(Plugin):
     ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
     charge: ArrayLike = parameter(default=1.0)
     """State of charge at the beginning of an episode, 0 to 1."""
+    command_voltage: ArrayLike | None = parameter(default=None, positive=True)
+    """Voltage at which rotors turn as commanded, V: their speeds are proportional to the voltage, as with firmware that
+    does not compensate for it; None for firmware that does."""
     name: str = "battery"
 
     def record(self, sim: Simulation) -> BatteryData:
@@ -106,12 +111,15 @@ class Battery(Plugin):
         return [Placement(stage("drone")(self.discharge))]
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with rotor commands limited by the voltage."""
+        """Return the data with rotor commands that follow the voltage, or are limited by it."""
         battery, controls = self.read(data), controls_of(data)
         share = battery.voltage / battery.full_speed_voltage
         share = jnp.where(battery.charge > 0, jnp.where(share < 1, share, 1.0), 0.0)
         limit = share * data.params.rotor_vel_max
-        rotor_vel = jnp.where(controls.rotor_vel > limit, limit, controls.rotor_vel)
+        rotor_vel = controls.rotor_vel
+        if battery.command_voltage is not None:
+            rotor_vel = rotor_vel * (battery.voltage / battery.command_voltage)
+        rotor_vel = jnp.where(rotor_vel > limit, limit, rotor_vel)
         return data.replace(controls=controls.replace(rotor_vel=rotor_vel))
 
     def observations(self, data: SimData) -> dict[str, Array]:

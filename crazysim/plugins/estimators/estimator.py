@@ -12,7 +12,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.stage import Stage, as_stages
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -33,6 +33,16 @@ class Estimator(Plugin):
     """True where the controllers of the simulation fly on the estimate."""
     _: dataclasses.KW_ONLY
     name: str = "estimator"
+
+    def __post_init__(self) -> None:
+        """Check that the sensors are a list of them.
+
+        Raises:
+            ConfigError: If they are not.
+        """
+        if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
+            example = f"{type(self).__name__}([IMU(), MotionCapture()])"
+            raise ConfigError(f"expected sensors as a list, got {shown(self.sensors)}. Use {example}, say.")
 
     @classmethod
     def default(cls) -> Estimator:

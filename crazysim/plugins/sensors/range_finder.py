@@ -112,7 +112,7 @@ class RangeFinder(Plugin):
 
         fn = measure_at_times if scope == "batch" and period > 1 else measure
         when = None if period == 1 else is_due
-        why = f"rays among {n_movable} movable geoms of a world, more than {MAX_UNROLLED}, are cast by a kernel of their own"
+        why = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED}, are cast by a kernel of their own"
         return [Placement(Stage(fn, scope, when, name="range_finder", why=why), before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:

@@ -81,6 +81,18 @@ def test_a_sagging_battery_slows_the_rotors_and_leaves_the_command():
     np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((2, 2, 4), top))
 
 
+def test_without_compensation_all_speeds_follow_the_voltage():
+    """At a half and at a full charge, and of a fleet: the command times V over the voltage of the command."""
+    sim = build(capacity=10.0, charge=[[1.0, 0.5], [0.2, 0.5]], command_voltage=[[3.7, 3.7], [3.7, 4.0]])
+    sim.rotor_vel_control(np.full((2, 2, 4), 12000.0))
+    sim.step(600)
+    v, at = np.asarray(record(sim).voltage), np.array([[3.7, 3.7], [3.7, 4.0]])[..., None]
+    assert np.ptp(v) > 0.1
+    np.testing.assert_allclose(sim.data.states.rotor_vel, np.repeat(12000 * v / at, 4, -1), rtol=1e-4)  # discharges
+    with pytest.raises(ConfigError, match="command_voltage to be finite and positive"):
+        sim.replace(Battery(0.25, 0.1, command_voltage=0.0))
+
+
 @pytest.mark.parametrize("name, expected", [("cf21B_500", 3.1257), ("cf2x_T350", 2.8166), ("bumblebee", 2 * 3.7)])
 def test_full_speed_needs_the_voltage_of_the_airframe(name, expected):
     """A Crazyflie's is that of the firmware's thrust curve; an airframe without a curve gets 3.7 V per cell."""

@@ -156,7 +156,7 @@ def test_presets_fly_and_take_changes():
 
 
 def test_a_task_flies_other_drones_in_every_episode():
-    env = AutoReset(make("hover", 4, effects=[Randomize.crazyflie()], seconds=0.1))
+    env = AutoReset(make("hover", 4, randomize="crazyflie", seconds=0.1))
     assert "one kernel" in env.explain(), "draws at resets are fused too"
     state = jax.jit(env.reset)(jax.random.key(0))
     step, seen = jax.jit(env.step), [np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0]]
@@ -230,6 +230,11 @@ def test_law_09_ranges_that_would_do_nothing_are_errors(setting, remedy):
         sim.step()
     with pytest.raises(ConfigError, match=remedy):
         make("hover", drone="bumblebee", effects=[Randomize(**setting)])
+
+
+def test_law_09_unknown_ranges_of_a_task_are_an_error():
+    with pytest.raises(ConfigError, match=r"randomize as one of 'crazyflie', 'generic', got 'crazyfly'. Use effects="):
+        make("hover", randomize="crazyfly")
 
 
 @pytest.mark.parametrize("latency_first", [True, False])

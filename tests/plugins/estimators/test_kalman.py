@@ -215,6 +215,9 @@ def test_wrong_sensors_are_refused():
     ):
         with pytest.raises(ConfigError, match=message):
             sim.add(Kalman(sensors))
+    for wrong in (imu, "imu", ["imu"]):
+        with pytest.raises(ConfigError, match=r"expected sensors as a list, got .*Use Kalman\(\[IMU\(\), MotionCap"):
+            Kalman(wrong)
     with pytest.raises(ConfigError, match="got 'speed'"):
         sim.add(Kalman([imu], deviations={"speed": 1.0}))
 
