@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,10 @@ from crazysim.dynamics.utils.identification import FITTED
 from crazysim.errors import ConfigError
 from crazysim.identify import (
     Columns,
+    FittedModel,
+    Log,
     Model,
+    Predictor,
     aligned,
     errors_table,
     fast_rotation,
@@ -57,8 +60,11 @@ def run(options: argparse.Namespace) -> None:
     """Fit an airframe, print its errors, and write its file."""
     if options.out.suffix != ".toml" or not options.out.parent.is_dir() or options.out.exists():
         raise ValueError(f"expected a new .toml file in an existing folder, got {str(options.out)!r}")
-    if options.dynamics != "first_principles":
-        _check_fitted(options)
+    if options.dynamics != "first_principles" and options.network is not None:
+        raise ConfigError(
+            f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
+            "Leave --network out, or use --dynamics first_principles with logs of rotor speeds."
+        )
     columns = _columns(options.columns) if options.columns else None
     paths = [*options.logs, *options.test]
     if options.motion and len(options.motion) != len(paths):
@@ -78,9 +84,13 @@ def run(options: argparse.Namespace) -> None:
     logs, held_out = every[: len(options.logs)], every[len(options.logs) :]
     source = f"crazysim identify, {datetime.now(UTC):%Y-%m-%d}, from {', '.join(log.name for log in logs)}"
     if options.dynamics != "first_principles":
-        _, text = identify_attitude(logs, options.airframe, options.dynamics, source, mass=options.mass)
-        options.out.write_text(text, encoding="utf-8")
-        print(f"{text}wrote {options.out}")
+        fitted, text = identify_attitude(logs, options.airframe, options.dynamics, source, mass=options.mass)
+        models = {"identified": FittedModel.create(fitted, options.dynamics)}
+        if f"fitted.{options.dynamics}.cmd_f_coef" in base.values:
+            models = {options.airframe: FittedModel.create(base, options.dynamics, options.mass)} | models
+        print(text, end="")
+        _report(options, logs, held_out, models)
+        _write(options.out, text)
         return
     result = identify(logs, options.airframe, mass=options.mass)
     for name, x in result.values.items():
@@ -95,6 +105,16 @@ def run(options: argparse.Namespace) -> None:
         trained = fit_residual(logs, result.model, n_hidden=options.network, iterations=options.iterations)
         result = result.with_residual(trained.residual)
         models["with residual"] = result.model
+    _report(options, logs, held_out, models)
+    _write(options.out, result.toml(source))
+    if result.doubtful:
+        print(f"DOUBTFUL, more than three times from the airframe: {', '.join(result.doubtful)}")
+
+
+def _report(
+    options: argparse.Namespace, logs: Sequence[Log], held_out: Sequence[Log], models: Mapping[str, Predictor]
+) -> None:
+    """Print the errors of predictions of fitted and held-out logs, and draw them if requested."""
     for title, flights in (("fitted logs", logs), ("held-out logs", held_out)):
         if flights:
             for name, model in models.items():
@@ -102,29 +122,11 @@ def run(options: argparse.Namespace) -> None:
     if options.plot:
         plot_errors(held_out or logs, models, options.plot)
         print(f"wrote {options.plot}")
-    text = result.toml(source)
-    options.out.write_text(text, encoding="utf-8")
-    print(f"wrote {options.out}")
-    if result.doubtful:
-        print(f"DOUBTFUL, more than three times from the airframe: {', '.join(result.doubtful)}")
 
 
-def _check_fitted(options: argparse.Namespace) -> None:
-    """Refuse options that only the fit of the first-principles model has."""
-    if options.test:
-        raise ConfigError(
-            f"expected no --test with --dynamics {options.dynamics}, whose errors are not computed. "
-            "Leave --test out, and compare flights of Sim(drone=..., dynamics=...) with the logs."
-        )
-    if options.plot:
-        raise ConfigError(
-            f"expected no --plot with --dynamics {options.dynamics}, whose errors are not computed. Leave --plot out."
-        )
-    if options.network is not None:
-        raise ConfigError(
-            f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
-            "Leave --network out, or use --dynamics first_principles with logs of rotor speeds."
-        )
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+    print(f"wrote {path}")
 
 
 def _columns(texts: Sequence[str]) -> Columns:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from crazysim.identify.logs import Log
-from crazysim.identify.prediction import HORIZONS, Model, prediction_errors
+from crazysim.identify.prediction import HORIZONS, Predictor, prediction_errors
 
 
-def plot_errors(logs: Sequence[Log], models: Mapping[str, Model], path: str | Path) -> None:
+def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str | Path) -> None:
     """Write a picture of the errors of position and attitude over the horizon.
 
     Args:

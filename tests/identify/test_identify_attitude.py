@@ -8,6 +8,7 @@ from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing, state_variable_filter
 from crazysim.dynamics.utils.identification import sys_id_rotation, sys_id_translation
 from crazysim.errors import ConfigError
+from crazysim.identify import FittedModel, prediction_errors, read_log
 from crazysim.sim import Sim
 
 MODEL = "so_rpy_rotor_drag"
@@ -61,23 +62,36 @@ def test_names_of_crazyflow_find_the_parameters(flight):
 
 
 def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
-    path, out = tmp_path / "flight.npz", tmp_path / "mine.toml"
+    path, out, plot = tmp_path / "flight.npz", tmp_path / "mine.toml", tmp_path / "errors.png"
     np.savez(path, **flight)
-    assert main(["identify", str(path), "--airframe", "cf2x_L250", "--dynamics", MODEL, "--out", str(out)]) == 0
-    assert "wrote" in capsys.readouterr().out
+    options = ["--airframe", "cf2x_L250", "--dynamics", MODEL, "--out", str(out)]
+    assert main(["identify", str(path), *options, "--test", str(path), "--plot", str(plot)]) == 0
+    printed = capsys.readouterr().out
+    assert "held-out logs, cf2x_L250\n" in printed
+    assert "held-out logs, identified\n" in printed
+    assert plot.read_bytes().startswith(b"\x89PNG")
     mine, base = load_airframe(out), load_airframe("cf2x_L250")
     for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef"):
         np.testing.assert_allclose(mine.value(f"fitted.{MODEL}.{key}"), base.value(f"fitted.{MODEL}.{key}"), rtol=0.02)
     Sim(drone=out, dynamics=MODEL, control="attitude").step()
 
 
-@pytest.mark.parametrize("option", ["--test", "--plot", "--network"])
-def test_options_of_the_other_fit_are_refused(flight, tmp_path, capsys, option):
+def test_the_true_model_predicts_its_own_flight(flight):
+    """Velocities and rates of the log are derivatives over 0.06 s, which leaves errors where predictions start."""
+    model = FittedModel.create(load_airframe("cf2x_L250"), MODEL)
+    errors = prediction_errors([read_log(flight)], model)
+    assert np.all(errors["position"] < 0.03 * errors["position at constant velocity"])
+    assert np.all(errors["attitude"] < 0.01 * errors["attitude unchanged"])
+    # RMSE, and mean, of one distribution.
+    for name in ("position", "attitude"):
+        assert np.all(errors[f"{name} (mean)"] < errors[name])
+
+
+def test_a_residual_of_a_fitted_model_is_refused(flight, tmp_path, capsys):
     path, out = tmp_path / "flight.npz", tmp_path / "a.toml"
     np.savez(path, **flight)
-    value = {"--test": str(path), "--plot": "errors.png", "--network": "0"}[option]
-    assert main(["identify", str(path), "--dynamics", MODEL, "--out", str(out), option, value]) != 0
-    assert f"Leave {option} out" in capsys.readouterr().err
+    assert main(["identify", str(path), "--dynamics", MODEL, "--out", str(out), "--network", "0"]) != 0
+    assert "Leave --network out" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -61,15 +61,16 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
 def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     """Return a log with filtered signals and their derivatives, without phase shift.
 
-    Position and thrust pass 6 Hz, angles 8 Hz. Commands are held from sample to sample, as flight controllers do.
+    Butterworth low-passes have a cutoff of 6 Hz for position and thrust and of 8 Hz for angles. Commands are held from
+    sample to sample, as flight controllers do.
 
     Args:
         data: A log from ``preprocessing``.
 
     Returns:
-        The same, with ``SVF_pos``, ``SVF_vel``, ``SVF_acc``, ``SVF_jerk``, SI units, (n, 3); ``SVF_rpy``, ``SVF_drpy``,
-        ``SVF_ddrpy``, ``SVF_dddrpy``, rad and s, (n, 3); ``SVF_quat``, (n, 4); ``SVF_cmd_f``, N, (n,); ``SVF_cmd_rpy``,
-        rad, (n, 3).
+        The same, with ``SVF_pos``, m, ``SVF_vel``, m/s, ``SVF_acc``, m/s^2, and ``SVF_jerk``, m/s^3, world frame,
+        (n, 3); ``SVF_rpy``, rad, ``SVF_drpy``, rad/s, ``SVF_ddrpy``, rad/s^2, and ``SVF_dddrpy``, rad/s^3, (n, 3);
+        ``SVF_quat``, body to world, unit, xyzw, (n, 4); ``SVF_cmd_f``, N, (n,); ``SVF_cmd_rpy``, rad, (n, 3).
     """
     log = {key: np.asarray(x, np.float64) for key, x in data.items()}
     time = log["time"]

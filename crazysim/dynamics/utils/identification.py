@@ -49,7 +49,7 @@ def sys_id_translation(
         data_validation: Another one, whose error is logged.
         gravity: Gravitational acceleration, world frame, m/s^2. (3,)
         verbose: Ignored: results are logged at level INFO.
-        plot: Accepted as False only; ``crazysim identify --plot`` draws errors.
+        plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
 
     Returns:
         ``cmd_f_coef``, thrust per commanded thrust, 1; with a lag ``thrust_dyn_coef``, its rate, 1/s; with drag
@@ -83,7 +83,7 @@ def sys_id_rotation(
         data: A log from ``derivatives_svf``.
         data_validation: Another one, whose error is logged.
         verbose: Ignored: results are logged at level INFO.
-        plot: Accepted as False only; ``crazysim identify --plot`` draws errors.
+        plot: Accepted as False only; ``crazysim identify --dynamics ... --plot`` draws errors.
 
     Returns:
         ``rpy_coef``, 1/s^2, ``rpy_rates_coef``, 1/s, and ``cmd_rpy_coef``, 1/s^2. (3,) each
@@ -194,7 +194,16 @@ def _terms(
 
 
 def lagged(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
-    """Return a signal, linear between samples, behind a lag of first order that starts at rest. (n, ...)"""
+    """Return a signal, linear between samples, behind a lag of first order that starts at rest.
+
+    Args:
+        x: Samples. (n, ...)
+        dt: Time between two samples, s.
+        rate: Rate of the lag, 1/s. (...)
+
+    Returns:
+        Samples in the unit of ``x``. (n, ...)
+    """
     decay = np.exp(-rate * dt)
     after = 1 - (1 - decay) / (rate * dt)  # weight of the later sample
     inputs = (1 - decay - after) * x[:-1] + after * x[1:]
