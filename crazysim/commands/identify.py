@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,14 +41,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     add = parser.add_argument
     add(
         "logs",
-        type=Path,
         nargs="+",
         metavar="LOG",
-        help="logs to fit: .csv, .npz, .ulg of PX4, ROS bags, or of a micro-SD card",
+        help="logs to fit: .csv, .npz, .ulg of PX4, ROS bags, or of a micro-SD card; LOG@10:25 is the part from 10 to "
+        "25 s",
     )
     add("--airframe", default="cf21B_500", help="airframe to start from: a name or a TOML file")
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
-    add("--test", type=Path, nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
+    add("--test", nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
     add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
     add("--dynamics", choices=["first_principles", *FITTED], default="first_principles", help="model to fit")
@@ -73,7 +75,8 @@ def run(options: argparse.Namespace) -> None:
             "Name them in the order of the logs, then of those of --test."
         )
     every = [
-        read_log(*x) for x in zip(paths, [columns] * len(paths), options.motion or [None] * len(paths), strict=True)
+        read_log(path, columns, motion, between)
+        for (path, between), motion in zip(map(_part, paths), options.motion or [None] * len(paths), strict=True)
     ]
     base = load_airframe(options.airframe)
     if options.dynamics == "first_principles":
@@ -127,6 +130,14 @@ def _report(
 def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
     print(f"wrote {path}")
+
+
+def _part(text: str) -> tuple[str, tuple[float, float]]:
+    """Return path, start and end of ``LOG@START:END``, either of which may be left out."""
+    found = re.fullmatch(r"(.+)@([\d.]*):([\d.]*)", text)
+    if found is None or Path(text).exists():
+        return text, (0.0, math.inf)
+    return found[1], (float(found[2] or 0), float(found[3] or math.inf))
 
 
 def _columns(texts: Sequence[str]) -> Columns:

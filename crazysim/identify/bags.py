@@ -15,13 +15,16 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
-from crazysim.identify.readers import QUAT, Stream, at_equal_times
+from crazysim.identify.columns import Columns
+from crazysim.identify.readers import Stream, at_equal_times
 
 XYZ, XYZW = "xyz", "xyzw"
 POSES = {
     "nav_msgs/msg/Odometry": ("pose/pose/position", "pose/pose/orientation"),
     "geometry_msgs/msg/PoseStamped": ("pose/position", "pose/orientation"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose/pose/position", "pose/pose/orientation"),
     "geometry_msgs/msg/TransformStamped": ("transform/translation", "transform/rotation"),
+    "geometry_msgs/msg/Pose": ("position", "orientation"),
 }
 """Fields of position and attitude by type of message, most informative first."""
 ROTORS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
@@ -33,22 +36,19 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
 
 
-def read_bag(
-    path: Path, repairs: list[str], names: Sequence[str] = (), quat: Sequence[str] = QUAT
-) -> dict[str, NDArray]:
+def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
     """Return the columns of a bag of ROS 1 or 2, interpolated at the times of the fastest topic.
 
     A name such as ``/drone/odom/pose/pose/position/x`` or ``/motors/data[0]`` is a topic and a field of its messages.
-    Without names, the columns are those of crazysim's logs: position and attitude of the only Odometry, PoseStamped or
-    TransformStamped; the twist of Odometry, which is in the frame of the body (nav_msgs/Odometry), with the velocity
+    Without such names, the columns are those of crazysim's logs: position and attitude of the only topic of a type in
+    ``POSES``; the twist of Odometry, which is in the frame of the body (nav_msgs/Odometry), with the velocity
     turned to the world; the angular velocity of the only Imu, which precedes; and rotor speeds of the only Actuators,
     rad/s (actuator_msgs, mav_msgs). Units are SI (REP 103). Times are those of headers, or else of the bag.
 
     Args:
         path: File ``.bag``, ``.mcap`` or ``.db3``, or folder with ``metadata.yaml``.
         repairs: List that descriptions of repairs are appended to.
-        names: Names of columns with their topics.
-        quat: Those of the attitude.
+        wanted: Names of the columns.
 
     Raises:
         ConfigError: If a topic or a field is missing, or topics are ambiguous.
@@ -61,6 +61,7 @@ def read_bag(
         raise ImportError(
             "expected rosbags, which ROS bags need, got none. Run pip install 'crazysim[logs]'."
         ) from error
+    names = [] if wanted is None else [x for x in wanted.names if "/" in x]
     folder = path.parent if path.suffix in (".mcap", ".db3") and (path.parent / "metadata.yaml").is_file() else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
@@ -79,7 +80,7 @@ def read_bag(
         ) from error
     if not names:
         streams = {topic: _turned(stream) for topic, stream in streams.items()}
-    return at_equal_times(path.name, streams, repairs, quat if names else QUAT)
+    return at_equal_times(path.name, streams, repairs, wanted if names else None)
 
 
 def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:

@@ -20,6 +20,8 @@ RATIOS = (0.5, 2.0)
 benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
 DIVERGED = 10.0
 """Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
+STILL = 0.3
+"""Span of the position below which a fault is that of a drone at rest, whose estimator drifts, m."""
 PIECE = 2.0
 """Duration of the pieces that are left out where a rate has diverged, s."""
 
@@ -36,20 +38,26 @@ class Pair(NamedTuple):
     floor: float
     """Change below which an axis does not move, in the unit of the changes."""
 
-    def ratios(self) -> NDArray:
-        """Return the median ratio of both on each axis where it moves most, NaN for axes that do not move. (3,)"""
-        found = np.full(3, np.nan)
+    def sizes(self) -> NDArray:
+        """Return medians of both where the expected one is largest, its own sign being positive. (3, 2)"""
+        found = np.zeros((3, 2))
         for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
             most = np.abs(y) >= np.quantile(np.abs(y), 0.75)
-            size, along = np.median(np.abs(y[most])), np.median(x[most] * np.sign(y[most]))
+            along, size = np.median(x[most] * np.sign(y[most])), np.median(np.abs(y[most]))
             if max(size, np.median(np.abs(x[most]))) > self.floor:
-                found[k] = along / size if size > 0 else np.inf
+                found[k] = (along, size) if size > 0 else (np.inf, 1.0)
         return found
 
+    def ratios(self) -> NDArray:
+        """Return the ratio of both on each axis, NaN for axes that do not move. (3,)"""
+        along, size = self.sizes().T
+        return np.divide(along, size, out=np.full(3, np.nan), where=size > 0)
+
     def agrees(self) -> bool:
-        """Return True if the ratios of all axes that move are those of one motion."""
-        ratios = self.ratios()
-        return bool(np.all(np.isnan(ratios) | ((ratios > RATIOS[0]) & (ratios < RATIOS[1]))))
+        """Return True if the ratios of all axes that move are those of one motion, but for half of the floor."""
+        along, size = self.sizes().T
+        slack = self.floor / 2
+        return bool(np.all((along >= RATIOS[0] * size - slack) & (along <= RATIOS[1] * size + slack)))
 
 
 def check_motion(
@@ -80,8 +88,16 @@ def check_motion(
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if (fault := _fault(t, data, derived)) is None:
         return keep
+    span = float(np.max(np.ptp(data["pos"], axis=0)))
+    if span < STILL:
+        raise ConfigError(
+            f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
+            f"{STILL:g} m or more, or give metres_per_unit."
+        )
+    moving = _moving(t, data, derived)
     for remedy, changed in _alternatives(data, derived):
-        if _fault(t, changed, derived) is None:
+        # A factor that makes the motion vanish explains nothing.
+        if _fault(t, changed, derived) is None and np.all(_moving(t, changed, derived) | ~moving):
             raise ConfigError(f"{name}: expected {fault}. {remedy}.")
     raise ConfigError(
         f"{name}: expected {fault}. Check units, signs and order of the columns: z up, quaternions xyzw and body to "
@@ -99,6 +115,12 @@ def _fault(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) ->
             shown = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in pair.ratios())
             return f"{pair.what}, got ratios of measured to expected changes of {shown} on x, y, z, where 1 is right"
     return None
+
+
+def _moving(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> NDArray:
+    """Return True for each law whose changes move on an axis. (n_laws,)"""
+    pairs = (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data))
+    return np.array([not np.all(np.isnan(pair.ratios())) for pair in pairs])
 
 
 def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ class Columns:
     """Position, world frame, m."""
     quat: tuple[str, ...] = ("qx", "qy", "qz", "qw")
     """Attitude, body to world, xyzw."""
+    rpy: tuple[str, ...] = ()
+    """Roll, pitch and yaw, rad, in place of ``quat``: ``Rz(yaw) Ry(pitch) Rx(roll)`` turns body to world."""
     vel: tuple[str, ...] = ("vx", "vy", "vz")
     """Velocity, world frame, m/s."""
     ang_vel: tuple[str, ...] = ("wx", "wy", "wz")
@@ -43,6 +45,8 @@ class Columns:
     """Factor from the logged positions to m."""
     speed_per_unit: float = 1.0
     """Factor from the logged velocities to m/s."""
+    rad_per_angle: float = 1.0
+    """Factor from ``rpy`` to rad."""
     rad_per_unit: float = 1.0
     """Factor from the logged angular velocities to rad/s."""
     rpm_per_unit: float = 1.0
@@ -53,6 +57,12 @@ class Columns:
     """Factor from the commanded collective thrust to N."""
     share_per_command: float = 1.0
     """Factor from the commands of the rotors to shares of the battery's voltage."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all columns but the time, without signs."""
+        attitude = self.rpy or self.quat
+        return [plain(x) for x in (*self.pos, *attitude, *(x for key in OPTIONAL for x in getattr(self, key)))]
 
 
 KNOWN = {
@@ -119,9 +129,25 @@ def _numbers(name: str, key: str, values: NDArray) -> NDArray:
 
 def missing(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
     """Return the columns that a log lacks; those of default names are optional as a whole."""
-    names = [columns.time, *columns.pos, *columns.quat]
+    names = [columns.time, *columns.pos, *(columns.rpy or columns.quat)]
     for key in OPTIONAL:
         given = getattr(columns, key)
         if given != getattr(KNOWN["crazysim"], key) or any(plain(x) in table for x in given):
             names += given
     return [plain(x) for x in names if plain(x) not in table]
+
+
+def numbered(table: Mapping[str, NDArray], columns: Columns) -> Columns:
+    """Return the columns with as many rotors as a log has, such as ``rpm1`` to ``rpm6``, where their names are default.
+
+    Logs of fewer rotors than four are left to the check for missing columns.
+    """
+    found = {}
+    for key in ("rotor_vel", "command"):
+        names = getattr(columns, key)
+        if names == getattr(KNOWN["crazysim"], key):
+            stem, n = names[0][:-1], len(names)
+            while f"{stem}{n + 1}" in table:
+                n += 1
+            found[key] = tuple(f"{stem}{k + 1}" for k in range(n))
+    return replace(columns, **found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.identify import motion as capture
 from crazysim.identify.checks import check_motion
-from crazysim.identify.columns import KNOWN, OPTIONAL, Columns, missing, plain, stacked
-from crazysim.identify.repairs import bridged, gaps_of, increasing, without_spikes
+from crazysim.identify.columns import KNOWN, OPTIONAL, Columns, missing, numbered, plain, stacked
+from crazysim.identify.repairs import SHORTEST, airborne, bridged, gaps_of, increasing, without_spikes
 from crazysim.identify.tables import read_table
 
 
@@ -58,6 +59,7 @@ def read_log(
     path: str | Path | Mapping[str, NDArray],
     columns: Columns | str | None = None,
     motion: str | Path | Mapping[str, NDArray] | None = None,
+    between: tuple[float, float] = (0.0, math.inf),
 ) -> Log:
     """Return the log of a file or of a dict of columns, checked and repaired.
 
@@ -70,6 +72,7 @@ def read_log(
         columns: Names of the columns, or a key of ``KNOWN``; by default the first of ``KNOWN`` that the log has.
         motion: Motion capture of the same flight, whose columns are added to those of the log. Its clock may be another
             one: it is moved to where the angular velocities agree.
+        between: Start and end of the part that is read, s after the first sample.
 
     Raises:
         ConfigError: If columns are missing, or the samples cannot be repaired.
@@ -84,12 +87,11 @@ def read_log(
         columns = KNOWN[columns]
     name, table = read_table(path, repairs, columns)
     if motion is not None:
-        names = columns or KNOWN["crazysim"]
-        ang_vel = stacked(name, table, names.ang_vel, names.rad_per_unit)
         _, other = read_table(motion, repairs, columns)
-        table = capture.joined(name, table, other, names.time, ang_vel, names.quat, repairs)
+        table = capture.joined(name, table, other, columns or KNOWN["crazysim"], repairs)
     if columns is None:
         columns = next((c for c in reversed(KNOWN.values()) if not missing(table, c)), KNOWN["crazysim"])
+    columns = numbered(table, columns)
     if absent := missing(table, columns):
         raise ConfigError(
             f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them in a Columns "
@@ -112,7 +114,20 @@ def read_log(
         data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]
     t = stacked(name, table, [columns.time])[:, 0]
     keep = increasing(name, t, repairs)
+    since = t - t[keep][0]
+    keep &= (since >= between[0]) & (since <= between[1])
+    if np.sum(keep) < SHORTEST:
+        raise ConfigError(
+            f"{name}: expected at least {SHORTEST} samples between {between[0]:g} and {between[1]:g} s, got "
+            f"{np.sum(keep)} of a log of {since[np.isfinite(since)].max():.3g} s. Give other times."
+        )
     t, data = bridged(name, t[keep], {key: x[keep] for key, x in data.items()}, repairs)
+    thrust = np.sum(data["rotor_vel"] ** 2, axis=1) if "rotor_vel" in data else None
+    if thrust is None and "attitude_command" in data:
+        thrust = data["attitude_command"][:, 3]
+    if thrust is not None:
+        keep = airborne(name, t, thrust, repairs)
+        t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if "rotor_vel" in data:
         data["rotor_vel"] = without_spikes(name, data["rotor_vel"], repairs)
     else:

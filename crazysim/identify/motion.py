@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.identify.columns import Columns, plain, stacked
 from crazysim.identify.readers import Stream, at_equal_times
 
 STEP = 0.005
@@ -20,9 +21,7 @@ def joined(
     name: str,
     table: Mapping[str, NDArray],
     motion: Mapping[str, NDArray],
-    time: str,
-    ang_vel: NDArray,
-    quat: Sequence[str],
+    columns: Columns,
     repairs: list[str],
 ) -> dict[str, NDArray]:
     """Return a log's columns with those of motion capture that it lacks, on the clock of the log.
@@ -33,14 +32,14 @@ def joined(
         name: Name of the log, for messages.
         table: Columns of the log.
         motion: Columns of the motion capture.
-        time: Name of the time, s, in both.
-        ang_vel: Angular velocity of the log, body frame, rad/s. (n, 3)
-        quat: Names of the attitude, body to world, xyzw, in the motion capture.
+        columns: Names of the columns in both.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
         ConfigError: If both do not move alike.
     """
+    time, quat = columns.time, [plain(x) for x in columns.quat]
+    ang_vel = stacked(name, table, columns.ang_vel, columns.rad_per_unit)
     missing = [c for c in (time, *quat) if c not in motion]
     if missing:
         raise ConfigError(
@@ -48,7 +47,7 @@ def joined(
             "Give the names as time= and quat=."
         )
     t, other = (np.asarray(x[time], np.float64) for x in (table, motion))
-    turned = body_rates(other, np.stack([np.asarray(motion[c], np.float64) for c in quat], axis=-1))
+    turned = body_rates(other, stacked(name, motion, columns.quat))
     size = round(DERIVED_OVER / STEP)
     series = []
     for at, rates in ((t, ang_vel), ((other[1:] + other[:-1]) / 2, turned)):
@@ -70,7 +69,7 @@ def joined(
         "the log": Stream(t, _numbers(table, len(t), (time,))),
         "motion capture": Stream(other + shift, _numbers(motion, len(other), (time, *table))),
     }
-    both = at_equal_times(name, streams, repairs, quat)
+    both = at_equal_times(name, streams, repairs, columns)
     return both | {time: both.pop("t")}
 
 

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim import rotation
 from crazysim.errors import ConfigError
-from crazysim.identify.repairs import continuous
+from crazysim.identify.columns import Columns, plain
+from crazysim.identify.repairs import PERIODS, continuous
 
 LONGEST_HOLD = 3.0
 """Intervals of a stream, after which its interpolated values count as a gap."""
-QUAT = ("qx", "qy", "qz", "qw")
-"""Names of the columns of an attitude, body to world."""
 LARGEST_RATE = 250.0
 """Rate to which faster logs are averaged, Hz: above some 50 Hz nothing is identified."""
 
@@ -32,21 +33,26 @@ class Stream(NamedTuple):
 
 
 def at_equal_times(
-    name: str, streams: Mapping[str, Stream], repairs: list[str], quat: Sequence[str] = QUAT
+    name: str, streams: Mapping[str, Stream], repairs: list[str], columns: Columns | None = None
 ) -> dict[str, NDArray]:
     """Return the columns of all streams, interpolated linearly at the times of the fastest; ``t`` begins at zero.
 
-    Where a stream pauses for over three of its intervals the samples are left out, which leaves a gap.
+    Where a stream pauses for over three of its intervals the samples are left out, which leaves a gap. Streams that are
+    slower than a log may be are left out, too, but for the voltage.
 
     Args:
         name: Name of the file, for messages.
         streams: Streams by name.
         repairs: List that descriptions of repairs are appended to.
-        quat: Names of the columns of the attitude, whose signs are made continuous first.
+        columns: Names of the columns, None for the default ones. Attitudes are made continuous first.
 
     Raises:
-        ConfigError: If no two streams overlap, or a stream has fewer than two samples.
+        ConfigError: If no two streams overlap, a stream has fewer than two samples, or position or attitude are too
+            slow.
     """
+    columns = columns or Columns()
+    quat, angles = ([plain(x) for x in names] for names in (columns.quat, columns.rpy))
+    needed, slowly = {*map(plain, columns.pos), *quat, *angles}, set(map(plain, columns.voltage))
     sorted_streams = {}
     for key, stream in streams.items():
         order = np.unique(stream.t, return_index=True)[1]
@@ -55,11 +61,22 @@ def at_equal_times(
             repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples have no time of their own")
         if len(order) < 2:
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
-        columns = {c: x[order] for c, x in stream.columns.items()}
-        if quat and all(c in columns for c in quat):
-            turned = continuous(np.stack([columns[c] for c in quat], axis=-1))
-            columns |= dict(zip(quat, turned.T, strict=True))
-        sorted_streams[key] = Stream(stream.t[order], columns)
+        values = {c: x[order] for c, x in stream.columns.items()}
+        step = float(np.median(np.diff(stream.t[order])))
+        if step > PERIODS[1] and not set(values) <= slowly:
+            wanted = f"{key} every {PERIODS[1]:g} s or more often, got every {step:.2g} s"
+            if needed & set(values):
+                raise ConfigError(f"{name}: expected {wanted}. Log it faster.")
+            repairs.append(f"left out a slow stream: expected {wanted}")
+            continue
+        if quat and all(c in values for c in quat):
+            turned = continuous(np.stack([values[c] for c in quat], axis=-1))
+            values |= dict(zip(quat, turned.T, strict=True))
+        turn = 2 * np.pi / abs(columns.rad_per_angle)
+        values |= {c: np.unwrap(values[c], period=turn) for c in angles if c in values}
+        sorted_streams[key] = Stream(stream.t[order], values)
+    if not sorted_streams:
+        raise ConfigError(f"{name}: expected messages every {PERIODS[1]:g} s or more often, got none. Log them faster.")
     steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
     start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
     dt = min(steps.values())
@@ -91,14 +108,17 @@ def decimated(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArra
     return {key: x[:n].reshape(-1, size).mean(axis=1) for key, x in table.items()}
 
 
-def read_crazyflie(path: Path, repairs: list[str]) -> dict[str, NDArray]:
+def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
     """Return the columns of a log of the Crazyflie's micro-SD card, by the names of its log variables.
 
     The format is that of Bitcraze's crazyflie-firmware, tools/usdlog/cfusdlog.py at commit 34c90e75: versions 1 and 2.
+    Compressed attitudes, such as ``stateEstimateZ.quat``, become four columns, such as ``stateEstimateZ.qx`` to ``qw``
+    (src/modules/interface/quatcompress.h). Variables that two events share get the name of the event in front.
 
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
+        wanted: Names of the columns. Events that have none of them are left out, unless all have none.
 
     Raises:
         ConfigError: If the file is no such log.
@@ -136,14 +156,39 @@ def read_crazyflie(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         at += head.size + kinds[kind][2].size
     if at < end and not repairs:
         repairs.append(f"left out {end - at} bytes at the end that are no record")
+    every = [variable for key, (_, variables, _) in kinds.items() if rows[key] for variable in variables]
     streams = {}
     for key, (name, variables, _) in kinds.items():
         if rows[key]:
             table = np.array(rows[key], np.float64)
-            streams[name] = Stream(table[:, 0], dict(zip(variables, table.T[1:], strict=True)))
+            names = [x if every.count(x) == 1 else f"{name}.{x}" for x in variables]
+            values = dict(zip(names, table.T[1:], strict=True))
+            for x in [x for x in names if x.endswith(".quat")]:
+                attitude = decompressed(values[x].astype(np.uint32))
+                values |= {f"{x[:-4]}q{axis}": c for axis, c in zip("xyzw", attitude.T, strict=True)}
+            streams[name] = Stream(table[:, 0], values)
     if not streams:
         raise ConfigError(f"{path.name}: expected records, got none. Start the log before the flight.")
-    return at_equal_times(path.name, streams, repairs)
+    if wanted is not None:
+        streams = {key: x for key, x in streams.items() if set(wanted.names) & set(x.columns)} or streams
+    return at_equal_times(path.name, streams, repairs, wanted)
+
+
+def decompressed(packed: NDArray) -> NDArray:
+    """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
+
+    From the lowest bits up: magnitudes of nine bits, in units of 1 / (511 sqrt(2)), each below a bit that is set for
+    negative ones, of the components but the largest, from the last to the first; then the index of the largest.
+    """
+    largest, quat = packed >> 30, np.zeros((len(packed), 4))
+    for k in (3, 2, 1, 0):
+        other = largest != k
+        size = (packed & 511) / 511 * np.sqrt(0.5)
+        quat[:, k] = np.where(other, np.where(packed & 512, -size, size), 0.0)
+        packed = np.where(other, packed >> 10, packed)
+    rest = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
+    quat[np.arange(len(quat)), largest] = rest
+    return quat
 
 
 def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
@@ -172,14 +217,16 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     """Return the columns of a PX4 ULog in the names of crazysim's logs.
 
     World axes are north, west, up, and body axes forward, left, up: PX4's, turned half about the first axis. Rotor
-    speeds are those of ``esc_status``, in PX4's order.
+    speeds are those of ``esc_status`` and commands those of ``actuator_motors``, or else of ``actuator_outputs``, in
+    PX4's order. Commanded attitudes are those of ``vehicle_attitude_setpoint``, with its thrust as a share from 0 to 1.
+    Logs before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
 
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
-        ConfigError: If the log lacks a message.
+        ConfigError: If the log lacks position or attitude, or is damaged.
         ImportError: If pyulog is not installed.
     """
     try:
@@ -188,28 +235,51 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         raise ImportError(
             "expected pyulog, which ULog files need, got none. Run pip install 'crazysim[logs]'."
         ) from error
-    log = ULog(str(path))
+    try:
+        with path.open("rb") as file:
+            log = ULog(file)
+    except Exception as error:  # of pyulog, whose versions raise several kinds
+        raise ConfigError(f"{path.name}: expected a ULog, got {error}. Copy the file again.") from error
     if log.dropouts:
         repairs.append(f"{len(log.dropouts)} dropouts of the logger")
     found = {d.name: d.data for d in log.data_list if d.multi_id == 0}
-    needed = ("vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity", "esc_status")
-    if missing := [key for key in needed if key not in found]:
+    if missing := [key for key in ("vehicle_local_position", "vehicle_attitude") if key not in found]:
         raise ConfigError(
-            f"{path.name}: expected messages {', '.join(missing)}, got {', '.join(sorted(found))}. "
-            "Add them to PX4's logged topics; esc_status needs ESCs with telemetry."
+            f"{path.name}: expected messages {' and '.join(missing)}, got {len(found)} others. "
+            "Add them to PX4's logged topics."
         )
-    place, turn, rates, escs = (found[key] for key in needed)
-    n_rotors = int(np.max(escs["esc_count"])) if "esc_count" in escs else 4
+    place, turn = found["vehicle_local_position"], found["vehicle_attitude"]
+    # PX4's quaternions are wxyz.
     columns = {
         "vehicle_local_position": {
             "x": place["x"], "y": -place["y"], "z": -place["z"],
             "vx": place["vx"], "vy": -place["vy"], "vz": -place["vz"],
         },
-        # PX4's quaternions are wxyz.
         "vehicle_attitude": {"qw": turn["q[0]"], "qx": turn["q[1]"], "qy": -turn["q[2]"], "qz": -turn["q[3]"]},
-        "vehicle_angular_velocity": {"wx": rates["xyz[0]"], "wy": -rates["xyz[1]"], "wz": -rates["xyz[2]"]},
-        "esc_status": {f"rpm{k + 1}": np.abs(escs[f"esc[{k}].esc_rpm"]) for k in range(n_rotors)},
     }  # fmt: skip
+    if "vehicle_angular_velocity" in found:
+        rates = [found["vehicle_angular_velocity"][f"xyz[{k}]"] for k in range(3)]
+        columns["vehicle_angular_velocity"] = {"wx": rates[0], "wy": -rates[1], "wz": -rates[2]}
+    elif "rollspeed" in turn:
+        columns["vehicle_attitude"] |= {"wx": turn["rollspeed"], "wy": -turn["pitchspeed"], "wz": -turn["yawspeed"]}
+    n_rotors = int(np.max(found["esc_status"]["esc_count"])) if "esc_status" in found else 0
+    if n_rotors:
+        speeds = [np.abs(found["esc_status"][f"esc[{k}].esc_rpm"]) for k in range(n_rotors)]
+        columns["esc_status"] = {f"rpm{k + 1}": x for k, x in enumerate(speeds)}
+    if "actuator_motors" in found:
+        outputs = [found["actuator_motors"][f"control[{k}]"] for k in range(12)]
+        used = [x for x in outputs if np.any(np.isfinite(x))]
+        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(used)}
+    elif "actuator_outputs" in found and n_rotors:
+        outputs = [found["actuator_outputs"][f"output[{k}]"] for k in range(n_rotors)]
+        columns["actuator_outputs"] = {f"command{k + 1}": x for k, x in enumerate(outputs)}
+    wanted = found.get("vehicle_attitude_setpoint", {})
+    if "q_d[0]" in wanted and "thrust_body[2]" in wanted:
+        aim = np.stack([wanted[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
+        angles = np.unwrap(np.asarray(rotation.to_rpy(jnp.asarray(aim)), np.float64), axis=0)
+        names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
+        values = [*angles.T, -wanted["thrust_body[2]"]]
+        columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
     if "battery_status" in found:
         columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}
     streams = {key: Stream(found[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}

@@ -6,6 +6,7 @@ from bisect import bisect_left
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from crazysim.errors import ConfigError
 
@@ -20,6 +21,13 @@ PERIODS = (1e-4, 0.2)
 """Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; at less than 5 Hz nothing
 is left of the rotation."""
 UNITS_OF_TIME = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SHORTEST = 20
+"""Least number of samples of a log."""
+GROUND = 1.0
+"""Shortest stay on the ground within a log that is found, and the time beside each stay that is left out, too, s."""
+CARRIED, IDLE = 0.75, 0.4
+"""Shares of the typical thrust: one below the first for longer than ``GROUND`` that falls below the second is that of a
+drone on the ground, where flight controllers raise the thrust slowly before they take off."""
 NEIGHBOURS = 10
 """Samples on both sides of an interval that show if time was lost or only jitters."""
 
@@ -58,9 +66,9 @@ def increasing(name: str, t: NDArray, repairs: list[str]) -> NDArray:
         at, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
         keep[[at[k] for k, step in ((0, 0), (-1, -2)) if t[at[step + 1]] - t[at[step]] > 100 * dt]] = False
     lost = int(np.sum(~keep))
-    if len(t) < 20 or lost > REPAIRABLE * len(t):
+    if len(t) < SHORTEST or lost > REPAIRABLE * len(t):
         raise ConfigError(
-            f"{name}: expected at least 20 samples whose time increases, got {len(t)} of which {lost} do not. "
+            f"{name}: expected at least {SHORTEST} samples whose time increases, got {len(t)} of which {lost} do not. "
             "Cut the log into flights."
         )
     if lost:
@@ -157,6 +165,46 @@ def bridged(name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str])
             f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {BRIDGED:g} s"
         )
     return t[keep], {key: x[keep] for key, x in whole.items()}
+
+
+def airborne(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDArray:
+    """Return True for the samples in the air, by the size of the thrust. (n,)
+
+    Args:
+        name: Name of the log, for messages.
+        t: Time, s. (n,)
+        thrust: Sum of the squares of the rotor speeds, or the commanded thrust, in any unit. (n,)
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If the rotors are at rest.
+    """
+    smooth = median_filter(
+        np.maximum(thrust, 0.0), size=2 * max(1, round(0.1 / float(np.median(np.diff(t))))) + 1, mode="nearest"
+    )
+    order = np.argsort(smooth)
+    weight = np.cumsum(smooth[order] ** 2)  # Little for idling rotors, however long.
+    typical = smooth[order[np.searchsorted(weight, weight[-1] / 2)]]
+    if not typical > 0:
+        raise ConfigError(
+            f"{name}: expected a flight, got rotors at rest. Check rotor_vel or attitude_command, or take another log."
+        )
+    low = np.r_[False, smooth < CARRIED * typical, False]
+    starts, ends = np.flatnonzero(np.diff(low.astype(int)) == 1), np.flatnonzero(np.diff(low.astype(int)) == -1)
+    keep = np.ones(len(t), bool)
+    for start, end in zip(starts, ends, strict=True):
+        inside = start > 0 and end < len(t)
+        if np.min(smooth[start:end]) < IDLE * typical and not (inside and t[end - 1] - t[start] < GROUND):
+            keep &= (t < t[start] - GROUND) | (t > t[end - 1] + GROUND)
+    if np.all(keep):
+        return keep
+    if np.sum(keep) < SHORTEST:
+        raise ConfigError(
+            f"{name}: expected at least {SHORTEST} samples in the air, got {np.sum(keep)} of {t[-1] - t[0]:.3g} s. "
+            "Take a longer flight, and check rotor_vel or attitude_command."
+        )
+    repairs.append(f"left out {np.sum(~keep)} samples on the ground, or within {GROUND:g} s of it, by the thrust")
+    return keep
 
 
 def without_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:

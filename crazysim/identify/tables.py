@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim import rotation
 from crazysim.errors import ConfigError
 from crazysim.identify.bags import is_bag, read_bag
 from crazysim.identify.blackbox import header_of, read_blackbox
-from crazysim.identify.columns import KNOWN, OPTIONAL, Columns, plain, stacked
+from crazysim.identify.columns import KNOWN, Columns, plain, stacked
 from crazysim.identify.delimited import read_delimited
 from crazysim.identify.readers import read_crazyflie, read_ulog
 from crazysim.identify.repairs import check_period
@@ -21,7 +23,7 @@ from crazysim.identify.repairs import check_period
 def read_table(
     source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
 ) -> tuple[str, Mapping[str, NDArray]]:
-    """Return the name of a log and its columns, with the time in s.
+    """Return the name of a log and its columns, with the time in s, and a quaternion where it has angles.
 
     Args:
         source: File, or columns by name.
@@ -31,13 +33,22 @@ def read_table(
     Raises:
         ConfigError: If the file cannot be read, or the interval of its samples is none of a flight.
     """
+    name, table = _read(source, repairs, columns)
+    if columns is None or not columns.rpy or any(plain(x) not in table for x in columns.rpy):
+        return name, table
+    quat = np.asarray(rotation.from_rpy(jnp.asarray(stacked(name, table, columns.rpy, columns.rad_per_angle))))
+    return name, {**table, **dict(zip(columns.quat, quat.T.astype(np.float64), strict=True))}
+
+
+def _read(
+    source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
+) -> tuple[str, Mapping[str, NDArray]]:
+    """Return the name of a log and its columns, with the time in s and the attitude as the source has it."""
     if isinstance(source, Mapping):
         return "log", _in_seconds("log", source, columns)
     path = Path(source)
     if is_bag(path) and path.exists():
-        every = [] if columns is None else [x for key in ("pos", "quat", *OPTIONAL) for x in getattr(columns, key)]
-        topics = [plain(x) for x in every if plain(x).startswith("/")]
-        return path.stem, read_bag(path, repairs, topics, () if columns is None else columns.quat)
+        return path.stem, read_bag(path, repairs, columns)
     if not path.is_file():
         raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
     if path.suffix == ".ulg":
@@ -45,7 +56,7 @@ def read_table(
     if path.suffix == ".npz":
         return path.stem, _in_seconds(path.stem, _arrays(path), columns)
     if path.suffix != ".csv":
-        return path.stem, read_crazyflie(path, repairs)
+        return path.stem, read_crazyflie(path, repairs, columns)
     if header_of(path) is not None:
         return path.stem, read_blackbox(path, repairs)
     return path.stem, _in_seconds(path.stem, read_delimited(path, repairs), columns)

@@ -20,7 +20,9 @@ from crazysim.identify import (
     prediction_errors,
     read_log,
 )
+from crazysim.identify.readers import Stream, at_equal_times
 from crazysim.plugins.effects import Residual
+from crazysim.rotation import to_rpy
 from crazysim.sim import Sim
 
 FACTORS = {"inertia x": 1.3, "inertia y": 1.2, "thrust factor": 1.05}
@@ -101,10 +103,13 @@ def test_command_writes_an_airframe(flights, tmp_path, capsys):
     options = ["--network", "4", "--iterations", "3", "--plot", str(tmp_path / "errors.png")]
     np.savetxt(path, np.stack(list(table.values()), -1), delimiter=",", header=",".join(table), comments="")
     status = main(
-        ["identify", str(path), "--test", str(path), "--columns", "time=seconds", "--out", str(out), *options]
+        ["identify", f"{path}@:2", "--test", f"{path}@0:", "--columns", "time=seconds", "--out", str(out), *options]
     )
     assert status == 0, capsys.readouterr().err
-    assert "held-out logs" in capsys.readouterr().out
+    assert main(["identify", f"{path}@5:6", "--columns", "time=seconds", "--out", str(tmp_path / "other.toml")]) == 2
+    printed = capsys.readouterr()
+    assert "between 5 and 6 s, got 0" in printed.err
+    assert "held-out logs" in printed.out
     assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
     sim = Sim(drone=out, control="rotor_vel")
     sim.add(Residual())
@@ -248,11 +253,76 @@ def test_wrong_columns_are_refused(flights):
         identify([read_log(radians)])
 
 
+def test_angles_are_read_in_place_of_quaternions(flights):
+    log, angles = read_log(flights[0]), [f"angle{k}" for k in range(3)]
+    rpy = np.degrees(np.asarray(to_rpy(jnp.asarray(log.quat)), np.float64)) * [1, -1, 1]
+    table = {k: x for k, x in flights[0].items() if k[0] != "q"} | dict(zip(angles, rpy.T, strict=True))
+    columns = Columns(rpy=("angle0", "-angle1", "angle2"), rad_per_angle=np.pi / 180)
+    # float32 of the conversions.
+    np.testing.assert_allclose(np.abs(np.sum(read_log(table, columns).quat * log.quat, axis=-1)), 1, atol=1e-5)
+    with pytest.raises(ConfigError, match="expected columns angle3"):
+        read_log(table, replace(columns, rpy=("angle0", "angle1", "angle3")))
+
+
+def test_angles_that_wrap_are_interpolated_across_the_wrap(flights):
+    yaw = np.degrees(np.linspace(0, 20, 500))
+    streams = {
+        "fast": Stream(0.004 * np.arange(500), {"x": yaw}),
+        "slow": Stream(0.02 * np.arange(100), {"yaw": (yaw[::5] + 180) % 360 - 180}),
+    }
+    table = at_equal_times("log", streams, [], Columns(rpy=("r", "p", "-yaw"), rad_per_angle=np.pi / 180))
+    np.testing.assert_allclose(table["yaw"], yaw[: len(table["t"])], atol=1e-9)
+
+
+def in_a_row(flights):
+    """Return three flights as one of 6 s."""
+    parts = range(3)
+    return {k: np.concatenate([flights[i][k] + (2.0 * i if k == "t" else 0) for i in parts]) for k in flights[0]}
+
+
+def test_time_on_the_ground_is_left_out(flights):
+    """Three seconds before a flight of 6 s and two after it, with rotors at 0.3 of their speeds, and a spike."""
+    flight, table = in_a_row(flights), {}
+    for key, x in flight.items():
+        rest = {"t": 0.004 * np.arange(1, 751), "qw": np.ones(750)}.get(key, np.zeros(750))
+        before, after = (x[0] - rest[::-1], x[-1] + rest) if key == "t" else (rest, rest)
+        if key in "xyz" or key.startswith("rpm"):
+            before, after = ((0.3 if key not in "xyz" else 1) * x[k] + rest for k in (0, -1))
+        table[key] = np.r_[before, x, after[:500]]
+    table["rpm1"][100] = 1e6
+    log = read_log(table)
+    assert (log.t[0], log.t[-1]) == pytest.approx((1.0, 5.0), abs=0.15)  # a second beside the ground, too
+    assert "on the ground" in log.repairs[0]
+    rotors = {k: (0 * x if k.startswith("rpm") else x) for k, x in table.items()}
+    with pytest.raises(ConfigError, match="rotors at rest"):
+        read_log(rotors)
+    assert len(read_log(flights[0]).t) == 500
+
+
+def test_a_part_of_a_log_is_read(flights):
+    log = read_log(flights[0], between=(0.4, 1.2))
+    np.testing.assert_allclose(log.t, flights[0]["t"][100:301])
+    with pytest.raises(ConfigError, match=r"between 5 and 6 s, got 0 of a log of 2 s"):
+        read_log(flights[0], between=(5.0, 6.0))
+
+
+def test_drift_at_rest_is_no_wrong_unit(flights):
+    """A drone on the ground, whose estimator drifts by centimetres and has another velocity."""
+    log = {k: x for k, x in flights[0].items() if k[0] not in "rw"} | dict.fromkeys(("qx", "qy", "qz"), np.zeros(500))
+    log |= {
+        "qw": np.ones(500),
+        "z": np.zeros(500),
+        "x": 0.1 * np.sin(log["t"]),
+        "vx": 1e3 * log["vx"],
+        "y": np.zeros(500),
+    }
+    with pytest.raises(ConfigError, match=r"spans 0\.1 m: take a log of a flight"):
+        read_log(log)
+
+
 def test_a_gyroscope_that_fails_is_left_out(flights):
     """A rate that grows to 200 rad/s in the last 0.4 s, of pieces of 2 s of three flights in a row."""
-    log = {
-        k: np.concatenate([x[k] + (2.0 * i if k == "t" else 0) for i, x in enumerate(flights[:3])]) for k in flights[0]
-    }
+    log = in_a_row(flights)
     log["wx"][1000:] += np.linspace(50, 200, 500)
     read = read_log(log)
     assert "without an angular velocity that turns the attitude" in read.repairs[0]

@@ -8,6 +8,7 @@ import pytest
 
 from crazysim.errors import ConfigError
 from crazysim.identify import Columns, read_log
+from crazysim.identify.readers import decompressed
 
 N = 400
 T = 5.0 + 0.01 * np.arange(N)
@@ -19,8 +20,9 @@ SIDE = 9.81 * ANGLE
 
 
 def crazyflie(path, version=2, pause=(), damaged=False):
-    """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, all others at 50 Hz."""
+    """Write a log of a micro-SD card: body rates in degrees/s at 100 Hz, all others at 50 Hz, and two rare events."""
     kinds = {
+        1: ("start", ["x", "y"]),
         3: ("fast", ["gyro.x", "gyro.y", "gyro.z"]),
         7: (
             "slow",
@@ -39,6 +41,9 @@ def crazyflie(path, version=2, pause=(), damaged=False):
         head += b"".join(f"{v}(f)".encode() + b"\0" for v in variables)
     body = []
     for k, t in enumerate(T):
+        if k in (200, 210):
+            body.append(struct.pack("<HI" if version == 1 else "<HQ", 1, round(t * (1e3 if version == 1 else 1e6))))
+            body.append(struct.pack("<2f", 0, 0))
         time = struct.pack("<I", round(1e3 * t)) if version == 1 else struct.pack("<Q", round(1e6 * t))
         body.append(struct.pack("<H", 3) + time + struct.pack("<3f", np.degrees(RATE[k]), 0, 0))
         if k % 2 == 0 and k not in pause:
@@ -86,6 +91,20 @@ def test_pauses_of_a_stream_are_gaps(tmp_path):
     assert "gaps" in log.repairs[0]
 
 
+def test_compressed_attitudes_are_unpacked():
+    """The components below, packed by the definition of quatcompress.h: three of ten bits after the largest's index."""
+    bits = {1: [(2, 0), (0, 255), (1, 511), (0, 511)], 2: [(3, 0), (0, 0), (1, 100), (0, 1)]}
+    packed = [
+        (b[0][0] << 30) | sum(((s << 9) | m) << (20 - 10 * k) for k, (s, m) in enumerate(b[1:])) for b in bits.values()
+    ]
+    unit = np.sqrt(0.5) / 511
+    expected = np.array([[255, -511, 0, 511], [0, -100, 1, 0]]) * unit
+    expected[0, 2], expected[1, 3] = 0.0, np.sqrt(1 - (100**2 + 1) * unit**2)
+    found = decompressed(np.array(packed, np.uint32))
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
+    np.testing.assert_allclose(found[0, [0, 1, 3]], expected[0, [0, 1, 3]], atol=1e-12)
+
+
 def test_other_files_are_refused(tmp_path):
     (tmp_path / "log").write_bytes(b"text, not a log")
     with pytest.raises(ConfigError, match="begins with 0xBC"):
@@ -96,13 +115,20 @@ def test_other_files_are_refused(tmp_path):
         read_log(crazyflie(tmp_path / "log04"))
 
 
-def ulog(path, leave_out=()):
-    """Write a ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html) of four messages."""
+def ulog(path, leave_out=(), slow=(), old=False):
+    """Write a ULog (https://docs.px4.io/main/en/dev_log/ulog_file_format.html); slow messages come every 0.25 s.
+
+    Old ones have the body rates in the message of the attitude.
+    """
     formats = {
         "esc_report": "uint64_t timestamp;int32_t esc_rpm;",
         "esc_status": "uint64_t timestamp;esc_report[4] esc;uint8_t esc_count;",
         "vehicle_local_position": "uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz;",
-        "vehicle_attitude": "uint64_t timestamp;float[4] q;",
+        "vehicle_attitude": "uint64_t timestamp;"
+        + ("float rollspeed;float pitchspeed;float yawspeed;" if old else "")
+        + "float[4] q;",
+        "vehicle_attitude_setpoint": "uint64_t timestamp;float[4] q_d;float[3] thrust_body;",
+        "actuator_motors": "uint64_t timestamp;float[12] control;",
         "vehicle_angular_velocity": "uint64_t timestamp;float[3] xyz;",
     }
 
@@ -116,32 +142,51 @@ def ulog(path, leave_out=()):
     for k, t in enumerate(T):
         stamp = struct.pack("<Q", round(1e6 * t))
         quat = np.array([np.cos(ANGLE[k] / 2), np.sin(ANGLE[k] / 2), 0, 0]) * (-1 if k > N // 2 else 1)
+        rates = struct.pack("<3f", RATE[k], 0.05, 0.025)
         content = {
             "esc_status": stamp + b"".join(stamp + struct.pack("<i", 1000 * (i + 1)) for i in range(4)) + b"\x04",
             "vehicle_local_position": stamp
             + struct.pack("<6f", 1 + 0.1 * t, -SIDE[k], -3 - 0.3 * t, 0.1, -9.81 * RATE[k], -0.3),
-            "vehicle_attitude": stamp + struct.pack("<4f", *quat),
-            "vehicle_angular_velocity": stamp + struct.pack("<3f", RATE[k], 0.05, 0.025),
+            "vehicle_attitude": stamp + (rates if old else b"") + struct.pack("<4f", *quat),
+            "vehicle_attitude_setpoint": stamp + struct.pack("<7f", *quat, 0, 0, -0.5),
+            "actuator_motors": stamp + struct.pack("<12f", 0.4, 0.5, 0.6, 0.7, *[np.nan] * 8),
+            "vehicle_angular_velocity": stamp + rates,
         }
-        data += b"".join(message("D", struct.pack("<H", i) + content[name]) for i, name in enumerate(names))
+        data += b"".join(
+            message("D", struct.pack("<H", i) + content[name])
+            for i, name in enumerate(names)
+            if name not in slow or k % 25 == 0
+        )
     path.write_bytes(data)
     return path
 
 
-def test_ulogs_are_read_with_axes_up_and_left(tmp_path):
+@pytest.mark.parametrize("old", [False, True])
+def test_ulogs_are_read_with_axes_up_and_left(tmp_path, old):
     pytest.importorskip("pyulog")
-    log = read_log(ulog(tmp_path / "flight.ulg"))
+    log = read_log(ulog(tmp_path / "flight.ulg", ["vehicle_angular_velocity"] if old else (), old=old))
     np.testing.assert_allclose(log.pos[5], [1 + 0.1 * T[5], SIDE[5], 3 + 0.3 * T[5]], rtol=1e-6)
     np.testing.assert_allclose(log.vel[5], [0.1, 9.81 * RATE[5], 0.3], rtol=1e-6)
     np.testing.assert_allclose(log.ang_vel[:, 1:], [[-0.05, -0.025]] * len(log.t), rtol=1e-6)
     np.testing.assert_allclose(log.quat[:, 0], np.sin(ANGLE / 2)[: len(log.t)], atol=1e-6)
     np.testing.assert_allclose(log.rotor_vel[5], [1000, 2000, 3000, 4000])
+    np.testing.assert_allclose(log.command[5], [0.4, 0.5, 0.6, 0.7], rtol=1e-6)
+    np.testing.assert_allclose(log.attitude_command[5], [ANGLE[5], 0, 0, 0.5], atol=1e-6)
 
 
-def test_ulogs_without_rotor_speeds_are_refused(tmp_path):
+def test_ulogs_lack_what_is_not_logged_or_slow(tmp_path):
     pytest.importorskip("pyulog")
-    with pytest.raises(ConfigError, match="esc_status"):
-        read_log(ulog(tmp_path / "flight.ulg", leave_out=["esc_status"]))
+    log = read_log(ulog(tmp_path / "a.ulg", ["vehicle_angular_velocity"], slow=["esc_status"]))
+    assert log.rotor_vel.shape[1] == 0
+    assert "esc_status every 0.2 s or more often, got every 0.25 s" in log.repairs[0]
+    assert any("differentiated the attitude" in x for x in log.repairs)
+    with pytest.raises(ConfigError, match=r"vehicle_attitude every 0\.2 s"):
+        read_log(ulog(tmp_path / "b.ulg", slow=["vehicle_attitude"]))
+    with pytest.raises(ConfigError, match="expected messages vehicle_attitude, got 5 others"):
+        read_log(ulog(tmp_path / "c.ulg", ["vehicle_attitude"]))
+    (tmp_path / "d.ulg").write_bytes(b"no ULog")
+    with pytest.raises(ConfigError, match="expected a ULog"):
+        read_log(tmp_path / "d.ulg")
 
 
 FAST = np.arange(5.0, 5.0 + 0.01 * N, 0.001)
