@@ -4,16 +4,19 @@ import json
 import socket
 import struct
 import threading
+import time
 
 import numpy as np
 import pytest
+from cases import with_states
 from pymavlink.dialects.v20 import common
+from waiting import wait_for
 
 from crazysim import IMU, ConfigError, Sim
 from crazysim.live.sitl import ArduPilot, Betaflight, Measured, Origin, Px4, SoftwareInTheLoop
-from crazysim.live.sitl.loop import motor_order
+from crazysim.live.sitl.loop import FIELD, motor_order
 from crazysim.live.sitl.measured import quat_ned
-from crazysim.plugins.sensors import Barometer
+from crazysim.plugins.sensors import GPS, Barometer, Magnetometer, Triad
 
 TO_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Axes east, north, up to north, east, down, and back."""
@@ -118,8 +121,8 @@ def test_betaflight_receives_the_state_and_flies():
             received.append(packet)
             gyro, quat, vel, place = packet[1:4], packet[7:11], packet[11:14], packet[14:17]
             w, x, y, z = quat * [1, 1, -1, -1]
-            # Longitude and latitude are mirrored at the origin.
-            east, north = (place[:2] - [20.0, 10.0]) * -111194.93 * np.array([np.cos(np.radians(10.0)), 1])
+            degrees = 2 * received[0][14:16] - place[:2]  # the bridge mirrors places at the first one
+            east, north = (degrees - [20.0, 10.0]) * 111194.93 * np.array([np.cos(np.radians(10.0)), 1])
             pos = np.array([east, north, place[2] - 100.0])
             motors = flown(Betaflight, pos, vel, matrix([x, y, z, w]), TO_FRD @ gyro)
             state.sendto(np.asarray(motors, "<f4").tobytes(), ("127.0.0.1", ports[0]))
@@ -172,37 +175,35 @@ def test_ardupilot_steps_with_the_simulation_and_flies():
     np.testing.assert_allclose([line["timestamp"] for line in lines], np.arange(1, n_steps) / 250, atol=1e-9)
 
 
-def test_px4_is_in_lockstep_and_flies():
-    n_steps, sensors, places = 2500, [], []
+def test_px4_starts_slowly_and_flies_on_mounted_sensors_with_rates_of_their_own():
+    """It ignores fields whose bits are not set, and answers to measurements of the gyroscope alone, once it runs."""
+    n_steps, n_boot, sensors, places, truths = 2000, 20, [], [], []
     link = Px4(port=0, origin=Origin(10.0, 20.0, 100.0))
 
     def serve():
         client = socket.create_connection(link.address)
         client.settimeout(5.0)
         mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
-        truth = None
-        while len(sensors) < n_steps:
+        while len(truths) < n_steps:
             for message in mav.parse_buffer(client.recv(4096)) or []:
-                if message.get_type() == "HIL_STATE_QUATERNION":
-                    truth = message
-                if message.get_type() == "HIL_GPS":
-                    places.append(message)
-                if message.get_type() == "HIL_SENSOR":
-                    sensors.append(message)
-                    # A real one estimates its state; the stand-in takes the simulation's.
-                    m = loop.measure()[0]
-                    gyro = np.array([message.xgyro, -message.ygyro, -message.zgyro])
-                    motors = flown(Px4, m.pos, m.vel, matrix(m.quat), gyro)
-                    mode = common.MAV_MODE_FLAG_SAFETY_ARMED
-                    answer = common.MAVLink_hil_actuator_controls_message(
-                        message.time_usec, [*motors, *[0] * 12], mode, 1
-                    )
-                    client.sendall(answer.pack(mav))
-        assert truth is not None
+                kind = message.get_type()
+                {"HIL_SENSOR": sensors, "HIL_GPS": places, "HIL_STATE_QUATERNION": truths}[kind].append(message)
+                if kind != "HIL_SENSOR" or message.fields_updated & 0x38 != 0x38 or len(sensors) < n_boot:
+                    continue
+                # A real one estimates its state; the stand-in takes the simulation's.
+                m = loop.measure()[0]
+                gyro = np.array([message.xgyro, -message.ygyro, -message.zgyro])
+                motors = flown(Px4, m.pos, m.vel, matrix(m.quat), gyro)
+                mode = common.MAV_MODE_FLAG_SAFETY_ARMED
+                answer = common.MAVLink_hil_actuator_controls_message(message.time_usec, [*motors, *[0] * 12], mode, 1)
+                client.sendall(answer.pack(mav))
         client.close()
 
     sim = disturbed(freq=250)
-    sim.add(Barometer(altitude=100.0))
+    sim.add(IMU(gyro=Triad(bias=[0.03, 0.0, 0.03]), rpy=(np.pi, 0.0, 0.3), freq=125))
+    sim.add(Barometer(altitude=100.0, freq=50))
+    sim.add(Magnetometer(FIELD, rpy=(0.0, 0.0, np.pi / 2), freq=25))
+    sim.add(GPS(freq=10))
     loop = SoftwareInTheLoop(sim, link)
     with loop:
         thread = Thread(serve)
@@ -211,23 +212,66 @@ def test_px4_is_in_lockstep_and_flies():
     require_home(sim)
     assert link.armed
     assert [message.time_usec for message in sensors[:3]] == [0, 4000, 8000]
-    last = sensors[-1]
+    last, truth = sensors[-1], truths[-1]
     np.testing.assert_allclose([last.xacc, last.yacc, last.zacc], [0, 0, -9.81], atol=0.3)
     # About the field of central Europe, in the body's axes of a drone that heads east: right is south.
     np.testing.assert_allclose([last.xmag, last.ymag, last.zmag], [0, -0.2, 0.45], atol=0.02)
     assert last.abs_pressure == pytest.approx(1013.25 * (1 - 0.0065 / 288.15 * 101.0) ** 5.2559, rel=1e-4)
-    assert len(places) == n_steps / 250 * 5
+    # The gyroscope has a bias, which the autopilot holds against; the truth does not turn.
+    assert np.linalg.norm([last.xgyro, last.ygyro, last.zgyro]) > 0.03
+    np.testing.assert_allclose([truth.rollspeed, truth.pitchspeed, truth.yawspeed], 0, atol=0.01)
+    # Accelerometer and gyroscope, magnetometer, barometer as PX4 tests for them: all at first, then at their rates.
+    masks = np.array([message.fields_updated for message in sensors])
+    for mask, freq in ((0x003F, 125), (0x01C0, 25), (0x1A00, 50)):
+        has = masks & mask == mask
+        assert has.sum() == 1 + n_steps * freq // 250
+        assert not np.any(masks[~has] & mask)
+    assert not np.any(masks & ~0x1BFF)  # nothing else: bit 10 would be an airspeed
+    assert len(places) == 1 + n_steps * 10 // 250
     assert (places[-1].lat, places[-1].lon) == (pytest.approx(10e7, abs=20), pytest.approx(20e7, abs=20))
 
 
-def test_px4_turns_no_motor_while_it_is_disarmed():
+def test_px4_turns_no_motor_while_it_is_disarmed_and_is_given_time_to_start():
     link = Px4(port=0)
+    loop = SoftwareInTheLoop(Sim(control="rotor_vel"), link, timeout=0.2)
     with link, socket.create_connection(link.address) as client:
         mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        loop.exchange()  # without an answer
         client.sendall(common.MAVLink_hil_actuator_controls_message(0, [0.5] * 16, 0, 0).pack(mav))
-        np.testing.assert_array_equal(link.receive(5.0), np.zeros(4))
+        wait_for(lambda: np.array_equal(link.receive(0.2), np.zeros(4)) and link._answers)
         assert not link.armed
-        assert link.receive(0.0) is None
+        loop.sim.step(1)
+        with pytest.raises(ConfigError, match=r"expected motor commands of Px4 within 0\.2 s, got none"):
+            loop.exchange()
+    with Px4(port=0) as silent, socket.create_connection(silent.address):
+        loop = SoftwareInTheLoop(Sim(control="rotor_vel"), silent, timeout=0.2)
+        with pytest.raises(ConfigError, match=r"expected motor commands of Px4 within 0\.2 s, got none"):
+            loop.run(100.0)
+
+
+def test_betaflight_in_real_time_and_one_that_does_not_answer():
+    ports = tuple(free_port(socket.SOCK_DGRAM) for _ in range(3))
+    sent, sim = [], disturbed(freq=250)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer, Betaflight(ports=ports) as link:
+        loop = SoftwareInTheLoop(sim, link)
+        with pytest.raises(ConfigError, match=r"expected motor commands of Betaflight within 1\.\d* s, got none"):
+            loop.run(1.1)
+        peer.bind(("127.0.0.1", ports[1]))
+        peer.settimeout(2.0)
+
+        def serve():
+            while True:
+                peer.recv(200)
+                sent.append(np.float32([0.5, 0.6, 0.7, 0.8]) + np.float32(1e-4) * len(sent))
+                peer.sendto(sent[-1].astype("<f4").tobytes(), ("127.0.0.1", ports[0]))
+
+        thread, began = Thread(serve), time.monotonic()
+        loop.run(0.5)
+        assert time.monotonic() - began > 0.49  # the last step begins 4 ms before the end
+    thread.end()
+    command = np.asarray(sim.data.controls.rotor_vel[0, 0] / loop._fastest[0])[loop._orders[0]]
+    assert len(sent) > 1
+    assert min(np.abs(command - each).max() for each in sent) < 1e-6
 
 
 def test_attitudes_in_the_axes_of_aviation():
@@ -267,14 +311,30 @@ def test_wrong_settings_are_refused():
         px4.send(SoftwareInTheLoop(Sim(control="rotor_vel"), px4).measure()[0])
 
 
-def test_measurements_are_those_of_the_plugins():
-    sim = Sim(control="rotor_vel")
-    imu = sim.add(IMU(delay=0.01))
-    with SoftwareInTheLoop(sim, ArduPilot(port=free_port(socket.SOCK_DGRAM))) as loop:
-        assert isinstance(loop.measure()[0], Measured)
-        sim.rotor_vel_control(np.full((1, 1, 4), 18000.0))
-        sim.step(50)
-        measured = loop.measure()[0]
-        value = np.asarray(imu.read(sim.data).samples.value)[0, 0]
-        np.testing.assert_array_equal(np.concatenate([measured.gyro, measured.accel]), value.astype(float))
-        assert measured.height == pytest.approx(float(sim.data.states.pos[0, 0, 2]))
+def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():
+    sim = Sim(2, control="rotor_vel")
+    quat = np.array([[[0.0, 0.0, 0.0, 1.0]], [[0.1, -0.3, 0.6, 0.5]]])
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    sim.data = with_states(sim.data, pos=[0.0, 0.0, 50.0], quat=quat, ang_vel=[0.5, -1.0, 2.0])
+    sim.add(IMU(rpy=(0.4, -0.2, 1.0), pos=(0.0, 0.0, 0.02)))
+    aligned = sim.add(IMU(pos=(0.0, 0.0, 0.02), name="aligned"))
+    sim.add(Magnetometer(FIELD, rpy=(np.pi / 2, 0.0, np.pi), freq=None))
+    sim.add(GPS(pos=(0.1, 0.0, -0.2), freq=None))
+    with SoftwareInTheLoop(sim, [ArduPilot(port=free_port(socket.SOCK_DGRAM)) for _ in range(2)]) as loop:
+        for has_measured in (False, True):
+            if has_measured:
+                sim.rotor_vel_control(np.full((2, 1, 4), 18000.0))
+                sim.step(50)
+            states = sim.data.states
+            for k, measured in enumerate(loop.measure()):
+                assert isinstance(measured, Measured)
+                pos, rotation = np.asarray(states.pos[k, 0]), matrix(states.quat[k, 0])
+                assert measured.height == pytest.approx(pos[2])
+                # In float32, with positions of 50 m.
+                np.testing.assert_allclose(measured.gps_pos, pos + rotation @ [0.1, 0, -0.2], atol=1e-5)
+                np.testing.assert_allclose(measured.field, rotation.T @ FIELD, atol=1e-10)
+                np.testing.assert_allclose(measured.ang_vel, states.ang_vel[k, 0])
+                if has_measured:
+                    found = np.concatenate([measured.gyro, measured.accel])
+                    value = np.asarray(aligned.read(sim.data).samples.value)[k, 0]
+                    np.testing.assert_allclose(found, value, atol=1e-5)

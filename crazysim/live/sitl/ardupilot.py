@@ -24,6 +24,10 @@ class ArduPilot(FirmwareLink):
 
     The interface is that of ``libraries/SITL/examples/JSON`` of ArduPilot/ardupilot. ArduPilot has no HIL messages of
     MAVLink any more.
+
+    It receives what the ``IMU`` measures. The interface has no fields for the others: ArduPilot simulates satellite
+    navigation, barometer and compass itself, with the errors of its parameters ``SIM_*``, from the true position,
+    velocity and attitude.
     """
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))

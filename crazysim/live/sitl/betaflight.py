@@ -21,6 +21,10 @@ class Betaflight(FirmwareLink):
     Packets are those of ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
     its clock to the simulation's but does not wait for it, and answers each packet of the state with at most one of the
     motors.
+
+    It receives what ``IMU`` and ``GPS`` measure, and the pressure at the height that the ``Barometer`` measures, which
+    a firmware with ``gazebo`` replaces by that at the altitude of the ``GPS``. Its attitude is the true one, which it
+    takes in place of its own estimate unless it was built with ``USE_IMU_CALC``, and from which it simulates a compass.
     """
 
     positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))
@@ -50,6 +54,7 @@ class Betaflight(FirmwareLink):
             ConfigError: If the port of the motors is in use.
         """
         self.gazebo, self.origin, self._rc_rate = gazebo, origin, Rate(rc_freq)
+        self._start: tuple[float, float] | None = None
         self._link = Datagrams(host, ports[0])
         _, self._state, self._rc = ports
         self.channels: NDArray = np.array([1500, 1500, 1000, 1500, *[1000] * (N_CHANNELS - 4)], np.uint16)
@@ -61,7 +66,8 @@ class Betaflight(FirmwareLink):
         latitude, longitude, altitude = self.origin.place(measured.gps_pos)
         if self.gazebo:
             quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
-            latitude, longitude = 2 * self.origin.latitude - latitude, 2 * self.origin.longitude - longitude  # mirrored
+            self._start = self._start or (latitude, longitude)  # the bridge mirrors places at the first one
+            latitude, longitude = (2 * x - y for x, y in zip(self._start, (latitude, longitude), strict=True))
         else:
             quat = TURN * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
             gyro = gyro * [1, 1, -1]

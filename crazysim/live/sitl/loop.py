@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -16,20 +17,30 @@ from crazysim.drones import Airframe
 from crazysim.errors import ConfigError
 from crazysim.live.attitude import rotate
 from crazysim.live.pace import Pace, Speed
-from crazysim.live.sitl.link import FirmwareLink
+from crazysim.live.sitl.link import ROUNDING, FirmwareLink
 from crazysim.live.sitl.measured import Measured
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
+from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.sim import Sim
 
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field where there is no ``Magnetometer``, world frame, T: about that of central Europe."""
+LONG = 1.0
+"""Time of a run from which a firmware that sends no motor commands in it is an error, s."""
+GPS_FREQ = 5
+"""Rate of satellite navigation where there is no ``GPS``, Hz."""
+KINDS = (IMU, Barometer, Magnetometer, GPS)
+"""Sensors whose measurements firmware receives."""
+MOUNTED = (IMU, Magnetometer)
+"""Those that measure in a frame of their own, at an attitude in the body."""
 
 
 class SoftwareInTheLoop(Closing):
     """Processes of a firmware that fly the drones of a simulation, one each.
 
-    A firmware receives what the plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation measure.
-    Where there is none, an ``IMU`` without errors is added, and the others give the true values.
+    The plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation measure; an ``IMU`` without
+    errors is added where there is none, and in place of the others the true values are sent. Which of them a firmware
+    receives is stated by its link.
     """
 
     def __init__(
@@ -77,12 +88,13 @@ class SoftwareInTheLoop(Closing):
         self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]
         self._airframes, self._fastest = airframes, [airframe.rotor_vel_limits[1] for airframe in airframes]
         self._sensors: dict[type, Any] = {
-            kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None)
-            for kind in (IMU, Barometer, Magnetometer, GPS)
+            kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None) for kind in KINDS
         }
         if self._sensors[IMU] is None:
             self._sensors[IMU] = sim.add(IMU())
         self._rotor_vel = np.zeros((len(self.links), 4), np.float32)
+        self._taken: NDArray | None = None
+        self._heard = [0.0] * len(self.links)
         self._exchanges = 0
 
     def run(self, seconds: float, speed: Speed | None = None) -> None:
@@ -94,71 +106,100 @@ class SoftwareInTheLoop(Closing):
                 of its own, and as fast as possible in lockstep.
 
         Raises:
-            ConfigError: If a firmware in lockstep does not answer in time.
+            ConfigError: If a firmware does not answer in time.
         """
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
-        dt = self._n_steps / self.sim.freq
+        dt, began = self._n_steps / self.sim.freq, time.monotonic()
+        self._heard = [began] * len(self.links)
         pace = Pace(dt, speed)
         for k in range(round(seconds / dt)):
             if (due := pace.due_in()) > 0:
                 time.sleep(due)
             pace.begin(k * dt)
             self.exchange()
+            self._check_heard(time.monotonic() - self.timeout, self.timeout)
             self.sim.step(self._n_steps)
+        if seconds > LONG and (passed := time.monotonic() - began) > LONG:
+            self._check_heard(began, passed)
 
     def exchange(self) -> None:
         """Send measurements, and put the motor commands that come back in force."""
-        for link, measured in zip(self.links, self.measure(), strict=True):
-            link.send(measured)
+        measured, self._taken = self._measurements()
+        for link, each in zip(self.links, measured, strict=True):
+            link.send(each)
         for k, link in enumerate(self.links):
             command = link.receive(self.timeout if link.lockstep else 0.0)
-            if command is None and link.lockstep:
-                raise ConfigError(
-                    f"expected motor commands of {type(link).__name__} within {self.timeout:g} s, got none. Start the "
-                    f"firmware, or set timeout."
-                )
             if command is not None:
                 self._rotor_vel[k] = self._speeds(k, command)
+                self._heard[k] = time.monotonic()
+            elif link.lockstep:
+                raise _silent(link, self.timeout)
         self._exchanges += 1
         sim = self.sim
         sim.rotor_vel_control(self._rotor_vel.reshape(sim.n_worlds, sim.n_drones, 4))
 
     def measure(self) -> list[Measured]:
-        """Return the measurements of every drone."""
-        sim, states = self.sim, self.sim.data.states
-        pos, quat, vel = (np.asarray(x, float).reshape(-1, x.shape[-1]) for x in (states.pos, states.quat, states.vel))
-        height, field, gps = (self._latest(kind) for kind in (Barometer, Magnetometer, GPS))
-        imu: Any = self._latest(IMU)
+        """Return the measurements of every drone; new ones are those since the last exchange."""
+        return self._measurements()[0]
+
+    def _measurements(self) -> tuple[list[Measured], NDArray]:
+        """Return the measurements of every drone, and when the sensors took them. (n_links, n_kinds)"""
+        states, time_now = self.sim.data.states, self._exchanges * self._n_steps / self.sim.freq
+        pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
+        values, taken = zip(*map(self._latest, KINDS), strict=True)
+        imu, height, field, gps = values
+        if field is None:
+            field = rotate(quat * [-1, -1, -1, 1], FIELD)
+        gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
+        counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING)}
+        when = np.empty((len(self.links), len(KINDS)), np.int64)
+        for k, kind in enumerate(KINDS):
+            when[:, k] = counts.get(kind, self._exchanges) if taken[k] is None else taken[k]
+        is_new = np.ones_like(when, bool) if self._taken is None else when != self._taken
         found = []
         for k in range(len(self.links)):
             found.append(
                 Measured(
-                    time=self._exchanges * self._n_steps / sim.freq,
+                    time=time_now,
                     gyro=imu[k, :3],
                     accel=imu[k, 3:],
                     pos=pos[k],
                     quat=quat[k],
                     vel=vel[k],
-                    gps_pos=pos[k] if gps is None else gps[k, :3],
-                    gps_vel=vel[k] if gps is None else gps[k, 3:],
+                    ang_vel=ang_vel[k],
+                    gps_pos=gps[k, :3],
+                    gps_vel=gps[k, 3:],
                     height=float(pos[k, 2] if height is None else height[k, 1]),
-                    field=rotate(quat[k] * [-1, -1, -1, 1], FIELD) if field is None else field[k],
+                    field=field[k],
+                    new=frozenset(kind for kind, changed in zip(KINDS, is_new[k], strict=True) if changed),
                 )
             )
-        return found
+        return found, when
 
-    def _latest(self, kind: type) -> NDArray | None:
-        """Return the latest measurements of a sensor, true ones before the first; None without it. (n_links, k)"""
+    def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
+        """Return the latest measurements of a sensor, vectors in the body frame, and when they were taken, in steps.
+
+        Before the first one they are those of a perfect sensor. Without the sensor there are none.
+        """
         sensor = self._sensors[kind]
         if sensor is None:
-            return None
-        samples = sensor.read(self.sim.data).samples
-        value = np.asarray(samples.value, float)
-        if np.any(np.asarray(samples.taken) < 0):
+            return None, None
+        record = sensor.read(self.sim.data)
+        value, taken = np.asarray(record.samples.value, float), np.asarray(record.samples.taken).reshape(-1)
+        if taken.min() < 0:
             observed = self.sim.plugins.observations(self.sim.data)
-            value = np.concatenate([observed[f"{sensor.name}.{channel}"] for channel in sensor.channels], axis=-1)
-        return value.reshape(-1, value.shape[-1])
+            value = np.concatenate([observed[f"{sensor.name}.{name}"] for name in sensor.channels], axis=-1)
+        if kind in MOUNTED:
+            vectors = value.reshape(*value.shape[:-1], -1, 3)
+            value = rotate(np.asarray(record.quat, float)[..., None, :], vectors).reshape(value.shape)
+        return _rows(value), taken
+
+    def _check_heard(self, since: float, seconds: float) -> None:
+        """Check that motor commands of every firmware arrived after a time of ``time.monotonic``, ``seconds`` ago."""
+        for link, heard in zip(self.links, self._heard, strict=True):
+            if heard <= since:
+                raise _silent(link, seconds)
 
     def close(self) -> None:
         """Close all links."""
@@ -173,6 +214,19 @@ class SoftwareInTheLoop(Closing):
             return of_rotors * self._fastest[k]
         speeds = airframe.rotor_vel(of_rotors * float(airframe.value("rotors.thrust_max")))
         return np.where(of_rotors > 0, speeds, 0.0)
+
+
+def _rows(values: Any) -> NDArray:
+    """Return values of all drones as one row for each, of those of the first world first. (n_links, k)"""
+    values = np.asarray(values, float)
+    return values.reshape(-1, values.shape[-1])
+
+
+def _silent(link: FirmwareLink, seconds: float) -> ConfigError:
+    return ConfigError(
+        f"expected motor commands of {type(link).__name__} within {seconds:.3g} s, got none. Start the firmware, or "
+        f"set timeout."
+    )
 
 
 def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) -> NDArray:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE
+from crazysim.plugins.sensors.sensor import Sensor
 
 METRES_PER_DEGREE = 6371000.0 * np.pi / 180
 """Length of a degree of latitude on a sphere with the mean radius of the earth (IUGG), m."""
@@ -17,7 +18,7 @@ TURN = np.sqrt(0.5)
 
 
 class Measured(NamedTuple):
-    """Measurements of one drone.
+    """Measurements of one drone, and its true state.
 
     World axes are x east, y north and z up (ENU), body axes x forward, y left and z up (FLU).
     """
@@ -29,11 +30,13 @@ class Measured(NamedTuple):
     accel: NDArray
     """Specific force, body frame, m/s^2: (0, 0, 9.81) at rest. (3,)"""
     pos: NDArray
-    """Position, world frame, m. (3,)"""
+    """True position, world frame, m. (3,)"""
     quat: NDArray
-    """Attitude, body to world, unit, xyzw. (4,)"""
+    """True attitude, body to world, unit, xyzw. (4,)"""
     vel: NDArray
-    """Velocity, world frame, m/s. (3,)"""
+    """True velocity, world frame, m/s. (3,)"""
+    ang_vel: NDArray
+    """True angular velocity, body frame, rad/s. (3,)"""
     gps_pos: NDArray
     """Position by satellite navigation, world frame, m. (3,)"""
     gps_vel: NDArray
@@ -42,6 +45,9 @@ class Measured(NamedTuple):
     """Height by barometer, m."""
     field: NDArray
     """Magnetic field, body frame, T. (3,)"""
+    new: frozenset[type[Sensor]]
+    """Sensors that have a measurement which the one before did not have: ``IMU``, ``Barometer``, ``Magnetometer`` and
+    ``GPS``. All of them in the first."""
 
 
 class Origin(NamedTuple):

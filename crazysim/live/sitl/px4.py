@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.live.sitl.link import FirmwareLink, Rate
+from crazysim.live.sitl.link import FirmwareLink
 from crazysim.live.sitl.measured import ZURICH, Measured, Origin, frd, ned, quat_ned
+from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
+from crazysim.plugins.sensors.sensor import Sensor
 
 PORT = 4560
 """Port at which the first instance of PX4 looks for a simulation."""
-ALL_FIELDS = 0x1FFF
-"""Bits of ``HIL_SENSOR.fields_updated`` for all fields."""
-GPS_FREQ = 5
-"""Messages of satellite navigation per second, Hz."""
+FIELDS: dict[type[Sensor], int] = {IMU: 0x003F, Magnetometer: 0x01C0, Barometer: 0x1A00}
+"""Bits of ``HIL_SENSOR.fields_updated`` for the fields of each sensor, without which PX4 ignores them: ``ACCEL`` with
+``GYRO``, ``MAG`` and ``BARO`` of ``SensorSource`` in SimulatorMavlink.hpp of PX4/PX4-Autopilot."""
+START = 0.02
+"""Time by which the simulation lags behind the clock until PX4 has started, s."""
 TEMPERATURE = 25.0
 """Temperature that is reported, degrees Celsius."""
 GAUSS, HECTOPASCAL = 1e-4, 100.0
@@ -32,8 +35,13 @@ class Px4(FirmwareLink):
     """A process of PX4 that was started without a simulator of its own, as ``make px4_sitl none_iris``.
 
     PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
-    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. It treats a sensor whose measurements never
-    change as broken, so give the simulation an ``IMU`` with noise.
+    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts it needs the clock and does not
+    answer: until the first answer the simulation keeps real time with its motors off. It answers to measurements of the
+    gyroscope alone, so its motor commands stay in force where the ``IMU`` has no new one.
+
+    It receives what ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` measure, each when a measurement is new. It
+    treats a sensor whose measurements never change as broken: give all of them noise. The true state in
+    ``HIL_STATE_QUATERNION`` is for its log; the accelerations there are those of the ``IMU``.
     """
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
@@ -71,7 +79,10 @@ class Px4(FirmwareLink):
         self._server.listen(1)
         self._client: socket.socket | None = None
         self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
-        self._gps_rate = Rate(GPS_FREQ)
+        self._began: tuple[float, float] | None = None
+        self._time = 0.0
+        self._asked = self._answers = False
+        self._motors = np.zeros(4)
         self.armed = False
         """True while PX4 is armed."""
 
@@ -81,38 +92,55 @@ class Px4(FirmwareLink):
         return self._server.getsockname()
 
     def send(self, measured: Measured) -> None:
-        """Send ``HIL_SENSOR``, and at their own rate ``HIL_GPS`` and ``HIL_STATE_QUATERNION``."""
+        """Send ``HIL_SENSOR``, ``HIL_GPS`` where there is a new position, and ``HIL_STATE_QUATERNION``."""
         origin, mav, micros = self.origin, self._mavlink, round(measured.time * 1e6)
         field = frd(measured.field) / GAUSS
         altitude = origin.altitude + measured.height
         pressure = origin.pressure(measured.height) / HECTOPASCAL
+        updated = sum(FIELDS.get(kind, 0) for kind in measured.new)
         self._send(
             mav.MAVLink_hil_sensor_message(
                 micros, *frd(measured.accel), *frd(measured.gyro), *field, pressure, 0.0, altitude, TEMPERATURE,
-                ALL_FIELDS,
+                updated,
             )
         )  # fmt: skip
-        if not self._gps_rate.is_due(measured.time):
-            return
-        latitude, longitude, altitude = origin.place(measured.gps_pos)
-        place = round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
-        north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
-        speed = round(float(np.hypot(north, east)))
-        course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
-        self._send(mav.MAVLink_hil_gps_message(micros, 3, *place, 30, 40, speed, north, east, down, course, 10))
-        latitude, longitude, altitude = origin.place(measured.pos)
-        place = round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
+        self._time, self._asked = measured.time, IMU in measured.new
+        if GPS in measured.new:
+            north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
+            speed = round(float(np.hypot(north, east)))
+            course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
+            place = self._place(measured.gps_pos)
+            self._send(mav.MAVLink_hil_gps_message(micros, 3, *place, 30, 40, speed, north, east, down, course, 10))
         vel = [round(100 * v) for v in ned(measured.vel)]
         accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
-        self._send(
-            mav.MAVLink_hil_state_quaternion_message(
-                micros, quat_ned(measured.quat).tolist(), *frd(measured.gyro), *place, *vel, 0, 0, *accel
-            )
-        )
+        quat, rates = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
+        place = self._place(measured.pos)
+        self._send(mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *place, *vel, 0, 0, *accel))
 
     def receive(self, timeout: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived in time. (4,)"""
-        deadline, found = time.monotonic() + timeout, None
+        now = time.monotonic()
+        if self._began is None:
+            self._began = now, self._time
+        passed, simulated = now - self._began[0], self._time - self._began[1]
+        if self._answers:
+            must_answer, patience = self._asked, timeout * self._asked
+        else:
+            must_answer, patience = passed > timeout, min(max(simulated + START - passed, 0.0), timeout)
+        found = self._newest(now + patience)
+        if found is not None:
+            self._answers, self._motors = True, found
+        return None if found is None and must_answer else self._motors
+
+    def close(self) -> None:
+        """Close the connection."""
+        for each in (self._client, self._server):
+            if each is not None:
+                each.close()
+
+    def _newest(self, deadline: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
+        found = None
         while found is None or self._readable(0.0):
             if not self._readable(max(deadline - time.monotonic(), 0.0)):
                 break
@@ -122,11 +150,10 @@ class Px4(FirmwareLink):
                     found = np.clip(np.array(message.controls[:4]), 0, 1) * self.armed
         return found
 
-    def close(self) -> None:
-        """Close the connection."""
-        for each in (self._client, self._server):
-            if each is not None:
-                each.close()
+    def _place(self, pos: NDArray) -> tuple[int, int, int]:
+        """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a position in the world, m. (3,)"""
+        latitude, longitude, altitude = self.origin.place(pos)
+        return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
 
     def _connected(self) -> socket.socket:
         if self._client is None:
@@ -143,9 +170,11 @@ class Px4(FirmwareLink):
         return self._client
 
     def _send(self, message: Any) -> None:
+        client = self._connected()
+        client.settimeout(self.connect_timeout)
         try:
-            self._connected().sendall(message.pack(self._mav))
-        except (BrokenPipeError, ConnectionResetError):
+            client.sendall(message.pack(self._mav))
+        except (BrokenPipeError, ConnectionResetError, TimeoutError):
             raise ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.") from None
 
     def _readable(self, timeout: float) -> bool:
