@@ -65,15 +65,18 @@ class Columns:
         return [plain(x) for x in (*self.pos, *attitude, *(x for key in OPTIONAL for x in getattr(self, key)))]
 
 
+IDSIA = Columns(
+    pos=("x_mocap", "y_mocap", "z_mocap"),
+    rotor_vel=("m1_erpm", "m2_erpm", "m3_erpm", "m4_erpm"),
+    command=("m1_thrust", "m2_thrust", "m3_thrust", "m4_thrust"),
+    voltage=("Vbat",),
+    rpm_per_unit=1 / 6,
+)
+"""Columns of IDSIA's benchmark (arXiv 2512.14450), with motors of six pole pairs."""
 KNOWN = {
     "crazysim": Columns(),
-    "idsia": Columns(
-        pos=("x_mocap", "y_mocap", "z_mocap"),
-        rotor_vel=("m1_erpm", "m2_erpm", "m3_erpm", "m4_erpm"),
-        command=("m1_thrust", "m2_thrust", "m3_thrust", "m4_thrust"),
-        voltage=("Vbat",),
-        rpm_per_unit=1 / 6,
-    ),
+    "idsia": IDSIA,
+    "idsia_csv": replace(IDSIA, pos=("x_poses", "y_poses", "z_poses")),
     "nanobench": Columns(
         pos=("px", "py", "pz"),
         ang_vel=("imu_gyro_x", "imu_gyro_y", "imu_gyro_z"),
@@ -83,7 +86,7 @@ KNOWN = {
         share_per_command=1 / 65535,
     ),
 }
-"""Columns of known logs: the default names, IDSIA's benchmark (arXiv 2512.14450; motors of six pole pairs), and
+"""Columns of known logs: the default names, IDSIA's benchmark, also as its repository's ``.csv`` files name them, and
 NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
 OPTIONAL = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
 """Fields whose columns a log may lack."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.airframes import AirframeSource
 from crazysim.errors import ConfigError
+from crazysim.identify.tables import read_table
 from crazysim.plugins.estimators import Estimator, Kalman
 from crazysim.plugins.sensors import IMU, MotionCapture
 from crazysim.sim.sim import Sim
@@ -85,7 +86,7 @@ class Comparison:
 
 
 def read_flight(path: str | Path) -> Flight:
-    """Return the flight of a log of NanoBench, an ``.npz`` file with ``COLUMNS``.
+    """Return the flight of a log of NanoBench, a table with ``COLUMNS``.
 
     Raises:
         ConfigError: If a column is missing, or there is no setpoint.
@@ -108,13 +109,12 @@ def columns_of(path: Path, names: Sequence[str]) -> NDArray:
     Raises:
         ConfigError: If one is missing.
     """
-    with np.load(path, allow_pickle=False) as file:
-        if missing := [name for name in names if name not in file.files]:
-            raise ConfigError(
-                f"{path.name}: expected columns {', '.join(names)}, got no {', '.join(missing)}. "
-                "Give a log of NanoBench."
-            )
-        return np.stack([file[name] for name in names]).astype(np.float64)
+    _, table = read_table(path, [], None)
+    if missing := [name for name in names if name not in table]:
+        raise ConfigError(
+            f"{path.name}: expected columns {', '.join(names)}, got no {', '.join(missing)}. Give a log of NanoBench."
+        )
+    return np.stack([table[name] for name in names]).astype(np.float64)
 
 
 def commanded_samples(name: str, height: NDArray) -> NDArray:

@@ -67,9 +67,11 @@ def difference(name: str, whole_numbers: bool = False) -> NDArray:
 
 def of_controllers() -> Iterable[Row]:
     """Yield the largest differences of the motors from those of the compiled firmware."""
-    for name in CASES:
+    for name, (controller, mode, drone) in CASES.items():
+        flown = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
         for whole, bound in ((False, TRUNCATED + FLOAT32), (True, 1.0 + FLOAT32)):
-            what = f"{name}, {'integers as the firmware' if whole else 'real numbers'}: motors"
+            numbers = "integers as the firmware" if whole else "real numbers"
+            what = f"{type(controller).__name__} on {mode} commands, {flown}, {numbers}: motors"
             yield Row(what, "compiled C, 240 ticks", float(difference(name, whole).max()), "PWM", (0, bound))
 
 

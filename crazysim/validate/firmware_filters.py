@@ -124,7 +124,10 @@ def of_filters() -> Iterable[Row]:
                   float(difference[:, :9].max()), "m, m/s, rad", (0, 2e-5))  # fmt: skip
         yield Row(f"Kalman filter, {kind}: quaternion", "compiled C, 400 loops",
                   float(difference[:, 9:13].max()), "", (0, 2e-6))  # fmt: skip
+        relative = difference[:, 13:] / (1e-5 + np.abs(recorded[:, 13:]))
+        yield Row(f"Kalman filter, {kind}: covariance", "compiled C, 400 loops", float(relative.max()), "",
+                  (0, 1e-3))  # fmt: skip
     for kind in ("pressure", "ground"):
         found, recorded = complementary(kind)
-        yield Row(f"complementary filter, {kind}: quaternion and height", "compiled C, 2 s",
-                  float(np.abs(found - recorded)[:, :5].max()), "and m", (0, 5e-6))  # fmt: skip
+        yield Row(f"complementary filter, {kind}: quaternion, height in m", "compiled C, 2 s",
+                  float(np.abs(found - recorded)[:, :5].max()), "", (0, 5e-6))  # fmt: skip

@@ -1,4 +1,4 @@
-"""The firmware's filter on logged measurements, beside the filter that ran on board."""
+"""The firmware's filter on logged measurements, compared with the filter that ran on board."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float,
 
 def of_filter(folder: Path) -> Iterable[Row]:
     """Yield errors of the filter over those of the filter on board, flight by flight, without crashed flights."""
-    flights = {path.stem: read(path) for path in logs(folder, "*.npz")}
+    flights = {path.stem: read(path) for path in logs(folder, "*")}
     n = max(len(log["pos"]) for log in flights.values())
     for name, log in flights.items():
         if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > LOST:
@@ -95,4 +95,5 @@ def of_filter(folder: Path) -> Iterable[Row]:
         board = errors(log, log["est_pos"], log["est_quat"])
         for what, unit, one, other in zip(("position", "attitude"), ("m", "degrees"), ours, board, strict=True):
             yield Row(f"{name}: {what}", "filter on board", one / other, "", (0, 1.1),
-                      f"on board {other:.3g} {unit}, here {one:.3g} {unit}")  # fmt: skip
+                      f"on board {other:.3g} {unit}, here {one:.3g} {unit}", series=what,
+                      at=name.partition("_")[2])  # fmt: skip

@@ -44,11 +44,13 @@ def mujoco_differences() -> dict[str, float]:
 
 def of_mujoco() -> Iterable[Row]:
     """Yield the differences from C MuJoCo."""
-    units = {"pos": "m", "vel": "m/s", "quat": "", "ang_vel": "rad/s"}
-    for name, x in mujoco_differences().items():
-        bound = 1e-7 if name == "ang_vel" else 1e-8
+    names = {"pos": ("position", "m"), "vel": ("velocity", "m/s"), "quat": ("quaternion", "")}
+    names["ang_vel"] = "angular velocity", "rad/s"
+    for key, x in mujoco_differences().items():
+        name, unit = names[key]
         reference = f"`mj_step`, RK4, MuJoCo {mujoco.__version__}"
-        yield Row(f"free body under a wrench, 0.5 s: {name}", reference, x, units[name], (0, bound))
+        bound = 1e-7 if key == "ang_vel" else 1e-8
+        yield Row(f"free body under a wrench, 0.5 s: {name}", reference, x, unit, (0, bound))
 
 
 def of_crazyflow() -> Iterable[Row]:

@@ -95,6 +95,19 @@ def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, r
         np.testing.assert_allclose(errors[f"{name} at constant body rates"], errors[name], rtol=1e-4)
 
 
+def test_of_one_prediction_the_mean_is_the_root_mean_square(flights, result):
+    """The root mean square is of the chord 2 sin(a / 2) of an angle."""
+    log = read_log(flights[-1])
+    n = round(0.5 / log.dt) + 4  # one window and a sample beside each end
+    fields = ("t", "pos", "quat", "vel", "ang_vel", "rotor_vel")
+    log = replace(log, **{key: getattr(log, key)[:n] for key in fields})
+    errors = prediction_errors([log], result.model)
+    for name in (key for key in errors if not key.endswith("(mean)")):
+        mean = errors[f"{name} (mean)"]
+        chord = np.degrees(2 * np.sin(np.radians(mean) / 2)) if "attitude" in name else mean
+        np.testing.assert_allclose(chord, errors[name], rtol=1e-6, err_msg=name)
+
+
 def test_command_writes_an_airframe(flights, tmp_path, capsys):
     table = {k: x for k, x in flights[0].items() if k != "t"} | {"seconds": flights[0]["t"]}
     # Commands that these speeds follow with a lag of first order of 25 1/s.

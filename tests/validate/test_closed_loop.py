@@ -52,6 +52,17 @@ def test_a_flight_that_fails_is_marked(circling, tmp_path):
     assert rows[1].ratio < 0.5
 
 
+def test_a_table_of_text_is_the_same_flight(circling, tmp_path):
+    path = log(tmp_path / "own.npz", *circling)
+    with np.load(path) as file:
+        columns = dict(file)
+    text = np.stack([*columns.values()], axis=-1)
+    np.savetxt(tmp_path / "own.csv", text, delimiter=",", header=",".join(columns), comments="")
+    one, other = read_flight(path), read_flight(tmp_path / "own.csv")
+    np.testing.assert_allclose(other.pos, one.pos, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.setpoint, one.setpoint, rtol=0, atol=1e-12)
+
+
 def test_other_logs_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", t=np.arange(9.0))
     with pytest.raises(ConfigError, match="got no px"):
