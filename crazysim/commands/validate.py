@@ -86,7 +86,7 @@ def _made(chosen: Sequence[Section]) -> str:
 
 
 def _processor() -> str:
-    """Return the name of the processor, or its kind where the system does not tell."""
+    """Return the name of the processor, or its kind where the system has none."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -18,7 +18,8 @@ crazysim validate --data FOLDER --out docs/validation.md
 ```
 
 and each section names the command that repeats it; without `--out` it writes `validation.md`. Other programs are
-compared where they are installed: `pip install crazyflow==0.4.0 rotorpy commonroad-vehicle-models foundation-policy l2f`.
+compared where they are installed:
+`pip install crazyflow==0.4.0 rotorpy commonroad-vehicle-models foundation-policy l2f`.
 In Python `crazysim.validate.validate(only=["mujoco"])` returns the rows.
 
 FOLDER holds logs of real flights as `.csv` or `.npz` tables, which are not part of crazysim:

@@ -17,7 +17,7 @@ def test_quick_rows_hold_and_the_page_has_them(tmp_path, capsys):
     out = tmp_path / "page.md"
     assert main(["validate", "--only", "mujoco", "idsia", "--out", str(out)]) == 0
     text = out.read_text()
-    assert "| free body under a wrench, 0.5 s: pos |" in text
+    assert "| free body under a wrench, 0.5 s: position |" in text
     assert "Not measured: give `--data FOLDER`." in text
     assert "left out idsia: give `--data FOLDER`" in capsys.readouterr().out
 
