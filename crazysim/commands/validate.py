@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -76,8 +75,8 @@ def _made(chosen: Sequence[Section]) -> str:
         commit = f", commit {done.stdout.strip()}" if done.returncode == 0 else ""
     except OSError:
         commit = ""
-    installed = [s.install.split()[0] for s in chosen if s.package and importlib.util.find_spec(s.package)]
-    others = [name.partition("==")[0] for name in installed]
+    used = dict(item for section in chosen if not section.missing for item in section.packages.items())
+    others = [name.partition("==")[0] for name in used.values()]
     programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy", *others))
     return (
         f"Made on {datetime.now(UTC):%Y-%m-%d} with crazysim {crazysim.__version__}{commit}, {programs}, Python "

@@ -13,7 +13,9 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators.kalman import DEVIATIONS
 from crazysim.validate.closed_loop import LOST, columns_of, commanded_samples
 from crazysim.validate.flights import logs
 from crazysim.validate.rows import Row
@@ -22,15 +24,14 @@ PERIOD, LOOPS = 0.01, 10
 """Time between samples of a log, s, and the firmware's loops in it, each of which adds process noise."""
 PROCESS = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
 """Deviations of the noise of a loop of 1 ms, m, m/s, rad: (0.5, 0.5, 1) m/s^2 and 0.1 rad/s of the firmware."""
-POS_DEVIATION, QUAT_DEVIATION = 0.01, 0.02
-"""Deviations of motion capture that the filter assumes: the firmware's of positions, m, and of attitudes, rad."""
 SETTLED = 2.0
-"""Time from the first setpoint, s, after which estimates are compared."""
+"""Time from the first setpoint, s, after which estimates are compared and drones fly."""
 
 
 def read(path: Path) -> dict[str, NDArray]:
     """Return a log of NanoBench from its first setpoint to its last: ``accel``, m/s^2, ``gyro``, rad/s, ``pos`` and
-    ``quat`` of motion capture, ``est_pos`` and ``est_quat`` of the filter on board, and ``goal``, m. (n, k)
+    ``quat`` of motion capture (see ``along_thrust``), ``est_pos`` and ``est_quat`` of the filter on board, and
+    ``goal``, m. (n, k)
 
     Raises:
         ConfigError: If a column is missing, or there is no setpoint.
@@ -44,10 +45,31 @@ def read(path: Path) -> dict[str, NDArray]:
         "est_quat": [f"att_stateEstimate_q{k}" for k in "xyzw"],
         "goal": [f"sp_ctrltarget_{k}" for k in "xyz"],
     }
-    log = {k: columns_of(path, columns).T.astype(np.float32) for k, columns in names.items()}
+    flat = [name for columns in names.values() for name in columns]
+    table = dict(zip(flat, columns_of(path, flat).astype(np.float32), strict=True))
+    log = {key: np.stack([table[name] for name in columns], axis=-1) for key, columns in names.items()}
     commanded = commanded_samples(path.name, log["goal"][:, 2])
     log = {k: x[commanded[0] : commanded[-1]] for k, x in log.items()}
-    return log | {"accel": np.float32(error_state.GRAVITY) * log["accel"]}
+    accel = np.float32(error_state.GRAVITY) * log["accel"]
+    return log | {"accel": accel, "quat": along_thrust(log["pos"], log["quat"])}
+
+
+def along_thrust(pos: NDArray, quat: NDArray) -> NDArray:
+    """Return the attitudes of a body whose z axis is the mean direction of the thrust in a flight. (n, 4)
+
+    The tracked body is whatever its markers make it, while the filter takes z as the direction of the thrust, which it
+    is for the drone. The direction is that of the mean of R^T (a + g) from ``SETTLED`` on, with the acceleration a of
+    the positions: the mean of the drag is small beside it.
+
+    Args:
+        pos: Position of the tracked body, world frame, m. (n, 3)
+        quat: Its attitude, body to world, xyzw. (n, 4)
+    """
+    accel = np.gradient(np.gradient(pos, PERIOD, axis=0), PERIOD, axis=0) + [0, 0, error_state.GRAVITY]
+    force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[round(SETTLED / PERIOD) :]
+    x, y, z = np.mean(force, axis=0) / np.linalg.norm(np.mean(force, axis=0))
+    tilt = np.array([-y, x, 0, 1 + z]) / np.sqrt(2 + 2 * z)  # the shortest rotation of the z axis to (x, y, z)
+    return np.asarray(rotation.multiply(jnp.asarray(quat), jnp.asarray(tilt, quat.dtype)))
 
 
 @jax.jit
@@ -65,8 +87,8 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
     def tick(estimate: error_state.Estimate, x: Any) -> tuple[Any, Any]:
         force, rate, where, attitude = x
         estimate = error_state.add_noise(error_state.predict(estimate, force, rate, PERIOD), noise)
-        estimate = error_state.update_pos(estimate, where, POS_DEVIATION)
-        estimate = error_state.finalize(error_state.update_quat(estimate, attitude, QUAT_DEVIATION))
+        estimate = error_state.update_pos(estimate, where, DEVIATIONS["pos"])
+        estimate = error_state.finalize(error_state.update_quat(estimate, attitude, DEVIATIONS["quat"]))
         return estimate, (estimate.pos, estimate.quat)
 
     start = error_state.start(pos[0], jnp.zeros(3), quat[0], (100, 100, 1, *[0.01] * 6))
@@ -84,8 +106,13 @@ def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float,
 
 def of_filter(folder: Path) -> Iterable[Row]:
     """Yield errors of the filter over those of the filter on board, flight by flight, without crashed flights."""
-    flights = {path.stem: read(path) for path in logs(folder, "*")}
-    n = max(len(log["pos"]) for log in flights.values())
+    flights = {}
+    for path in logs(folder, "*"):
+        try:
+            flights[path.stem] = read(path)
+        except ConfigError as error:  # others are compared
+            yield Row(path.stem, "filter on board", problem=str(error))
+    n = max((len(log["pos"]) for log in flights.values()), default=0)
     for name, log in flights.items():
         if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > LOST:
             continue

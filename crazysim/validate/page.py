@@ -11,24 +11,31 @@ INTRODUCTION = """
 # Validation
 
 Comparisons of crazysim with closed forms, other simulators, the Crazyflie's firmware and real flights. Rows with bad
-figures stay. This page is written by
+figures stay. This page is written, in a checkout of the sources, by
 
 ```sh
+pip install -e ".[demo]" {packages}
 crazysim validate --data FOLDER --out docs/validation.md
 ```
 
-and each section names the command that repeats it; without `--out` it writes `validation.md`. Other programs are
-compared where they are installed:
-`pip install crazyflow==0.4.0 rotorpy commonroad-vehicle-models foundation-policy l2f`.
-In Python `crazysim.validate.validate(only=["mujoco"])` returns the rows.
+and each section names the command that repeats it, which writes `validation.md`. Sections whose package is not
+installed are left out. In Python `crazysim.validate.validate(only=["mujoco"])` returns the rows.
 
-FOLDER holds logs of real flights as `.csv` or `.npz` tables, which are not part of crazysim:
+FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim:
 
-- `idsia/`: melon of IDSIA's benchmark (arXiv 2512.14450), `data/test` of
-  [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark) (Git LFS). Here it is the recording as
-  it stood at commit b0cf4b3; the published tables were processed further, so that figures may differ a little.
-- `nanobench/`: NanoBench (arXiv 2603.09908), `datasets/dataset` of
-  [its repository](https://github.com/syediu/nanobench-iros2026); here 34 of its flights.
+- `idsia/melon_20251017_run1.csv` is a flight of IDSIA's benchmark (arXiv 2512.14450) as it was recorded. In a clone of
+  [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark), with pandas and pyarrow,
+
+    ```sh
+    git checkout b0cf4b3
+    python -c "import pandas
+    log = pandas.read_parquet('control_engineering_practice/data/real/new/parquets/melon_20251017_run1.parquet')
+    log[250:6750].to_csv('melon_20251017_run1.csv', index=False)"
+    ```
+
+    writes it. Figures of this page are of the same samples rounded to float32, and differ by up to 2%.
+- `nanobench/` holds the logs of NanoBench (arXiv 2603.09908) that the rows name, from `datasets/dataset` of
+  [its repository](https://github.com/syediu/nanobench-iros2026) at commit d45bc5a. More of its logs make more rows.
 
 A figure passes if it is within the range in its row; rows without a range report what was found.
 """
@@ -54,12 +61,15 @@ def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: 
     """
     bounded = [row for row in rows if row.bound is not None or row.problem]
     bad = [row for row in bounded if row.failed]
-    summary = f"{len(bounded) - len(bad)} of {len(bounded)} figures with a bound are within it."
+    summary = f" {len(bounded) - len(bad)} of {len(bounded)} figures with a range are within it." if bounded else ""
     if bad:
         summary += " Outside: " + "; ".join(row.what for row in bad) + "."
-    parts = [INTRODUCTION.strip(), f"{made} {summary}"]
+    packages = dict.fromkeys(name for section in sections for name in section.packages.values())
+    parts = [INTRODUCTION.format(packages=" ".join(packages)).strip(), made + summary]
     for section in sections:
         repeat = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.logs}`"
+        if section.packages:
+            repeat = f"`pip install {' '.join(section.packages.values())}` and {repeat}"
         parts += [f"## {section.title}", section.text, f"Repeat: {repeat}."]
         if section.missing:
             parts.append(f"Not measured: {section.missing}.")

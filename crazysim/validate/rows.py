@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import importlib.util
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from crazysim.errors import ConfigError
 from crazysim.progress import progress
@@ -60,10 +60,8 @@ class Section:
     """Paragraph below it: data and method."""
     checks: Sequence[Callable[[], Iterable[Row]]]
     """Functions that measure rows."""
-    package: str = ""
-    """Package that must be importable."""
-    install: str = ""
-    """Name of that package for pip."""
+    packages: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Packages that must be importable, and their names with version for pip."""
     absent: str = ""
     """Reason why the section is not measured."""
     logs: bool = False
@@ -74,9 +72,8 @@ class Section:
     @property
     def missing(self) -> str:
         """Reason why the section cannot be measured, or an empty text."""
-        if self.package and importlib.util.find_spec(self.package) is None:
-            return f"not installed; run `pip install {self.install}`"
-        return self.absent
+        needed = [name for package, name in self.packages.items() if importlib.util.find_spec(package) is None]
+        return f"run `pip install {' '.join(needed)}`" if needed else self.absent
 
 
 def measure(sections: Sequence[Section]) -> list[Row]:

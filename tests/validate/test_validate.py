@@ -47,7 +47,7 @@ def test_rows_with_a_series_are_drawn_and_shown(tmp_path):
     text = page([section], rows, "Made.", {"filter": "pictures/one.png"})
     assert "(pictures/one.png)" in text
     assert "| 3 | **1.5** | at most 1.1 |" in text
-    assert "2 of 3 figures with a bound are within it. Outside: 3." in text
+    assert "2 of 3 figures with a range are within it. Outside: 3." in text
 
 
 def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
@@ -57,8 +57,7 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
     assert main(["validate", "--only", "idsia", "nanobench", "--data", str(tmp_path), "--out", out]) == 1
     lines = capsys.readouterr().out.splitlines()
     (failed,) = (line for line in lines if line.startswith("failed"))
-    assert "failed: open loop: expected a log, got" in failed
-    assert "melon.npz" in failed
+    assert "failed: open loop: melon.npz: expected arrays of numbers as of numpy.savez" in failed
     assert "left out nanobench: FOLDER has no folder nanobench" in lines
     assert main(["validate", "--only", "idsia", "--out", str(tmp_path)]) == 2
     assert "expected a file in an existing folder" in capsys.readouterr().err
@@ -88,7 +87,8 @@ def test_what_cannot_run_is_a_failed_row_or_a_message(tmp_path, capsys):
     (row,) = measure([dataclasses.replace(closed, checks=(broken,))])
     assert row.failed
     assert Row("x", "y", float("nan"), bound=(0, 1)).failed
-    missing = dataclasses.replace(closed, package="no_such_package", install="such")
-    assert "pip install such" in missing.missing
+    missing = dataclasses.replace(closed, packages={"numpy": "numpy", "no_such_package": "such==1"})
+    assert missing.missing == "run `pip install such==1`"
+    assert "Repeat: `pip install numpy such==1` and `crazysim validate --only closed`." in page([missing], [], "", {})
     assert main(["validate", "--data", str(tmp_path / "none")]) == 2
     assert "expected a folder with logs" in capsys.readouterr().err
