@@ -24,8 +24,8 @@ from jax import Array
 from crazysim import rotation
 from crazysim.pytree import PyTree, leaf
 
-POS, VEL, ATT = (0, 1, 2), (3, 4, 5), (6, 7, 8)
-"""Rows of the errors of position, velocity and attitude."""
+POS, VEL, ATT, GYRO = (0, 1, 2), (3, 4, 5), (6, 7, 8), (12, 13, 14)
+"""Rows of the errors of position, velocity, attitude and the bias of the gyroscope."""
 N, N_BIASED = 9, 15
 """Number of error states without biases, and with those of accelerometer and gyroscope, in this order."""
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
@@ -41,6 +41,8 @@ GRAVITY = 9.81
 """Acceleration of gravity, m/s^2 (physicalConstants.h)."""
 LOWEST = 0.1
 """Least height that the flow is predicted for, m (mm_flow.c)."""
+LOWEST_COSINE = 0.1
+"""Least cosine of the tilt at which a distance to the ground is used (mm_tof.c)."""
 HALF_CONE = 0.5 * 15 * math.pi / 180
 """Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
 REVERSION = 0.001
@@ -141,6 +143,24 @@ def predict(
     return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=cov)
 
 
+def moved(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, gravity: Array) -> Estimate:
+    """Return the estimate with biases after an interval, or before one where it is negative, with its covariance as is.
+
+    Args:
+        estimate: The estimate.
+        accel: Mean specific force as measured, body frame, m/s^2. (3,)
+        gyro: Mean angular velocity as measured, body frame, rad/s. (3,)
+        dt: Length of the interval, s.
+        gravity: Acceleration of gravity, world frame, m/s^2. (3,)
+    """
+    angle = dt * (gyro - estimate.gyro_bias)  # type: ignore[operator]
+    middle, end = _turned(estimate.quat, 0.5 * angle), _turned(estimate.quat, angle)
+    acc = rotation.matvec(rotation.matrix(middle), accel - estimate.accel_bias, gravity)  # type: ignore[operator]
+    vel = rotation.rotate(estimate.quat, estimate.vel)
+    pos = estimate.pos + dt * vel + 0.5 * dt**2 * acc
+    return estimate.replace(pos=pos, vel=rotation.rotate_inverse(end, vel + dt * acc), quat=end)
+
+
 def predict_biased(
     estimate: Estimate,
     accel: Array,
@@ -170,18 +190,13 @@ def predict_biased(
         accel_variance: Variances of the mean specific force, m^2/s^4. (3,)
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
-    vel, quat = estimate.vel, estimate.quat
-    angle = dt * (gyro - estimate.gyro_bias)  # type: ignore[operator]
-    middle, end = _turned(quat, 0.5 * angle), _turned(quat, angle)
-    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (quat, middle, end))
-    acc = rotation.matvec(rot_middle, accel - estimate.accel_bias, gravity)  # type: ignore[operator]
-    vel_world = rotation.matvec(rot, vel)
-    pos = estimate.pos + dt * vel_world + 0.5 * dt**2 * acc
-    new_vel = rotation.matvec(rot_end.T, vel_world + dt * acc)
+    vel, after = estimate.vel, moved(estimate, accel, gyro, dt, gravity)
+    middle = _turned(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
+    rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, middle, after.quat))
 
     turn, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
     vel_to_pos, att_to_pos = dt * rot, -dt * rot @ rotation.cross_matrix(vel)
-    fall, gyro_to_vel = dt * rotation.cross_matrix(rot_end.T @ gravity), -dt * rotation.cross_matrix(new_vel)
+    fall, gyro_to_vel = dt * rotation.cross_matrix(rot_end.T @ gravity), -dt * rotation.cross_matrix(after.vel)
 
     def rows(p: Array) -> Array:
         """Return the linearised step times a matrix."""
@@ -196,7 +211,7 @@ def predict_biased(
     both = -dt * by_gyro
     p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(both).at[6:9, 3:6].add(both.T)
     p = p.at[6:9, 6:9].add(dt**2 * jnp.diag(gyro_variance))
-    return estimate.replace(pos=pos, vel=new_vel, quat=end, cov=_bounded(p))
+    return after.replace(cov=_bounded(p))
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
@@ -297,16 +312,19 @@ def update_flow(
         estimate: The estimate.
         rot: Attitude at the end of the loop before, as a matrix. (3, 3)
         flow: Motion of the image along x and y of the body, pixels. (2,)
-        gyro: Angular velocity, body frame, rad/s. (3,)
+        gyro: Angular velocity as measured, body frame, rad/s. (3,)
         scale: Pixels by which the image moves at 1 rad/s. ()
         deviation: Standard deviation of a motion, pixels.
     """
-    for k, turn in ((0, -gyro[1]), (1, gyro[0])):
+    for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
         height = jnp.maximum(estimate.pos[2], LOWEST)
         rate = rot[2, 2] / height
-        h = scale * jnp.stack([-estimate.vel[k] * rate / height, rate])
-        predicted = scale * (estimate.vel[k] * rate + turn)
-        estimate = update(estimate, [POS[2], VEL[k]], h, flow[k] - predicted, deviation)
+        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-estimate.vel[k] * rate / height, rate]
+        if estimate.gyro_bias is not None:
+            turn = turn - estimate.gyro_bias[axis]
+            rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(rate, -sign)]
+        predicted = scale * (estimate.vel[k] * rate + sign * turn)
+        estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
     return estimate
 
 
@@ -319,12 +337,28 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
         distance: Shortest distance within the cone of the sensor. ()
         deviation: Standard deviation of the distance, m.
     """
-    upright = rot[2, 2] > 0.1
+    upright = rot[2, 2] > LOWEST_COSINE
     cosine = jnp.where(upright, rot[2, 2], 1.0)
     tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum(1 - cosine**2, 0.0)), cosine)
     gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE, 0.0))
     after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
     return select(upright, after, estimate)
+
+
+def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured distance to level ground at z = 0 along the negative z axis of the body.
+
+    Args:
+        estimate: The estimate.
+        distance: The distance, m; a drone tilted by 84 degrees measures none. ()
+        deviation: Standard deviation of the distance, m.
+    """
+    down = rotation.matrix(estimate.quat)[2]
+    sees = down[2] > LOWEST_COSINE
+    gain = 1 / jnp.where(sees, down[2], 1.0)
+    predicted = gain * estimate.pos[2]
+    h = gain * jnp.stack([jnp.ones_like(gain), predicted * down[1], -predicted * down[0]])
+    return select(sees, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate)
 
 
 def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
@@ -354,6 +388,29 @@ def update_difference(
     h = to_second / jnp.where(away, d_second, 1.0) - to_first / jnp.where(away, d_first, 1.0)
     after = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
     return select(away[0], after, estimate)
+
+
+def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after measured differences of distances to that to the first anchor, all at one time.
+
+    They have the errors of the first distance in common. A distance minus the mean of those before it is a combination
+    of the differences whose errors are independent, with k distances before it of the variance ``1 + 1 / k``.
+
+    Args:
+        estimate: The estimate.
+        anchors: Positions of the anchors, world frame, m. (n, 3)
+        differences: Distances to all anchors but the first minus the distance to the first, m. (n - 1,)
+        deviation: Standard deviation of a distance, m.
+    """
+    at, apart = estimate.pos, estimate.pos - anchors
+    distance = rotation.safe_norm(apart)
+    direction = apart / jnp.where(distance > 0, distance, 1.0)
+    for k in range(1, anchors.shape[0]):
+        h = direction[k] - jnp.sum(direction[:k], axis=0) / k
+        predicted = distance[k, 0] - jnp.sum(distance[:k]) / k + jnp.dot(h, estimate.pos - at)
+        measured = differences[k - 1] - jnp.sum(differences[: k - 1]) / k
+        estimate = update(estimate, POS, h, measured - predicted, math.sqrt(1 + 1 / k) * deviation)
+    return estimate
 
 
 def update_sweep(

@@ -5,23 +5,21 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, per_drone
+from crazysim.core.plugin import Placement, Simulation, per_drone
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.plugins.estimators import error_state
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
-from crazysim.plugins.estimators.kalman import Std
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
-from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight
+from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight, range_deviation
 from crazysim.plugins.sensors.gps import GPS
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.magnetometer import Magnetometer
@@ -85,11 +83,15 @@ class ESKF(ErrorStateFilter):
         cov = per_drone(sim, 0.0, n * (n + 1) // 2)
         return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still))
 
+    def stages(self, sim: Simulation) -> Sequence[Placement]:
+        """Return the stage that begins with the state before the first step, and those of every estimator."""
+        begin = Placement(Stage(self._begin, "drone", at_the_start), name=f"{self.name}_begin")
+        return [begin, *super().stages(sim)]
+
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         """Return the stages of the filter by name, in their order."""
         period, is_due = self.predictions(freq)
         return [
-            ("begin", Stage(self._begin, "drone", at_the_start)),
             ("sample", Stage(self.sample, "drone")),
             ("predict", Stage(self._predict(period), "drone", is_due)),
             *self.fusions(),
@@ -134,8 +136,14 @@ class ESKF(ErrorStateFilter):
         return predict
 
     def updated(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
-        """Return the estimate of one drone after the latest measurement of a sensor."""
-        return _finalized(UPDATES[type(sensor)](sensor, self.imu, data, record.estimate))
+        """Return the estimate of one drone after the latest measurement of a sensor, used where it was taken."""
+        steps, (gyro, accel) = data.core.steps, self.inertial(data)
+        period, _ = self.predictions(data.core.freq)
+        since = sensor.read(data).samples.taken[0] - steps + (steps + 1) % period  # the last prediction
+        lag, gravity = since.astype(gyro.dtype) / data.core.freq, data.params.gravity_vec
+        then = error_state.moved(record.estimate, accel, gyro, lag, gravity)
+        then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
+        return error_state.moved(then, accel, gyro, -lag, gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:
         """Return True where the estimate of one drone is within ``max_pos`` and ``max_vel``. ()"""
@@ -158,16 +166,6 @@ def _finalized(estimate: Estimate) -> Estimate:
 def _size(*deviations: Array | float, least: float = LEAST) -> Array:
     """Return the standard deviation of a sum of independent errors, at least ``least``. (...)"""
     return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(least * least)))
-
-
-def _firmware(deviations: Callable[[Any], Std]) -> Callable[..., Estimate]:
-    """Return the firmware's update for a kind of sensor, with the standard deviations of its record."""
-
-    def update(sensor: Sensor, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-        rot, std = rotation.matrix(estimate.quat), deviations(sensor.read(data))
-        return FIRMWARE[type(sensor)](sensor, imu, data, estimate, rot, std)
-
-    return update
 
 
 def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
@@ -202,16 +200,42 @@ def _field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) ->
     return error_state.update_direction(estimate, measured, record.field / size, std)
 
 
+def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
+    scale, rot = sensor.interval(data) * record.scale[0], rotation.matrix(estimate.quat)
+    return error_state.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _size(record.noise[0]))
+
+
+def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record, distance = sensor.read(data), sensor.latest(data)
+    std = _size(record.noise + range_deviation(distance, record.far_noise))
+    after = error_state.update_ray(estimate, distance[0], std[0])
+    return error_state.select(distance[0] < record.max_range[0], after, estimate)
+
+
+def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    record, measured = sensor.read(data), sensor.latest(data)
+    std = _size(record.noise[0])
+    if sensor.tdoa:
+        return error_state.update_differences(estimate, record.anchors, measured, std)
+    for k in range(measured.shape[0]):
+        estimate = error_state.update_distance(estimate, record.anchors[k], measured[k], std)
+    return estimate
+
+
+def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    rot, std = rotation.matrix(estimate.quat), {"sweep": _size(sensor.read(data).noise[0], least=0.1 * LEAST)}
+    return FIRMWARE[Lighthouse](sensor, imu, data, estimate, rot, std)
+
+
 UPDATES: dict[type, Callable[..., Estimate]] = {
     MotionCapture: _pose,
     GPS: _satellites,
     Barometer: _pressure,
     Magnetometer: _field,
-    OpticalFlow: _firmware(lambda record: {"flow": _size(record.noise[0])}),
-    TimeOfFlight: _firmware(lambda record: {"range": _size(record.noise[0], record.far_noise[0])}),
-    UWB: _firmware(
-        lambda record: {"distance": _size(record.noise[0]), "difference": _size(math.sqrt(2) * record.noise[0])}
-    ),
-    Lighthouse: _firmware(lambda record: {"sweep": _size(record.noise[0])}),
+    OpticalFlow: _flow,
+    TimeOfFlight: _range,
+    UWB: _beacons,
+    Lighthouse: _sweeps,
 }
 """Functions that update an estimate with a measurement, by the class of the sensor."""

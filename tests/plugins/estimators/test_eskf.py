@@ -1,4 +1,4 @@
-"""The error-state filter with biases: its linearisation, honest about its errors, and flown on."""
+"""The error-state filter with biases: its linearisation, the distribution of its errors, and flight on it."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,19 @@ from consistency import assert_chi_squared, errors, normalised
 
 from crazysim import ConfigError, Sim, rotation
 from crazysim.plugins.estimators import ESKF, error_state
-from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer, MotionCapture, RotorSpeeds, Triad
+from crazysim.plugins.sensors import (
+    GPS,
+    IMU,
+    UWB,
+    Barometer,
+    Lighthouse,
+    Magnetometer,
+    MotionCapture,
+    OpticalFlow,
+    RotorSpeeds,
+    TimeOfFlight,
+    Triad,
+)
 
 GYRO = Triad(noise=2.4e-4, bias_spread=0.0175, random_walk=1e-4)
 ACCEL = Triad(noise=2e-3, bias_spread=0.2, random_walk=1e-3)
@@ -60,26 +72,65 @@ def test_the_covariance_moves_with_the_derivatives_of_the_step(estimate):
     assert (g @ g.T)[3:9, 3:9].max() * 40 > 1e-4, "the noise shows nothing"
 
 
-@pytest.mark.parametrize("kind", ["vel", "direction"])
+KNOWN, SCALE, GYRO_NOW = jnp.array([0.6, 0.0, -0.8]), 0.49, jnp.array([0.3, -0.2, 0.1])
+ANCHORS = jnp.array([[-3.0, -3.0, 0.2], [3.0, -3.0, 2.4], [3.0, 3.0, 0.2], [-3.0, 3.0, 2.4]])
+
+
+def image_motion(at, upright):
+    """Return the motion of the image; the filter neglects that its attitude has errors."""
+    turn = GYRO_NOW - at.gyro_bias
+    return SCALE * (at.vel[:2] * upright / at.pos[2] + jnp.array([-1.0, 1.0]) * turn[1::-1])
+
+
+def differences(at):
+    distance = jnp.linalg.norm(at.pos - ANCHORS, axis=-1)
+    return distance[1:] - distance[0]
+
+
+MEASURED = {
+    "vel": lambda at, _: rotation.rotate(at.quat, at.vel),
+    "direction": lambda at, _: rotation.rotate_inverse(at.quat, KNOWN),
+    "flow": lambda at, rot: image_motion(at, rot[2, 2]),
+    "ray": lambda at, _: at.pos[2:] / rotation.matrix(at.quat)[2, 2:],
+    "differences": lambda at, _: differences(at),
+}
+"""Measurements of a state, by kind."""
+UPDATES = {
+    "vel": lambda at, z, rot, std: error_state.update_vel(at, z, std),
+    "direction": lambda at, z, rot, std: error_state.update_direction(at, z, KNOWN, std),
+    "flow": lambda at, z, rot, std: error_state.update_flow(at, rot, z, GYRO_NOW, jnp.asarray(SCALE), std),
+    "ray": lambda at, z, rot, std: error_state.update_ray(at, z[0], std),
+    "differences": lambda at, z, rot, std: error_state.update_differences(at, ANCHORS, z, std),
+}
+
+
+@pytest.mark.parametrize("kind", MEASURED)
 def test_updates_move_by_the_derivatives_of_the_measurement(estimate, kind):
     """A measurement of the state with a tiny error, all axes at once with the gain of its derivatives."""
-    known = jnp.array([0.6, 0.0, -0.8])
-
-    def measured(at):
-        return rotation.rotate(at.quat, at.vel) if kind == "vel" else rotation.rotate_inverse(at.quat, known)
-
-    error, std = 1e-7 * jnp.array([1.0, -2.0, 1.5]), jnp.array([0.1, 0.2, 0.3])
-    z = measured(estimate) + error
-    after = error_state.update_vel(estimate, z, std) if kind == "vel" else (
-        error_state.update_direction(estimate, z, known, std)
-    )  # fmt: skip
-    h = jax.jacfwd(lambda e: measured(moved(estimate, e)))(jnp.zeros(15))
+    rot = rotation.matrix(estimate.quat)
+    prediction = MEASURED[kind](estimate, rot)
+    error = 1e-7 * jnp.array([1.0, -2.0, 1.5])[: len(prediction)]
+    std = jnp.array([0.1, 0.2, 0.3]) if kind in ("vel", "direction") else 0.1
+    variance = jnp.diag(jnp.full(len(error), std**2)) + (std**2 if kind == "differences" else 0.0)
+    after = UPDATES[kind](estimate, prediction + error, rot, std)
+    h = jax.jacfwd(lambda e: MEASURED[kind](moved(estimate, e), rot))(jnp.zeros(15))
     p = error_state.covariance(estimate.cov)
-    gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + jnp.diag(std**2))
+    gain = p @ h.T @ jnp.linalg.inv(h @ p @ h.T + variance)
     found = difference(error_state.finalize(after, least=0.0), estimate)
     # rounding of float64 and the 1e-6 that the firmware adds to norms
     np.testing.assert_allclose(found, gain @ error, rtol=0, atol=1e-11)
     np.testing.assert_allclose(error_state.covariance(after.cov), p - gain @ h @ p, rtol=1e-6, atol=1e-8)
+
+
+def test_a_move_back_undoes_a_move(estimate):
+    """With which late measurements are used where they were taken."""
+    inputs = jnp.array([0.5, 1.0, 9.0]), jnp.array([3.0, -2.0, 1.0])
+    gravity = jnp.array([0, 0, -9.81])
+    there = error_state.moved(estimate, *inputs, 0.2, gravity)
+    back = error_state.moved(there, *inputs, -0.2, gravity)
+    assert np.abs(there.pos - estimate.pos).max() > 0.1
+    for name in ("pos", "vel", "quat"):  # the 1e-6 that the firmware adds to norms, in the direction of 9 m/s^2
+        np.testing.assert_allclose(getattr(back, name), getattr(estimate, name), rtol=0, atol=2e-5)
 
 
 def flown(n_worlds, aids, steps, engine="auto"):
@@ -95,14 +146,14 @@ def flown(n_worlds, aids, steps, engine="auto"):
 
 @pytest.fixture(scope="module")
 def indoors():
-    return flown(128, [MotionCapture(noise=POS, angle_noise=ANGLE), Barometer(noise=3.0)], 2000)
+    return flown(128, [MotionCapture(noise=POS, angle_noise=ANGLE, delay=0.02), Barometer(noise=3.0)], 2000)
 
 
-def all_errors(sim):
+def all_errors(sim, name="eskf"):
     """Return the errors of all states, and the covariances. (n_worlds, 15), (n_worlds, 15, 15)"""
-    estimate, imu = sim.data.plugins["eskf"].estimate, sim.data.plugins["imu"]
+    estimate, imu = sim.data.plugins[name].estimate, sim.data.plugins["imu"]
     biases = [imu.accel.bias - estimate.accel_bias, imu.gyro.bias - estimate.gyro_bias]
-    error = np.concatenate([errors(sim, "eskf"), *(np.asarray(b)[:, 0] for b in biases)], axis=-1)
+    error = np.concatenate([errors(sim, name), *(np.asarray(b)[:, 0] for b in biases)], axis=-1)
     return error, np.asarray(error_state.covariance(estimate.cov), np.float64)[:, 0]
 
 
@@ -137,6 +188,78 @@ def test_innovations_are_as_the_filter_expects(indoors):
     assert_chi_squared(normalised(error, cov + np.diag([POS**2] * 3 + [ANGLE**2] * 3)), 6)
 
 
+DEVIATIONS = (*[0.1] * 6, *[0.02] * 3, *[0.03] * 3, *[0.002] * 3)
+"""Standard deviations at the start of the flights below. Products of errors count nothing: the biases are what a
+calibration leaves."""
+FLOW = [OpticalFlow(noise=0.2), TimeOfFlight(noise=0.005, resolution=None)]
+STATIONS = [[-2, -2, 2.5], [2, 2, 2.5]], [[0, 0.5, 0.8], [0, 0.5, -2.4]]
+
+
+def watched(filters):
+    """Return a simulation of 128 drones that move by 0.4 m, with filters, by their names, that began with errors."""
+    sim, imu = Sim(128, control="state", integrator="rk4", rng_key=2), IMU(
+        gyro=Triad(noise=2.4e-4, bias_spread=DEVIATIONS[-1], random_walk=1e-5),
+        accel=Triad(noise=2e-3, bias_spread=DEVIATIONS[9], random_walk=1e-4),
+    )  # fmt: skip
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=sim.data.states.pos.at[..., 2].set(1.0)))
+    sim.add(imu)
+    for name, aids in filters.items():
+        sim.add(ESKF([imu, *(sim.add(aid) for aid in aids)], control=False, name=name))
+    sim.state_control(pos=(0.3, 0.3, 1.0))
+    sim.step(1)
+    s, zero = sim.data.states, jnp.zeros_like(sim.data.states.pos)
+    cov = np.diag(np.square(DEVIATIONS))[np.triu_indices(15)].astype(np.float32)
+    true = error_state.Estimate(
+        s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, zero, jnp.tile(cov, (128, 1, 1)), zero, zero
+    )
+    error = jnp.asarray(np.random.default_rng(3).normal(0.0, DEVIATIONS, (128, 1, 15)), zero.dtype).at[..., 9:].set(0)
+    begun = jax.jit(jax.vmap(jax.vmap(moved)))(true, error)
+    for name in filters:
+        record = sim.data.plugins[name]
+        sim.data = sim.data.replace(plugins=sim.data.plugins | {name: record.replace(estimate=begun)})
+    sim.step(1999)
+    return sim
+
+
+def test_flow_range_and_differences_are_used_as_they_err():
+    """NEES of the states, and NIS of the next differences and ranges, which have errors in common and a tilted ray."""
+    sim = watched({"eskf": [*FLOW, UWB(ANCHORS, noise=0.1, tdoa=True)]})
+    error, cov = all_errors(sim)
+    assert_chi_squared(normalised(error, cov), 15)
+    assert not np.asarray(sim.data.plugins["eskf"].failures).any()
+
+    record, steps = sim.data.plugins["eskf"], sim.data.core.steps[0, 0]
+    data = ESKF(()).write(sim.data, record.replace(used=jnp.full_like(record.used, steps)))  # nothing is new
+    plugins = sim.step_fn(data, jnp.int32(1)).plugins
+    values = jnp.concatenate([plugins[name].samples.value[:, 0] for name in ("uwb", "time_of_flight")], axis=-1)
+
+    def predicted(at):
+        return jnp.concatenate([MEASURED["differences"](at, None), MEASURED["ray"](at, None)])
+
+    at = jax.tree.map(lambda x: x[:, 0], plugins["eskf"].estimate)
+    h = jax.jit(jax.vmap(lambda at: jax.jacfwd(lambda e: predicted(moved(at, e)))(jnp.zeros(15))))(at)
+    noise = np.zeros((4, 4))
+    noise[:3, :3] = 0.1**2 * (np.eye(3) + 1)
+    noise[3, 3] = (0.005 + 0.0025 * (1 + np.exp(2.92 * (1 - 2.5)))) ** 2 + 0.001**2  # at 1 m, and the least
+    innovation = np.asarray(values - jax.vmap(predicted)(at), np.float64)
+    h, cov = np.asarray(h, np.float64), np.asarray(error_state.covariance(at.cov), np.float64)
+    assert_chi_squared(normalised(innovation, h @ cov @ h.transpose(0, 2, 1) + noise), 4)
+
+
+@pytest.mark.slow
+def test_every_kind_of_aid_is_used_as_it_errs():
+    """NEES of filters on one kind of sensor."""
+    filters = {
+        "flow": FLOW,
+        "two_way": [UWB(ANCHORS, noise=0.1)],
+        "tdoa": [UWB(ANCHORS, noise=0.1, tdoa=True, name="differences")],
+        "sweeps": [Lighthouse(*STATIONS, noise=2e-3, delay=0.01)],
+    }
+    sim = watched(filters)
+    for name in filters:
+        assert_chi_squared(normalised(*all_errors(sim, name)), 15)
+
+
 @pytest.mark.slow
 def test_satellites_barometer_and_magnetometer_are_enough():
     """NEES after 8 s: 15; the heading is known by the field alone, whose noise is 0.08 rad in a sample."""
@@ -162,6 +285,10 @@ def test_engines_agree_and_an_impossible_estimate_begins_anew():
     record = sim.data.plugins["eskf"]
     assert np.asarray(record.failures)[:, 0, 0].tolist() == [0, 1]
     assert np.abs(np.asarray(record.estimate.pos)[1]).max() < 20.0
+    fast = record.replace(estimate=record.estimate.replace(vel=record.estimate.vel.at[0, 0, 1].set(-101.0)))
+    sim.data = ESKF(()).write(sim.data, fast)
+    sim.step(1)
+    assert np.asarray(sim.data.plugins["eskf"].failures)[:, 0, 0].tolist() == [1, 1]
 
 
 def test_one_argument_adds_it_and_wrong_sensors_are_refused():
