@@ -105,7 +105,7 @@ def allan() -> None:
 
 
 def measured() -> None:
-    """A Crazyflie on a figure eight: what it does, and what its sensors measure."""
+    """A Crazyflie on a figure eight: its motion, and the measurements of its sensors."""
     path = figure_eight(width=1.8, depth=1.1, period=4.0, height=0.6)
     sim = Sim(control="state", rng_key=3)
     sim.add(Follow(path))

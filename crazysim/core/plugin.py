@@ -283,8 +283,8 @@ class Plugin:
     def begin_episode(self, data: SimData) -> SimData:
         """Return the data of one drone at the beginning of an episode; ``data`` are those after a reset.
 
-        It may write leaves of drones, such as what is drawn for an episode. Random numbers of ``drone_key`` are those
-        of the first step.
+        It may write leaves of drones, such as what is drawn for an episode. It is also called in the first step of an
+        episode, for worlds that were not reset, before all other stages and with the same random numbers.
         """
         return data
 

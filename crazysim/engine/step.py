@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -120,6 +121,13 @@ class Step:
         self._pack = PackCache()
         self._at_home: Any = None
         self._unsynced: Any = None
+
+    def without(self, names: Collection[str]) -> Step:
+        """Return the step without some stages."""
+        devices = self.location.devices
+        device = devices[0] if self.mesh is None and devices is not None else None
+        stages: Pipeline = {stage.__name__: stage for stage in self.stages if stage.__name__ not in names}
+        return Step(stages, self.engine, self.platform, self.mesh, device=device, strict=self.strict)
 
     def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
         """Return the data some steps later.

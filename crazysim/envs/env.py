@@ -221,7 +221,7 @@ class DroneEnv(Env):
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         sim.plugins.check()
-        self._step = sim.build_step_fn()
+        self._step = sim.build_step_fn().without(sim.plugins.reset_stages)  # every episode begins by a reset
         self._foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))
         first, *others = sim.reset_pipeline.values()
         self.batched_reset = self._foreign or first is not reset or not all(isinstance(fn, Stage) for fn in others)

@@ -101,8 +101,8 @@ def make(
         actions: Meaning of an action; None for the usual one of the command level.
         sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Empty for the
             true states, or for those that ``estimator``, a setting of ``Sim``, estimates.
-        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. ``reset`` refuses those that
-            ``env.sim.add`` adds later.
+        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. Those that ``env.sim.add``
+            adds later are an error in ``reset``.
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,

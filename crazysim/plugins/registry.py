@@ -18,7 +18,7 @@ from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import check_flags
-from crazysim.core.stage import Axes, Stage, over_drones, over_worlds
+from crazysim.core.stage import Axes, Stage, at_the_start, over_drones, over_worlds
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.sensors.sensor import Sensor
@@ -93,7 +93,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
         self._require_names(plugin, self._sim.names)
         record, default = plugin.record(self._sim), plugin.default_record(self._sim)
-        pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, plugin.stages(self._sim))
+        pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
         pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
         resets = dict(self._sim.reset_pipeline)
         if plugin.begins_episodes:
@@ -136,7 +136,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         present_pipeline = sim.step_pipeline
         sim.step_pipeline = _without(dict(present_pipeline), self._installed[name])
         try:  # the stages are made for a pipeline without the plugin
-            pipeline, installed = _with(dict(sim.step_pipeline), plugin, plugin.stages(sim))
+            pipeline, installed = _with(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
             pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         finally:
             sim.step_pipeline = present_pipeline
@@ -152,6 +152,12 @@ class PluginRegistry(Mapping[str, Plugin]):
     def members_of(plugin: Plugin) -> tuple[str, ...]:
         """Return the names of the members of a population; none of another plugin."""
         return plugin.names if isinstance(plugin, Population) else ()
+
+    @property
+    def reset_stages(self) -> tuple[str, ...]:
+        """Names of stages that do in the first step of an episode what resets have done."""
+        resets = self._sim.reset_pipeline
+        return tuple([_begin_name(p) for p in self.values() if p.begins_episodes and p.name in resets])
 
     @property
     def members(self) -> tuple[str, ...]:
@@ -250,6 +256,20 @@ class PluginRegistry(Mapping[str, Plugin]):
 def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
     others = {key: value for key, value in data.plugins.items() if key != name}
     return data.replace(plugins=others if record is None else others | {name: record})
+
+
+def _placements(plugin: Plugin, sim: Simulation) -> object:
+    """Return the stages of a plugin with their places, after one that begins the episode of worlds without a reset."""
+    placements = plugin.stages(sim)
+    if not plugin.begins_episodes or not isinstance(placements, (list, tuple)):
+        return placements
+    begins = Stage(plugin.begin_episode, "drone", at_the_start)
+    first = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not at_the_start)
+    return [Placement(begins, before=first, name=_begin_name(plugin)), *placements]
+
+
+def _begin_name(plugin: Plugin) -> str:
+    return f"{plugin.name}_begin"
 
 
 def _with(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _Installed]:

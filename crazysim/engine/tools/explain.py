@@ -55,8 +55,7 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
         jax.block_until_ready(step(data, jnp.int32(n)))
         return (time.perf_counter() - begin) / n
 
-    rest = {s.__name__: s for s in step.stages if s.__name__ not in split}
-    with_them, without = seconds(step), seconds(Step(rest, step.engine, step.platform, step.mesh))
+    with_them, without = seconds(step), seconds(step.without(split))
     return (
         f"cost of the split, measured: a step takes {1e6 * with_them:.0f} us, and {1e6 * without:.0f} us without "
         f"{', '.join(split)}"

@@ -13,9 +13,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
+from crazysim.core.plugin import Plugin, Simulation, parameter, per_drone
 from crazysim.core.random import drone_key, uniform
-from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
 from crazysim.plugins.effects.latency import LatencyData
@@ -203,15 +202,6 @@ class Randomize(Plugin):
         """Return the expression of a ``Latency`` whose delays can be drawn."""
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._longest})"
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that draws, in the first step of an episode, before all others."""
-        first = next(name for name in sim.step_pipeline if name != self.name)
-        return [Placement(Stage(self.begin, "drone", at_the_start), before=first)]
-
-    def begin_episode(self, data: SimData) -> SimData:
-        """Return the data with what is drawn for an episode, the same as in its first step."""
-        return self.begin(data)
-
     def influence(self, data: SimData) -> SimData:
         """Return the data with the parameters of the drone that was drawn."""
         record, p = self.read(data), data.params
@@ -238,7 +228,7 @@ class Randomize(Plugin):
         found = {"factors": record.factors, "thrust_factors": record.thrust_factors}
         return found if record.air_vel is None else found | {"air_vel": record.air_vel}
 
-    def begin(self, data: SimData) -> SimData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Draw the factors of one drone for an episode."""
         record = self.read(data)
         n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype

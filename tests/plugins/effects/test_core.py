@@ -135,7 +135,7 @@ def test_float64_stays_float64(x64):
     assert signature(after) == signature(sim.data)
 
 
-STAGES = ("battery", "downwash", "latency", "motors", "randomize", "wind", "wind_field", "integration")
+STAGES = ("battery", "downwash", "latency", "motors", "randomize_begin", "wind", "wind_field", "integration")
 
 
 @pytest.fixture(scope="module")

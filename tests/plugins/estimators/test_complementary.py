@@ -1,4 +1,4 @@
-"""The complementary filter: that of the compiled firmware, flown on, and honest about what it does not estimate."""
+"""The complementary filter: agreement with the compiled firmware, flight on it, and errors for states that it lacks."""
 
 import math
 
