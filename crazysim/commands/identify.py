@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -134,7 +134,7 @@ def _write(path: Path, text: str) -> None:
 
 def _part(text: str) -> tuple[str, tuple[float, float]]:
     """Return path, start and end of ``LOG@START:END``, either of which may be left out."""
-    found = re.fullmatch(r"(.+)@([\d.]*):([\d.]*)", text)
+    found = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
     if found is None or Path(text).exists():
         return text, (0.0, math.inf)
     return found[1], (float(found[2] or 0), float(found[3] or math.inf))
@@ -142,10 +142,20 @@ def _part(text: str) -> tuple[str, tuple[float, float]]:
 
 def _columns(texts: Sequence[str]) -> Columns:
     """Return the columns of FIELD=NAMES pairs."""
-    fields = {name: names for name, _, names in (text.partition("=") for text in texts)}
-    unknown = sorted(set(fields) - set(Columns.__dataclass_fields__))
-    if unknown:
-        raise ValueError(f"expected fields of {', '.join(Columns.__dataclass_fields__)}, got {unknown[0]!r}")
-    convert: dict[str, Callable[[str], Any]] = {name: float for name in Columns.__dataclass_fields__ if "_per_" in name}
-    convert["time"] = str
-    return Columns(**{k: convert.get(k, lambda x: tuple(filter(None, x.split(","))))(x) for k, x in fields.items()})
+    known = Columns.__dataclass_fields__
+    fields: dict[str, Any] = {}
+    for text in texts:
+        name, mark, names = text.partition("=")
+        if name not in known or not mark:
+            raise ConfigError(
+                f"expected FIELD=NAMES without spaces, such as pos=px,py,pz, got {text!r}. "
+                f"Fields are {', '.join(known)}."
+            )
+        if "_per_" not in name:
+            fields[name] = names if name == "time" else tuple(filter(None, names.split(",")))
+            continue
+        try:
+            fields[name] = float(names)
+        except ValueError:
+            raise ConfigError(f"expected a number as {name}, got {names!r}. Give the factor to SI units.") from None
+    return Columns(**fields)

@@ -18,6 +18,8 @@ GRAVITY = 9.81
 RATIOS = (0.5, 2.0)
 """Ratios of measured to expected motion that count as agreement, on each axis that moves. Of the logs of two public
 benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
+"""Units of positions, and with /s of velocities, in m."""
 DIVERGED = 10.0
 """Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
 STILL = 0.3
@@ -86,41 +88,54 @@ def check_motion(
             keep[np.flatnonzero(bad)[:, None] + np.arange(width + 1)] = False
             repairs.append(f"dropped {np.sum(~keep)} samples without {pair.what}, which the others have")
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
-    if (fault := _fault(t, data, derived)) is None:
+    laws = _laws(t, data, derived)
+    broken = [k for k, law in enumerate(laws) if law.fault]
+    if not broken:
         return keep
+    fault = laws[broken[0]].fault
     span = float(np.max(np.ptp(data["pos"], axis=0)))
     if span < STILL:
         raise ConfigError(
             f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
             f"{STILL:g} m or more, or give metres_per_unit."
         )
-    moving = _moving(t, data, derived)
-    for remedy, changed in _alternatives(data, derived):
-        # A factor that makes the motion vanish explains nothing.
-        if _fault(t, changed, derived) is None and np.all(_moving(t, changed, derived) | ~moving):
-            raise ConfigError(f"{name}: expected {fault}. {remedy}.")
+    remedy, least = "", len(broken)
+    for words, changed in _alternatives(data, derived):
+        after = _laws(t, changed, derived)
+        # Another law may be broken by another mistake. A factor that makes a motion vanish explains nothing.
+        worse = any((y.fault and not x.fault) or (x.moves and not y.moves) for x, y in zip(laws, after, strict=True))
+        left = sum(bool(law.fault) for law in after)
+        if left < least and not worse and not after[broken[0]].fault:
+            remedy, least = words, left
+            if not left:
+                break
+    if remedy:
+        raise ConfigError(f"{name}: expected {fault}. {remedy}.")
     raise ConfigError(
         f"{name}: expected {fault}. Check units, signs and order of the columns: z up, quaternions xyzw and body to "
         "world, angular velocities in the body frame, rad/s."
     )
 
 
-def _fault(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> str | None:
-    """Return the first law that the columns break with what was found, None if they break none."""
-    up = float(np.median(_thrust_axis(data["quat"])[:, 2]))
-    if not up > 0:
-        return f"a thrust that points up in most samples, got {up:.2f} as the median of its z component"
+class Law(NamedTuple):
+    """A law of mechanics, in a log."""
+
+    fault: str
+    """Description of what breaks it, empty if nothing does."""
+    moves: bool
+    """True if it is about a motion that the log has."""
+
+
+def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> list[Law]:
+    """Return the laws that the columns must follow."""
+    up, found = float(np.median(_thrust_axis(data["quat"])[:, 2])), "a thrust that points up in most samples, got"
+    laws = [Law("" if up > 0 else f"{found} {up:.2f} as the median of its z component", True)]
     for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
-        if not pair.agrees():
-            shown = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in pair.ratios())
-            return f"{pair.what}, got ratios of measured to expected changes of {shown} on x, y, z, where 1 is right"
-    return None
-
-
-def _moving(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> NDArray:
-    """Return True for each law whose changes move on an axis. (n_laws,)"""
-    pairs = (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data))
-    return np.array([not np.all(np.isnan(pair.ratios())) for pair in pairs])
+        ratios = pair.ratios()
+        shown = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
+        text = f"{pair.what}, got ratios of measured to expected changes of {shown} on x, y, z, where 1 is right"
+        laws.append(Law("" if pair.agrees() else text, not np.all(np.isnan(ratios))))
+    return laws
 
 
 def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
@@ -190,16 +205,20 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
     """Yield columns as they would be if a common mistake were mended, with the change that mends it."""
 
     def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
-        if "pos" in factors and "vel" in derived:
-            factors["vel"] = factors["pos"]
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
 
-    for unit, x in (("mm", 1e-3), ("cm", 1e-2), ("feet", 0.3048)):
-        yield f"The position seems to be in {unit}: give metres_per_unit={x:g}", scaled(pos=x)
-        if "vel" not in derived:
-            yield f"The velocity seems to be in {unit}/s: give speed_per_unit={x:g}", scaled(vel=x)
-            both = f"give metres_per_unit={x:g} and speed_per_unit={x:g}"
-            yield f"Position and velocity seem to be in {unit}: {both}", scaled(pos=x, vel=x)
+    for (unit, x), (other, y) in product(UNITS.items(), repeat=2):
+        if "vel" in derived and x != y:
+            continue
+        if y == 1 or "vel" in derived:
+            words = f"The position seems to be in {unit}: give metres_per_unit={x:g}"
+        elif x == 1:
+            words = f"The velocity seems to be in {other}/s: give speed_per_unit={y:g}"
+        else:
+            factors = f"metres_per_unit={x:g} and speed_per_unit={y:g}"
+            words = f"Position and velocity seem to be in {unit} and {other}/s: give {factors}"
+        if (x, y) != (1, 1):
+            yield words, scaled(pos=x, vel=y)
     degrees = math.pi / 180
     yield (
         f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",

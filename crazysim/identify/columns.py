@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+
+COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
+"""Numbers of names of a field, the last of them if it is not left out."""
+ORDERS = {
+    "quat": "x, y, z, w, in this order",
+    "rpy": "roll, pitch and yaw",
+    "attitude_command": "roll, pitch, yaw and thrust",
+}
 
 
 @dataclass(frozen=True)
@@ -57,6 +67,17 @@ class Columns:
     """Factor from the commanded collective thrust to N."""
     share_per_command: float = 1.0
     """Factor from the commands of the rotors to shares of the battery's voltage."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers of names, and the factors."""
+        for key, counts in COUNTS.items():
+            names = getattr(self, key)
+            if isinstance(names, str) or len(names) not in counts:
+                got, order = repr(names) if isinstance(names, str) else len(names), ORDERS.get(key, "x, y, z")
+                raise ConfigError(f"expected {counts[-1]} names of columns as {key}, got {got}. Give {order}.")
+        for key, x in vars(self).items():
+            if "_per_" in key and not (isinstance(x, Real) and math.isfinite(x) and x != 0):
+                raise ConfigError(f"expected a finite number that is not zero as {key}, got {x!r}")
 
     @property
     def names(self) -> list[str]:

@@ -327,7 +327,7 @@ def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
         raise ConfigError(
             f"expected rotors in the order of airframe {airframe.name!r}; the angular accelerations fit "
             f"the order {[k + 1 for k in best]} much better ({explained(best):.2f} against {explained(given):.2f}, "
-            "of at most 2). Change rotor_vel in Columns."
+            "of at most 2). Name the columns of rotor_vel, and of command, in that order."
         )
 
 

@@ -94,8 +94,8 @@ def read_log(
     columns = numbered(table, columns)
     if absent := missing(table, columns):
         raise ConfigError(
-            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them in a Columns "
-            "(--columns), or give the motion capture of the flight (--motion)."
+            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them, as in "
+            "--columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the flight (--motion)."
         )
     factors = {
         "pos": columns.metres_per_unit,

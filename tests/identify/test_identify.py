@@ -248,6 +248,37 @@ def test_factors_of_columns_are_applied(flights):
         )
 
 
+def test_several_mistakes_are_named_in_turn(flights):
+    quat = ("qw", "qx", "qy", "qz")
+    log = {
+        k: x * (1e3 if k in "xyz" else 100 if k[0] == "v" else 57.3 if k[0] == "w" else 1)
+        for k, x in flights[0].items()
+    }
+    columns = Columns(quat=quat)
+    for message, change in (
+        ("order w, x, y, z", {"quat": (*quat[1:], "qw")}),
+        ("in mm and cm/s: give metres_per_unit=0.001 and speed", {"metres_per_unit": 1e-3, "speed_per_unit": 1e-2}),
+        ("rad_per_unit=0.0174533", {"rad_per_unit": 0.0174533}),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            read_log(log, columns)
+        columns = replace(columns, **change)
+    np.testing.assert_allclose(read_log(log, columns).pos, read_log(flights[0]).pos)
+
+
+def test_columns_that_cannot_be_are_refused(capsys):
+    for wrong, message in (
+        ({"pos": "px,py,pz"}, "3 names of columns as pos, got 'px,py,pz'"),
+        ({"quat": ("a", "b", "c")}, "4 names of columns as quat, got 3. Give x, y, z, w, in this order"),
+        ({"rad_per_unit": 0}, "not zero as rad_per_unit, got 0"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            Columns(**wrong)
+    for text, message in (("pos", "got 'pos'"), ("place=a,b,c", "such as pos=px"), ("rad_per_unit=deg", "got 'deg'")):
+        assert main(["identify", "log.csv", "--out", "none.toml", "--columns", text]) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_wrong_columns_are_refused(flights):
     """Orders of quaternions, axes, positions alone, and rotors."""
     quat = dict(zip(("qx", "qy", "qz", "qw"), (flights[0][k] for k in ("qw", "qx", "qy", "qz")), strict=True))
