@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import hashlib
+import tempfile
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -52,7 +54,8 @@ class CFirmware(Controller):
     include: ClassVar[Path] = Path(__file__).parent
     """Folder of ``firmware.h``, for the compiler's option ``-I``."""
     library: str | Path
-    """Path of the shared library."""
+    """Path of the shared library. A copy is loaded, so a file that was compiled again is another library to the next
+    ``CFirmware``; libraries that it needs are not searched beside it."""
     motors: Literal["throttle", "thrust", "rpm"] = "throttle"
     """Unit of the motor commands: ``"throttle"``, the thrust of a rotor as a part of its maximum, as a Crazyflie's PWM
     over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to what the rotor can give, and 0 is off."""
@@ -67,7 +70,12 @@ class CFirmware(Controller):
         """
         if self.motors not in UNITS:
             raise ConfigError(f"expected motors as one of {', '.join(UNITS)}, got {self.motors!r}")
-        load(str(self.library))
+        _ = self._copy
+
+    @functools.cached_property
+    def _copy(self) -> str:
+        """Path of the copy that is loaded."""
+        return load(self.library)
 
     def params(self, airframe: Airframe) -> AllocationParams:
         """Return the limits and curves of the rotors."""
@@ -75,7 +83,7 @@ class CFirmware(Controller):
 
     def memory(self, airframe: Airframe) -> CFirmwareMemory:
         """Return the memory of a drone at rest, as the library sets it."""
-        library = load(str(self.library))
+        library = _opened(self._copy)
         words: Any = np.zeros(-(-library.crazysim_memory_size() // 4) or 1, np.uint32)
         library.crazysim_init(words.ctypes.data)
         return CFirmwareMemory(words)
@@ -92,14 +100,22 @@ class CFirmware(Controller):
             given, feedforward = jnp.zeros(N_COMMAND).at[:4].set(command), jnp.zeros(N_FEEDFORWARD)
         clock = jnp.stack([data.core.steps / data.core.freq, jnp.asarray(1 / self.freq)])
         row = jnp.concatenate([clock, s.pos, s.quat, s.vel, s.ang_vel, given, feedforward]).astype(jnp.float32)
-        words, motors = jax.pure_callback(
-            functools.partial(_call, str(self.library), level, n_motors),
-            (jax.ShapeDtypeStruct(memory.words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32)),
-            memory.words,
-            row,
-            vmap_method="broadcast_all",
-        )
+
+        @jax.custom_jvp
+        def call(words: Array, row: Array) -> tuple[Array, Array]:
+            shapes = (jax.ShapeDtypeStruct(words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32))
+            own = functools.partial(_call, self._copy, level, n_motors)
+            return jax.pure_callback(own, shapes, words, row, vmap_method="broadcast_all")
+
+        call.defjvp(self._refuse_derivative)
+        words, motors = call(memory.words, row)
         return self._rotor_vel(motors.astype(s.pos.dtype), params), CFirmwareMemory(words)
+
+    def _refuse_derivative(self, primals: Any, tangents: Any) -> Any:
+        raise ConfigError(
+            f"expected a controller in JAX for the derivative of a step, got CFirmware({str(self.library)!r}): a "
+            f"compiled library has no derivative. Use a controller such as 'mellinger'."
+        )
 
     def _rotor_vel(self, motors: Array, params: AllocationParams) -> Array:
         """Return rotor speeds, rpm, from motor commands. (n_rotors,)"""
@@ -114,7 +130,7 @@ def _call(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> t
     """Return memories and motor commands after one call of a library for all drones.
 
     Args:
-        library: Path of the library.
+        library: Path of the copy of the library.
         level: Number of the command level in ``LEVELS``.
         n_motors: Number of motors of a drone.
         words: Memories; the library writes into a copy. (..., n_words)
@@ -123,32 +139,45 @@ def _call(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> t
     words, inputs = np.array(words, np.uint32, order="C"), np.ascontiguousarray(inputs, np.float32)
     motors = np.zeros((*inputs.shape[:-1], n_motors), np.float32)
     pointers = words.ctypes.data, level, inputs.ctypes.data, motors.ctypes.data
-    load(library).crazysim_update_all(motors.size // n_motors, n_motors, words.strides[-2], *pointers)
+    _opened(library).crazysim_update_all(motors.size // n_motors, n_motors, words.strides[-2], *pointers)
     return words, motors
 
 
-@functools.cache
-def load(path: str) -> ctypes.CDLL:
-    """Return a library, with the types of its functions.
+def load(library: str | Path) -> str:
+    """Load a copy of a library that has its content of now, and return the path of the copy.
 
     Raises:
         ConfigError: If it cannot be loaded, lacks a function, or was compiled with another version of ``firmware.h``.
     """
-    remedy = f"Compile it as {CFirmware.include / 'firmware.h'} says."
+    remedy, path = f"Compile it as {CFirmware.include / 'firmware.h'} says.", Path(library)
     try:
-        library = ctypes.CDLL(str(Path(path).resolve()))
+        content = path.read_bytes()
+        copy = Path(_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
+        if not copy.exists():  # a loaded one is never written again
+            copy.write_bytes(content)
+        loaded = _opened(str(copy))
     except OSError as error:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
-    missing = [name for name in FUNCTIONS if not hasattr(library, name)]
+    missing = [name for name in FUNCTIONS if not hasattr(loaded, name)]
     if missing:
         needed, lacking = ", ".join(FUNCTIONS), ", ".join(missing)
         raise ConfigError(f"expected the functions {needed} in {path}, got no {lacking}. {remedy}")
-    if (version := library.crazysim_version()) != VERSION:
+    if (version := loaded.crazysim_version()) != VERSION:
         raise ConfigError(f"expected version {VERSION} of firmware.h in {path}, got {version}. {remedy}")
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
-    library.crazysim_memory_size.restype = size
-    library.crazysim_init.argtypes = [pointer]
-    library.crazysim_init.restype = None
-    library.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
-    library.crazysim_update_all.restype = None
-    return library
+    loaded.crazysim_memory_size.restype = size
+    loaded.crazysim_init.argtypes = [pointer]
+    loaded.crazysim_init.restype = None
+    loaded.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
+    loaded.crazysim_update_all.restype = None
+    return str(copy)
+
+
+_opened = functools.cache(ctypes.CDLL)
+"""Open a library by its path, once: the types of its functions stay."""
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    """Return the folder of the copies of this process."""
+    return tempfile.TemporaryDirectory(prefix="crazysim-", ignore_cleanup_errors=True)

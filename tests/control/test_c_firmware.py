@@ -1,6 +1,7 @@
 """Controllers in C: what they receive, what they command, and what they remember of each drone."""
 
 import subprocess
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import pytest
 from cases import with_states
 
 from crazysim import ConfigError, Sim
-from crazysim.control import AllocationParams, CFirmware, Control, Controller
+from crazysim.control import AllocationParams, CFirmware, Control, Controller, firmware
 from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
 from crazysim.engine.backends import native
 from crazysim.pytree import PyTree, leaf
@@ -39,6 +40,51 @@ void crazysim_update(void *memory, enum crazysim_level level, const struct crazy
   memcpy(memory, in, sizeof *in);
   ((struct memory *)memory)->level = level;
   for (int i = 0; i < 4; ++i) motors[i] = 0.1f * i;
+}
+"""
+CONSTANT = """
+#include "firmware.h"
+size_t crazysim_memory_size(void) { return 0; }
+void crazysim_init(void *memory) { (void)memory; }
+void crazysim_update(void *memory, enum crazysim_level level, const struct crazysim_input *in, float *motors) {
+  for (int i = 0; i < 4; ++i) motors[i] = RPM;
+}
+"""
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "crazyflie.c"
+STAND_IN = """
+#pragma once
+#include <stdint.h>
+struct vec { float x, y, z; };
+typedef struct { float x, y, z; } point_t, velocity_t, acc_t, gyro_t;
+typedef struct { float x, y, z, w; } quaternion_t;
+typedef struct { float roll, pitch, yaw; } attitude_t;
+enum mode { modeDisable, modeAbs, modeVelocity };
+typedef struct {
+  struct { enum mode x, y, z, quat; } mode;
+  point_t position; velocity_t velocity; acc_t acceleration; quaternion_t attitudeQuaternion; attitude_t attitudeRate;
+} setpoint_t;
+typedef struct { point_t position; velocity_t velocity; quaternion_t attitudeQuaternion; attitude_t attitude; } state_t;
+typedef struct { gyro_t gyro; acc_t acc; } sensorData_t;
+typedef struct { float sums[4]; } control_t;
+typedef struct { int32_t list[4]; } motors_thrust_uncapped_t;
+typedef struct { uint16_t list[4]; } motors_thrust_pwm_t;
+typedef struct { int calls; } controllerMellinger_t, controllerLee_t;
+static inline void controllerLeeInit(controllerLee_t *self) { self->calls = 100; }
+static inline void controllerLee(controllerLee_t *self, control_t *control, const setpoint_t *s, const sensorData_t *d,
+                                 const state_t *x, uint32_t tick) {
+  const setpoint_t *p = s;
+  self->calls += 1 + tick;
+  control->sums[0] = p->position.x + 2 * p->velocity.y + 4 * p->acceleration.z + 8 * p->attitudeQuaternion.w;
+  control->sums[1] = p->attitudeRate.roll + 2 * p->attitudeRate.pitch + 4 * p->attitudeRate.yaw + p->mode.z;
+  control->sums[2] = x->position.x + 2 * x->velocity.y + 4 * x->attitudeQuaternion.z + 8 * x->attitudeQuaternion.w;
+  control->sums[3] = d->gyro.x + 2 * d->gyro.y + 4 * d->gyro.z + self->calls;
+}
+static inline void powerDistribution(const control_t *control, motors_thrust_uncapped_t *thrusts) {
+  for (int i = 0; i < 4; ++i) thrusts->list[i] = 20 * control->sums[i];
+}
+static inline int powerDistributionCap(const motors_thrust_uncapped_t *thrusts, motors_thrust_pwm_t *limited) {
+  for (int i = 0; i < 4; ++i) limited->list[i] = thrusts->list[i];
+  return 0;
 }
 """
 
@@ -164,6 +210,64 @@ def test_the_step_is_split_without_a_warning_and_explained(library):
     sim = flown(CFirmware(library("hover", HOVER)), n_steps=1)
     assert "'state_controller' is not fused" in sim.explain()
     assert "it calls a function on the host" in sim.explain()
+
+
+def test_a_library_that_is_compiled_again_is_another_one_to_the_next_controller(tmp_path):
+    sims = []
+    for rpm in (9000, 12000):
+        (tmp_path / "constant.c").write_text(CONSTANT.replace("RPM", f"{rpm}"))
+        words = ["cc", "-shared", "-fPIC", f"-I{CFirmware.include}", "constant.c", "-o", "constant.so"]
+        subprocess.run(words, cwd=tmp_path, check=True)
+        controller = CFirmware(tmp_path / "constant.so", motors="rpm")
+        sims.append(Sim(control="attitude", controller=controller, engine="plain"))
+    for sim, rpm in zip(sims, (9000, 12000), strict=True):
+        sim.step(1)
+        np.testing.assert_array_equal(sim.data.controls.rotor_vel, np.full((1, 1, 4), rpm))
+
+
+def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
+    """The types are those of stabilizer_types.h of the firmware, the controller a sum of what it receives."""
+    for name in ("math3d", "controller_lee", "controller_mellinger", "power_distribution"):
+        (tmp_path / f"{name}.h").write_text(STAND_IN if name == "math3d" else '#include "math3d.h"')
+    words = [
+        "cc",
+        "-shared",
+        "-fPIC",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-DCONTROLLER=Lee",
+        f"-I{CFirmware.include}",
+        "-I.",
+    ]
+    subprocess.run([*words, EXAMPLE, "-o", "lee.so"], cwd=tmp_path, check=True)
+    controller = CFirmware(tmp_path / "lee.so")
+    memory = np.asarray(controller.memory(None).words)
+    x = np.arange(1.0, 40.0, dtype=np.float32) / 8  # time, dt, pos, quat, vel, ang_vel, command
+    pos, quat, vel, gyro, command = x[2:5], x[5:9], x[9:12], x[12:15], x[15:31]
+    words, motors = firmware._call(controller._copy, 0, 4, memory[None], x[None])
+    degrees = np.rad2deg(1.0)
+    sums = [
+        command[0] + 2 * command[4] + 4 * command[8] + 8 * command[12],
+        degrees * (command[13] + 2 * command[14] + 4 * command[15]) + 1,
+        pos[0] + 2 * vel[1] + 4 * quat[2] + 8 * quat[3],
+        degrees * (gyro[0] + 2 * gyro[1] + 4 * gyro[2]) + 101,
+    ]
+    np.testing.assert_allclose(65535 * motors[0], 20 * np.array(sums), atol=1.1)  # whole numbers, rounded down
+    assert words.tolist() == [[101]]
+
+
+@pytest.mark.parametrize("engine", ["auto", "plain"])
+def test_a_derivative_is_an_error_that_names_the_library(library, engine):
+    sim = Sim(control="state", controller=CFirmware(library("hover", HOVER)), engine=engine)
+    data, step = sim.data, sim.step_fn
+
+    def height(z):
+        return step(data.replace(states=data.states.replace(pos=data.states.pos + z)), 2).states.pos[0, 0, 2]
+
+    for derivative in (jax.grad, jax.jacfwd):
+        with pytest.raises(ConfigError, match=r"for the derivative of a step, got CFirmware\('.*hover\.so'\)"):
+            derivative(height)(0.1)
 
 
 def test_wrong_libraries_and_units_are_refused(library, tmp_path):

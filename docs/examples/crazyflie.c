@@ -1,32 +1,42 @@
-/* The Crazyflie firmware's Mellinger controller for crazysim.control.CFirmware.
+/* The Crazyflie firmware's controllers Mellinger and Lee for crazysim.control.CFirmware.
  *
- * It keeps what it remembers in a struct, so one library flies any number of drones. FIRMWARE is a clone of
- * github.com/bitcraze/crazyflie-firmware, and FOLDER is as in firmware.h:
+ * They keep what they remember in a struct, so one library flies any number of drones. The files are those that
+ * Bitcraze's Python module cffirmware is made of. FIRMWARE is a clone of github.com/bitcraze/crazyflie-firmware, and
+ * FOLDER is as in firmware.h; for the other controller replace Mellinger by Lee, and mellinger by lee:
  *
  *     touch autoconf.h
- *     cc -O2 -shared -fPIC -w -DUNIT_TEST_MODE -I . -I FOLDER \
+ *     cc -O2 -shared -fPIC -w -DUNIT_TEST_MODE -DCONTROLLER=Mellinger -I . -I FOLDER -I FIRMWARE/src/config \
  *         $(find FIRMWARE/src -type d \( -name interface -o -path "*interface*" \) | sed 's/^/-I /') \
- *         mellinger.c FIRMWARE/src/modules/src/controller/controller_mellinger.c -o mellinger.so
+ *         crazyflie.c FIRMWARE/src/modules/src/controller/controller_mellinger.c \
+ *         FIRMWARE/src/modules/src/power_distribution_quadrotor.c -lm -o mellinger.so
  *
  * Rotors are those of the airframe cf2x_L250.
  */
-#include <math.h>
 #include <string.h>
 
 #include "firmware.h"
+#include "math3d.h"
+#include "controller_lee.h"
 #include "controller_mellinger.h"
+#include "power_distribution.h"
+
+#define JOIN_(a, b, c) a##b##c
+#define JOIN(a, b, c) JOIN_(a, b, c)
+#define MEMORY JOIN(controller, CONTROLLER, _t)
 
 static const float degree = 57.29577951f;
 
-size_t crazysim_memory_size(void) { return sizeof(controllerMellinger_t); }
+size_t crazysim_memory_size(void) { return sizeof(MEMORY); }
 
-void crazysim_init(void *memory) { controllerMellingerInit(memory); }
+void crazysim_init(void *memory) { JOIN(controller, CONTROLLER, Init)(memory); }
 
 void crazysim_update(void *memory, enum crazysim_level level, const struct crazysim_input *in, float *motors) {
   setpoint_t setpoint;
   sensorData_t sensors;
   state_t state;
   control_t control;
+  motors_thrust_uncapped_t thrusts;
+  motors_thrust_pwm_t limited;
   memset(&setpoint, 0, sizeof setpoint);
   memset(&sensors, 0, sizeof sensors);
   memset(&state, 0, sizeof state);
@@ -48,13 +58,9 @@ void crazysim_update(void *memory, enum crazysim_level level, const struct crazy
   sensors.gyro.y = degree * in->ang_vel[1];
   sensors.gyro.z = degree * in->ang_vel[2];
 
-  controllerMellinger(memory, &control, &setpoint, &sensors, &state, 0);
+  JOIN(controller, CONTROLLER, )(memory, &control, &setpoint, &sensors, &state, 0);
 
-  /* Mixing and limits of power_distribution_quadrotor.c; the reduction keeps the torque. */
-  const float roll = control.roll / 2, pitch = control.pitch / 2, yaw = control.yaw, thrust = control.thrust;
-  const float m[4] = {thrust - roll + pitch + yaw, thrust - roll - pitch - yaw, thrust + roll - pitch + yaw,
-                      thrust + roll + pitch - yaw};
-  float excess = 0;
-  for (int i = 0; i < 4; ++i) excess = fmaxf(excess, m[i] - 65535);
-  for (int i = 0; i < 4; ++i) motors[i] = fmaxf(m[i] - excess, 0) / 65535;
+  powerDistribution(&control, &thrusts);
+  powerDistributionCap(&thrusts, &limited);
+  for (int i = 0; i < 4; ++i) motors[i] = limited.list[i] / 65535.0f;
 }
