@@ -6,7 +6,6 @@ from bisect import bisect_left
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from crazysim.errors import ConfigError
 
@@ -179,6 +178,8 @@ def airborne(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDAr
     Raises:
         ConfigError: If the rotors are at rest.
     """
+    from scipy.ndimage import median_filter  # a fifth of a second to import
+
     smooth = median_filter(
         np.maximum(thrust, 0.0), size=2 * max(1, round(0.1 / float(np.median(np.diff(t))))) + 1, mode="nearest"
     )
