@@ -16,6 +16,8 @@ from crazysim.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_
 from crazysim.live.crtp.setpoints import unpack_quat
 from crazysim.live.crtp.tables import LOG_TYPES, Table, Variable, pack
 from crazysim.live.swarm import Swarm
+from crazysim.plugins.estimators import Kalman
+from crazysim.plugins.sensors import IMU, MotionCapture, MultiRanger, Triad
 from crazysim.plugins.sensors.range_finder import RangeFinder
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:cflib", "ignore::DeprecationWarning:usb")
@@ -272,6 +274,35 @@ def test_the_range_finder_is_a_multi_ranger():
     state = swarm.state(0)
     assert device.readings["range.zrange"][1](state, swarm["cf1"]) == pytest.approx(1250, abs=5)
     assert device.readings["range.front"][1](state, swarm["cf1"]) == 32767
+
+
+def test_drones_fly_and_log_what_their_sensors_and_filter_measure():
+    imu, tracked = IMU(gyro=Triad(bias=0.1)), MotionCapture(noise=0.002, freq=100)
+    sim = Sim(control="state", estimator=Kalman([imu, tracked]))
+    sim.add(RangeFinder(directions=[[0, 0, -2.0], [1, 0, 0], [1, 1, 0]], max_range=2.0))
+    ranger = sim.add(MultiRanger(noise=0.05, n_rays=3, freq=10))
+    sim.build_default_data()
+    swarm = Swarm(sim)
+    device = CrtpDevice(swarm, 0)
+
+    def logged(*names):
+        state = device.commander.estimate(swarm.state(0))
+        return [device.readings[name][1](state, swarm["cf1"]) for name in names]
+
+    swarm["cf1"].take_off(0.5, 0.8)
+    swarm.advance(1.2)
+    known, states = sim.plugins.observations(sim.data), sim.data.states
+    pos = [float(x) for x in known["kalman.pos"][0, 0]]
+    assert logged("stateEstimate.x", "stateEstimate.y", "kalman.stateZ") == pytest.approx(pos, abs=1e-6)
+    assert 1e-5 < np.abs(states.pos[0, 0] - np.array(pos)).max() < 0.02  # the noise, and not the truth
+    assert float(states.pos[0, 0, 2]) == pytest.approx(0.5, abs=0.1)
+    gyro, accel = (np.asarray(known[f"imu.{name}"][0, 0]) for name in ("gyro", "accel"))
+    assert logged("gyro.x", "gyro.y", "gyro.z") == pytest.approx(np.rad2deg(gyro).tolist(), rel=1e-4)
+    assert logged("acc.x", "acc.y", "acc.z") == pytest.approx((accel / 9.81).tolist(), abs=1e-5)
+    measured = float(ranger.read(sim.data).samples.value[0, 0, 0])
+    assert logged("range.zrange") == pytest.approx([1000 * measured], abs=0.1)
+    assert abs(measured - float(states.pos[0, 0, 2])) > 1e-3
+    assert logged("range.front") == [32767]
 
 
 # Servers ------------------------------------------------------------------------------------------------------------

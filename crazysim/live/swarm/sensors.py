@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from crazysim.plugins.effects import Battery
+from crazysim.plugins.sensors import MultiRanger
 from crazysim.plugins.sensors.range_finder import MULTI_RANGER, RangeFinder
 from crazysim.sim.sim import Sim
 
@@ -43,15 +44,21 @@ def battery_of(sim: Sim, drone: int) -> BatteryState:
 
 
 def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
-    """Return the distances that a drone's ``RangeFinder`` measures along ``MULTI_RANGER``, m, by name.
+    """Return the distances that a ``MultiRanger``, or a ``RangeFinder``, measures along ``MULTI_RANGER``, m, by name.
 
-    They are infinite where nothing is within its range. Other directions, and drones without one, have none.
+    They are infinite where nothing is within its range. Other directions, and drones without one, have none. Before the
+    first measurement of a ``MultiRanger`` they are the true ones.
     """
-    plugin = _plugin(sim, RangeFinder)
+    ranger = _plugin(sim, MultiRanger)
+    plugin = _plugin(sim, RangeFinder) if ranger is None else sim.plugins[ranger.range_finder]
     if plugin is None:
         return {}
     record = plugin.read(sim.data)
     far, distances = float(record.max_range), np.asarray(record.distance)[0, drone].tolist()
+    if ranger is not None:
+        samples = ranger.read(sim.data).samples
+        if samples.taken[0, drone, 0] >= 0:
+            distances = np.asarray(samples.value)[0, drone].tolist()
     found = {}
     for direction, distance in zip(np.asarray(record.direction), distances, strict=True):
         name = next((name for name, axis in MULTI_RANGER.items() if np.allclose(axis, direction, atol=1e-6)), None)

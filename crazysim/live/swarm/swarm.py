@@ -6,12 +6,16 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
 from crazysim.closing import Closing
 from crazysim.control import Control
+from crazysim.core.data import SimData
+from crazysim.core.stage import over_drones, over_worlds
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.attitude import from_yaw, rotate, to_rpy
@@ -22,6 +26,7 @@ from crazysim.live.swarm.parameters import LIGHTS, Parameters, parameters_of
 from crazysim.live.swarm.sensors import ranges_of
 from crazysim.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
+from crazysim.plugins.estimators import Estimator
 from crazysim.sim.sim import Sim
 
 GRAVITY = 9.81
@@ -35,6 +40,7 @@ class Swarm(Closing):
         swarm["cf1"].take_off(1.0, 2.0)
         swarm.advance(3.0)
 
+    States are those of the filter of ``Sim(estimator=...)`` and of its ``IMU``, or the true ones without a filter.
     Commands come from other threads or from the same one; ``lock`` protects them. The simulation advances by
     ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
     that ``advance`` runs, after ``run_in(live)``.
@@ -72,6 +78,9 @@ class Swarm(Closing):
         self._period = sim.freq // sim.control_freq
         self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
         self._motors = self._add_motors()
+        estimators = [plugin for plugin in sim.plugins.values() if isinstance(plugin, Estimator)]
+        self._estimator = next((each for each in estimators if each.control), None)
+        self._estimate = jax.jit(over_worlds(over_drones(self._estimated)))
         self._on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
         self._yaws: list[float] = []
@@ -246,11 +255,11 @@ class Swarm(Closing):
         return self.sim.add(MotorFailure(name="motor_switch"))
 
     def _read(self) -> None:
-        data = self.sim.data
-        states = data.states
-        pos, quat, vel, ang_vel = (
-            np.asarray(x)[0].astype(float) for x in (states.pos, states.quat, states.vel, states.ang_vel)
-        )
+        data, states = self.sim.data, self.sim.data.states
+        values = [states.pos, states.quat, states.vel, states.ang_vel]
+        if self._estimator is not None:
+            values = self._estimate(data)
+        pos, quat, vel, ang_vel, *measured = (np.asarray(x)[0].astype(float) for x in values)
         now = float(np.asarray(data.core.steps)[0, 0]) / self.sim.freq
         before = self._states
         if before and now < before[0].time:
@@ -263,8 +272,15 @@ class Swarm(Closing):
         acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY])
         if before and dt == 0:
             acc = np.stack([state.acc for state in before])
+        acc = measured[0] if measured else acc
         self._yaws = to_rpy(quat)[:, 2].tolist()
         self._states = [DroneState(now, *x) for x in zip(pos, quat, vel, ang_vel, acc, strict=True)]
+
+    def _estimated(self, data: SimData) -> list[Array]:
+        """Return the estimate of one drone and the reading of its accelerometer, as fields of ``DroneState``."""
+        estimator, s = self._estimator, data.states
+        known = {"pos": s.pos, "quat": s.quat, "vel": s.vel, "ang_vel": s.ang_vel} | estimator.measured_states(data)
+        return [known[name] for name in ("pos", "quat", "vel", "ang_vel")] + [estimator.inertial(data)[1]]
 
     def _write(self) -> None:
         sim = self.sim
