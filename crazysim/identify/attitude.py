@@ -71,8 +71,8 @@ class FittedModel(PyTree):
     def inputs(self, window: Windows, dt: float) -> Array:
         """Return the commands, held from sample to sample. (n - 1, 3, 4)"""
         del dt  # an argument of every predictor
-        assert window.attitude_command is not None  # of prepared logs
-        return jnp.repeat(window.attitude_command[:-1, None], 3, axis=1)
+        command: Array = window.attitude_command  # type: ignore[assignment]  # prepared logs have commands
+        return jnp.repeat(command[:-1, None], 3, axis=1)
 
     def derivative(self, state: State, inputs: Array) -> State:
         """Return the time derivatives of a state under a command."""
