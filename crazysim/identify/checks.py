@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import permutations, product
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim import rotation
 from crazysim.errors import ConfigError
 from crazysim.identify.columns import Columns
 from crazysim.identify.motion import body_rates, integral
@@ -75,7 +77,7 @@ def check_motion(
         name: Name of the log, for messages.
         t: Time, s. (n,)
         data: Columns by field of ``Columns``, in the units of a log.
-        derived: Fields that were not measured but differentiated.
+        derived: Fields that were not measured but differentiated; the attitude, if it was given as angles.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
@@ -224,16 +226,29 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
         f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",
         scaled(ang_vel=degrees),
     )
-    first, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
-    yield (
-        "The quaternions seem to be in the order w, x, y, z: name them in the order x, y, z, w",
-        {**data, "quat": first},
-    )
-    yield "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw", scaled(quat=inverse)
-    yield (
-        "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw in this order",
-        {**data, "quat": first * np.array(inverse)},
-    )
+    if "quat" in derived:
+        angles = np.asarray(rotation.to_rpy(jnp.asarray(data["quat"])))
+        for signs, x in product(product((1, -1), repeat=3), (1.0, degrees)):
+            names = ",".join(
+                ("-" if s < 0 else "") + key for s, key in zip(signs, ("roll", "pitch", "yaw"), strict=True)
+            )
+            turned = np.asarray(rotation.from_rpy(jnp.asarray(angles * np.array(signs))), np.float64)
+            also = "" if x == 1 else f", and the angular velocity in degrees per second: give rad_per_unit={x:.6g}"
+            yield (
+                f"The angles seem to be rpy={names}, with names of your columns{also}",
+                {**scaled(ang_vel=x), "quat": turned},
+            )
+    else:
+        first, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
+        yield (
+            "The quaternions seem to be in the order w, x, y, z: name them in the order x, y, z, w",
+            {**data, "quat": first},
+        )
+        yield "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw", scaled(quat=inverse)
+        yield (
+            "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw",
+            {**data, "quat": first * np.array(inverse)},
+        )
     down = (1, -1, -1)
     yield (
         "z seems to point down, in world and body: give the signs pos=x,-y,-z vel=vx,-vy,-vz quat=qx,-qy,-qz,qw "

@@ -139,7 +139,7 @@ def read_log(
     if "ang_vel" in derived:
         data["ang_vel"] = capture.ang_vel_of(t, data["quat"])
         repairs.append("differentiated the attitude, for want of an angular velocity")
-    keep = check_motion(name, t, data, derived, repairs)
+    keep = check_motion(name, t, data, (*derived, *(["quat"] if columns.rpy else [])), repairs)
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if "voltage" in data:
         data["voltage"] = data["voltage"][:, 0]

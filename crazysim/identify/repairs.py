@@ -65,6 +65,11 @@ def increasing(name: str, t: NDArray, repairs: list[str]) -> NDArray:
         at, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
         keep[[at[k] for k, step in ((0, 0), (-1, -2)) if t[at[step + 1]] - t[at[step]] > 100 * dt]] = False
     lost = int(np.sum(~keep))
+    if len(t) >= SHORTEST and 2 * (different := len(np.unique(t))) < len(t):
+        raise ConfigError(
+            f"{name}: expected a time of its own for each sample, got {different} times of {len(t)} samples. "
+            "Export the time with more digits, or name another column as time."
+        )
     if len(t) < SHORTEST or lost > REPAIRABLE * len(t):
         raise ConfigError(
             f"{name}: expected at least {SHORTEST} samples whose time increases, got {len(t)} of which {lost} do not. "

@@ -36,7 +36,13 @@ def read_table(
     name, table = _read(source, repairs, columns)
     if columns is None or not columns.rpy or any(plain(x) not in table for x in columns.rpy):
         return name, table
-    quat = np.asarray(rotation.from_rpy(jnp.asarray(stacked(name, table, columns.rpy, columns.rad_per_angle))))
+    angles = stacked(name, table, columns.rpy, columns.rad_per_angle)
+    if (most := np.nanmax(np.abs(angles[:, 1]), initial=0.0)) > 1.01 * np.pi / 2:
+        raise ConfigError(
+            f"{name}: expected a pitch of at most pi/2 rad, got {most:.3g}. Name roll, pitch and yaw in this order, "
+            f"and give rad_per_angle={np.pi / 180:.6g} for degrees."
+        )
+    quat = np.asarray(rotation.from_rpy(jnp.asarray(angles)))
     return name, {**table, **dict(zip(columns.quat, quat.T.astype(np.float64), strict=True))}
 
 

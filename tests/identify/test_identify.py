@@ -136,6 +136,11 @@ def test_missing_columns_are_named(flights):
         read_log({k: x for k, x in flights[0].items() if k != "qw"})
 
 
+def test_times_of_few_digits_are_refused(flights):
+    with pytest.raises(ConfigError, match="expected a time of its own for each sample, got 21 times of 500"):
+        read_log(flights[0] | {"t": np.round(flights[0]["t"], 1)})
+
+
 def test_time_that_goes_back_is_dropped(flights):
     log = {k: np.insert(x, 100, x[50]) for k, x in flights[0].items()}
     read = read_log(log)
@@ -304,6 +309,13 @@ def test_angles_are_read_in_place_of_quaternions(flights):
     columns = Columns(rpy=("angle0", "-angle1", "angle2"), rad_per_angle=np.pi / 180)
     # float32 of the conversions.
     np.testing.assert_allclose(np.abs(np.sum(read_log(table, columns).quat * log.quat, axis=-1)), 1, atol=1e-5)
+    with pytest.raises(ConfigError, match=r"seem to be rpy=roll,-pitch,yaw, with names of your columns\."):
+        read_log(table, replace(columns, rpy=tuple(angles)))
+    degrees = table | {k: np.degrees(table[k]) for k in ("wx", "wy", "wz")}
+    with pytest.raises(ConfigError, match=r"rpy=roll,-pitch,yaw.* and the angular velocity in degrees per second"):
+        read_log(degrees, replace(columns, rpy=tuple(angles)))
+    with pytest.raises(ConfigError, match=r"pitch of at most pi/2 rad.* rad_per_angle=0\.0174533"):
+        read_log(table, replace(columns, rad_per_angle=1.0))
     with pytest.raises(ConfigError, match="expected columns angle3"):
         read_log(table, replace(columns, rpy=("angle0", "angle1", "angle3")))
 
