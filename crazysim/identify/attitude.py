@@ -69,10 +69,16 @@ class FittedModel(PyTree):
         return window.rotor_vel[PADDING]
 
     def inputs(self, window: Windows, dt: float) -> Array:
-        """Return the commands, held from sample to sample. (n - 1, 3, 4)"""
+        """Return the commands, held from sample to sample. (n - 1, 3, 4)
+
+        Raises:
+            ConfigError: If the window has no commands.
+        """
         del dt  # an argument of every predictor
-        command: Array = window.attitude_command  # type: ignore[assignment]  # prepared logs have commands
-        return jnp.repeat(command[:-1, None], 3, axis=1)
+        cmd = window.attitude_command
+        if cmd is None:
+            raise ConfigError("expected windows with attitude commands, got none. Cut them from prepared logs.")
+        return jnp.repeat(cmd[:-1, None], 3, axis=1)
 
     def derivative(self, state: State, inputs: Array) -> State:
         """Return the time derivatives of a state under a command."""

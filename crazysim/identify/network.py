@@ -1,4 +1,4 @@
-"""Training of a residual's network through predictions of flights."""
+"""Training of a residual through predictions of flights."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def fit_residual(
     validation: Sequence[Log] = (),
     seed: int = 0,
 ) -> Model:
-    """Return the model with a network that is added to force and torque.
+    """Return the model with a trained residual: linear terms and a network that are added to force and torque.
 
     Adam minimises Huber's loss of open-loop predictions of 0.5 s, by gradients through the dynamics. The parameters of
-    the model stay as they are; the residual's linear terms are trained too. With validation logs the result is the best
+    the model stay as they are. With validation logs the result is the best
     of those seen every 100 iterations by their loss.
 
     Args:
