@@ -8,7 +8,6 @@ from consistency import assert_chi_squared, errors, normalised
 
 from crazysim import ConfigError, Plugin, Sim, rotation
 from crazysim.core.random import drone_key
-from crazysim.engine import Step
 from crazysim.envs import make
 from crazysim.plugins.estimators import Kalman, error_state
 from crazysim.plugins.sensors import IMU, UWB, Barometer, Lighthouse, MotionCapture, OpticalFlow, TimeOfFlight, Triad
@@ -236,24 +235,3 @@ def test_a_task_observes_the_estimate():
     one, two = env.step(state, action), env.step(other, action)
     np.testing.assert_allclose(two.obs["pos"] - one.obs["pos"], 1.0, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(one.reward, two.reward)
-
-
-def test_law_08_gradients_of_flight_on_the_estimate(x64):
-    """Of where a drone is and where it takes itself to be, by its first position and rates; no noise is rounded."""
-    sim = Sim(control="state", estimator=Kalman([IMU(Triad(noise=0.01), Triad(noise=0.1)), MotionCapture(0.01, 0.01)]))
-    sim.state_control(pos=(0.3, 0.1, 1.0))
-    step, start = Step(sim.step_pipeline, "plain"), sim.data
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3)))
-
-    @jax.jit
-    def loss(pos, ang_vel):
-        data = step(start.replace(states=start.states.replace(pos=pos, ang_vel=ang_vel)), 25)
-        return jnp.sum(weights[0] * data.states.pos) + jnp.sum(weights[1] * data.plugins["kalman"].estimate.pos)
-
-    x = jnp.array([[[0.1, 0.2, 1.0]]]), jnp.array([[[0.2, -0.3, 0.1]]])
-    direction = jnp.array([[[1.0, -0.5, 0.7]]]), jnp.array([[[0.3, 0.8, -0.6]]])
-    slopes = jax.jit(jax.grad(loss, (0, 1)))(*x)
-    along = sum(float(jnp.sum(slope * d)) for slope, d in zip(slopes, direction, strict=True))
-    h = 1e-5
-    ends = [loss(*(value + sign * h * d for value, d in zip(x, direction, strict=True))) for sign in (1, -1)]
-    np.testing.assert_allclose(along, float(ends[0] - ends[1]) / (2 * h), rtol=1e-6)

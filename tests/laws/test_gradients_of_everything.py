@@ -1,0 +1,121 @@
+"""Derivatives through filters, and through all sensors, filters and effects at once, against central differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim import Battery, Downwash, GroundEffect, Latency, RangeFinder, Sim, Wind
+from crazysim.core.stage import as_stages
+from crazysim.plugins import sensors
+from crazysim.plugins.estimators import ESKF, Kalman
+from crazysim.plugins.sensors import IMU, UWB, MotionCapture, OpticalFlow, TimeOfFlight, Triad
+
+ANCHORS = [(-3, -3, 0.2), (3, -3, 2.4), (3, 3, 0.2)]
+ERRORS = Triad(noise=1e-3, bias=0.01, scale=0.01, misalignment=0.02, instability=0.01, bandwidth=80.0)
+STEPS = 10
+"""Steps of 2 ms: two predictions of each filter, and a measurement of each sensor."""
+SMALL, DIFFERENCE = 1e-9, 1e-5
+"""Slope below which nothing is compared, and step of the differences relative to the directions."""
+
+
+def filters():
+    """Return a filter that flies two drones, and one that watches, with their sensors."""
+    imu, tracked = IMU(ERRORS, ERRORS), MotionCapture(1e-3, 1e-2, delay=0.004)
+    aids = [OpticalFlow(0.1), TimeOfFlight(resolution=None), UWB(ANCHORS, 0.1, tdoa=True)]
+    return [imu, tracked, *aids, Kalman([imu, tracked]), ESKF([imu, *aids], control=False)]
+
+
+def everything():
+    """Return effects, all sensors, and filters on all that they can use."""
+    imu, tracked = IMU(ERRORS, ERRORS, (0.01, 0.0, 0.0), imbalance=1e-8), MotionCapture(1e-3, 1e-2, delay=0.004)
+    aids = [
+        OpticalFlow(0.1),
+        TimeOfFlight(resolution=None),
+        UWB(ANCHORS, 0.1),
+        UWB(ANCHORS, 0.1, tdoa=True, name="tdoa"),
+        sensors.Lighthouse([(-2, -2, 2.5)], [(0, 0.5, 0.8)], 1e-3),
+        sensors.GPS(0.5),
+        sensors.Barometer(1.0),
+        sensors.Magnetometer((2e-5, 0.0, -4.5e-5), Triad(noise=5e-7)),
+    ]
+    effects = [Wind((1.0, 0.0, 0.0), 7.7), Downwash(), GroundEffect(), Battery(), Latency(2), RangeFinder()]
+    others = [sensors.MultiRanger(0.01), sensors.RotorSpeeds(5.0), sensors.BatteryVoltage(0.01)]
+    watching = ESKF([imu, tracked, *aids], control=False)
+    return [*effects, *others, imu, tracked, *aids, Kalman([imu, tracked]), watching]
+
+
+def is_float(x):
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def pushed(stage):
+    """Return a function from data, and the slopes of its real numbers, to those after a stage."""
+
+    def run(data, slopes):
+        leaves, tree = jax.tree.flatten(data)
+
+        def real(numbers):
+            rest = iter(numbers)
+            after = jax.tree.leaves(stage(tree.unflatten([next(rest) if is_float(x) else x for x in leaves])))
+            return [x for x in after if is_float(x)], after
+
+        _, slopes, after = jax.jvp(real, ([x for x in leaves if is_float(x)],), (slopes,), has_aux=True)
+        return tree.unflatten(after), slopes
+
+    # Nothing is optimised: to compile takes longer than to run.
+    return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@pytest.mark.parametrize("plugins", [filters, pytest.param(everything, marks=pytest.mark.slow)])
+def test_law_08_slopes_are_central_differences(plugins, x64):
+    """Of every real number of the data, by the states at the start, with the stages as they are written.
+
+    Each stage is compiled alone, forwards; a gradient is its transpose. Differences are off by their step squared, and
+    by rounding of the largest numbers: of pressures of 1e5 Pa, and of a battery's charge that hardly changes.
+    """
+    sim = Sim(n_drones=2, control="state", engine="plain")
+    for plugin in plugins():
+        sim.add(plugin)
+    pos = jnp.array([[[0.2, 0.1, 0.3], [0.25, 0.05, 0.9]]])
+    sim.state_control(pos=np.asarray(pos) + 0.1)
+    start = {
+        "pos": pos,
+        "vel": jnp.full((1, 2, 3), 0.3),
+        "quat": jnp.tile(jnp.array([0.1, -0.05, 0.2, 1.0]), (1, 2, 1)),
+        "ang_vel": jnp.tile(jnp.array([0.4, -0.5, 0.6]), (1, 2, 1)),
+        "rotor_vel": jnp.full((1, 2, 4), 15_000.0),
+    }
+    rng = np.random.default_rng(1)
+    sizes = {name: 100.0 if name == "rotor_vel" else 0.1 for name in start}
+    directions = {name: jnp.asarray(sizes[name] * rng.normal(size=x.shape)) for name, x in start.items()}
+    stages = [pushed(stage) for stage in as_stages(sim.step_pipeline)]
+
+    def begin(x):
+        quat = x["quat"] / jnp.linalg.norm(x["quat"], axis=-1, keepdims=True)
+        return sim.data.replace(states=sim.data.states.replace(**x | {"quat": quat}))
+
+    def flown(x):
+        """Return the real numbers of the data after some steps, by their names, and their slopes."""
+        data = begin(x)
+        _, slopes = jax.jvp(
+            lambda x: [leaf for leaf in jax.tree.leaves(begin(x)) if is_float(leaf)], (x,), (directions,)
+        )
+        for _ in range(STEPS):
+            for stage in stages:
+                data, slopes = stage(data, slopes)
+        return {jax.tree_util.keystr(k): x for k, x in jax.tree.leaves_with_path(data) if is_float(x)}, slopes
+
+    values, slopes = flown(start)
+    ends = [flown({k: x + h * directions[k] for k, x in start.items()})[0] for h in (DIFFERENCE, -DIFFERENCE)]
+    compared = set()
+    for (name, value), slope in zip(values.items(), slopes, strict=True):
+        difference = np.asarray(ends[0][name] - ends[1][name]) / (2 * DIFFERENCE)
+        size = max(np.abs(x).max(initial=0.0) for x in (np.asarray(slope), difference))
+        rounding = 1e-15 * np.abs(value).max(initial=0.0) / DIFFERENCE
+        if size > SMALL:
+            assert np.abs(slope - difference).max() < 1e-6 * size + rounding, name
+            compared.add(name)
+    own = {name for name, plugin in sim.plugins.items() if hasattr(plugin, "channels")} | {"kalman", "eskf"}
+    assert own <= {name.split("'")[1] for name in compared if name.startswith(".plugins")}
+    assert {".states.pos", ".states.rotor_vel", ".plugins['eskf'].estimate.gyro_bias"} <= compared
