@@ -93,8 +93,9 @@ def read_log(
         columns = next((c for c in reversed(KNOWN.values()) if not missing(table, c)), KNOWN["crazysim"])
     columns = numbered(table, columns)
     if absent := missing(table, columns):
+        slow = "".join(f", and {x}" for x in repairs if x.startswith("left out a slow stream"))
         raise ConfigError(
-            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them, as in "
+            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}{slow}. Name them, as in "
             "--columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the flight (--motion)."
         )
     factors = {

@@ -180,6 +180,8 @@ def test_ulogs_lack_what_is_not_logged_or_slow(tmp_path):
     assert log.rotor_vel.shape[1] == 0
     assert "esc_status every 0.2 s or more often, got every 0.25 s" in log.repairs[0]
     assert any("differentiated the attitude" in x for x in log.repairs)
+    with pytest.raises(ConfigError, match=r"columns rpm2, rpm1, .* a slow stream: expected esc_status"):
+        read_log(tmp_path / "a.ulg", Columns(rotor_vel=("rpm2", "rpm1", "rpm3", "rpm4")))
     with pytest.raises(ConfigError, match=r"vehicle_attitude every 0\.2 s"):
         read_log(ulog(tmp_path / "b.ulg", slow=["vehicle_attitude"]))
     with pytest.raises(ConfigError, match="expected messages vehicle_attitude, got 5 others"):
