@@ -56,7 +56,7 @@ SENSORS: dict[str, Build] = {
     "uwb": lambda: [sensors.UWB(CORNERS, 0.1)],
     "lighthouse": lambda: [sensors.Lighthouse(*STATIONS, 1e-3)],
     "barometer": lambda: [sensors.Barometer(1.0)],
-    "magnetometer": lambda: [sensors.Magnetometer((0.1, 0.2, -0.45), sensors.Triad(noise=1e-3))],
+    "magnetometer": lambda: [sensors.Magnetometer((0.0, 2e-5, -4.5e-5), sensors.Triad(noise=5e-7))],
     "gps": lambda: [sensors.GPS(0.5)],
     "rotor_speeds": lambda: [sensors.RotorSpeeds(5.0)],
     "battery_voltage": lambda: [Battery(), sensors.BatteryVoltage(0.01)],
