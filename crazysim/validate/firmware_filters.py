@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.plugins.estimators import complementary as law
-from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators import error_state, updates
 from crazysim.validate.firmware_controllers import VECTORS
 from crazysim.validate.rows import Row
 
@@ -29,28 +29,27 @@ NOISE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4
 
 def measured(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, station: Any) -> Any:
     """Return the estimate after the measurements of a loop, as tests/plugins/estimators/record_filter.py takes them."""
-    find = error_state
     if kind in ("position", "ground"):
-        return find.select(k % 10 == 5, find.update_pos(estimate, m[:3], 0.01), estimate)
+        return error_state.select(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
     if kind == "pose":
-        after = find.update_quat(find.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
-        return find.select(k % 10 == 0, after, estimate)
+        after = updates.update_quat(updates.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
+        return error_state.select(k % 10 == 0, after, estimate)
     if kind == "flow":
-        after = find.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
-        estimate = find.select(k % 10 == 3, after, estimate)
-        return find.select(k % 25 == 10, find.update_range(estimate, rot, m[2], 0.02), estimate)
+        after = updates.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
+        estimate = error_state.select(k % 10 == 3, after, estimate)
+        return error_state.select(k % 25 == 10, updates.update_range(estimate, rot, m[2], 0.02), estimate)
     if kind == "sweep":
-        estimate = find.select(k == 2, find.update_pos(estimate, m[:3], 0.01), estimate)
+        estimate = error_state.select(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
         for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
-            after = find.update_sweep(estimate, rot, jnp.asarray(DIODE), station, tilt, m[0], 0.001)
-            estimate = find.select(k % 8 == first, after, estimate)
+            after = updates.update_sweep(estimate, rot, jnp.asarray(DIODE), station, tilt, m[0], 0.001)
+            estimate = error_state.select(k % 8 == first, after, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), m[1].astype(int)
     if kind == "distance":
-        after = find.update_distance(estimate, anchors[a], m[0], 0.25)
+        after = updates.update_distance(estimate, anchors[a], m[0], 0.25)
     else:
-        after = find.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
-    return find.select(k % 5 == 0, after, estimate)
+        after = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
+    return error_state.select(k % 5 == 0, after, estimate)
 
 
 def kalman(kind: str) -> tuple[NDArray, NDArray]:

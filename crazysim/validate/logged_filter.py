@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.errors import ConfigError
-from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.kalman import DEVIATIONS
 from crazysim.validate.closed_loop import LOST, columns_of, commanded_samples
 from crazysim.validate.flights import logs
@@ -87,8 +87,8 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
     def tick(estimate: error_state.Estimate, x: Any) -> tuple[Any, Any]:
         force, rate, where, attitude = x
         estimate = error_state.add_noise(error_state.predict(estimate, force, rate, PERIOD), noise)
-        estimate = error_state.update_pos(estimate, where, DEVIATIONS["pos"])
-        estimate = error_state.finalize(error_state.update_quat(estimate, attitude, DEVIATIONS["quat"]))
+        estimate = updates.update_pos(estimate, where, DEVIATIONS["pos"])
+        estimate = error_state.finalize(updates.update_quat(estimate, attitude, DEVIATIONS["quat"]))
         return estimate, (estimate.pos, estimate.quat)
 
     start = error_state.start(pos[0], jnp.zeros(3), quat[0], (100, 100, 1, *[0.01] * 6))

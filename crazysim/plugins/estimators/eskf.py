@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Simulation, per_drone
 from crazysim.core.stage import Stage, at_the_start
-from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
@@ -170,15 +170,15 @@ def _size(*deviations: Array | float, least: float = LEAST) -> Array:
 
 def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
-    estimate = _finalized(error_state.update_pos(estimate, sensor.part(data, "pos"), _size(record.noise)))
-    return error_state.update_quat(estimate, sensor.part(data, "quat"), _size(record.angle_noise))
+    estimate = _finalized(updates.update_pos(estimate, sensor.part(data, "pos"), _size(record.noise)))
+    return updates.update_quat(estimate, sensor.part(data, "quat"), _size(record.angle_noise))
 
 
 def _satellites(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     std = _size(record.noise, record.drift)
-    estimate = _finalized(error_state.update_pos(estimate, sensor.part(data, "pos"), std))
-    return error_state.update_vel(estimate, sensor.part(data, "vel"), _size(record.vel_noise))
+    estimate = _finalized(updates.update_pos(estimate, sensor.part(data, "pos"), std))
+    return updates.update_vel(estimate, sensor.part(data, "vel"), _size(record.vel_noise))
 
 
 def _pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
@@ -197,19 +197,19 @@ def _field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) ->
     noise = errors.noise * math.sqrt(0.5 / sensor.interval(data))
     std = _size(*(x / size for x in (noise, errors.spread[:3], errors.instability)))
     measured = rotation.rotate(record.quat, sensor.part(data, "field") - errors.mean[:3]) / size
-    return error_state.update_direction(estimate, measured, record.field / size, std)
+    return updates.update_direction(estimate, measured, record.field / size, std)
 
 
 def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
     scale, rot = sensor.interval(data) * record.scale[0], rotation.matrix(estimate.quat)
-    return error_state.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _size(record.noise[0]))
+    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _size(record.noise[0]))
 
 
 def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, distance = sensor.read(data), sensor.latest(data)
     std = _size(record.noise + range_deviation(distance, record.far_noise))
-    after = error_state.update_ray(estimate, distance[0], std[0])
+    after = updates.update_ray(estimate, distance[0], std[0])
     return error_state.select(distance[0] < record.max_range[0], after, estimate)
 
 
@@ -217,9 +217,9 @@ def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estima
     record, measured = sensor.read(data), sensor.latest(data)
     std = _size(record.noise[0])
     if sensor.tdoa:
-        return error_state.update_differences(estimate, record.anchors, measured, std)
+        return updates.update_differences(estimate, record.anchors, measured, std)
     for k in range(measured.shape[0]):
-        estimate = error_state.update_distance(estimate, record.anchors[k], measured[k], std)
+        estimate = updates.update_distance(estimate, record.anchors[k], measured[k], std)
     return estimate
 
 

@@ -15,7 +15,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
-from crazysim.plugins.estimators import error_state
+from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.sensors.beacons import SWEEP_TILTS, UWB, Lighthouse
@@ -182,20 +182,20 @@ class Kalman(ErrorStateFilter):
 
 
 def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
-    estimate = error_state.update_pos(estimate, sensor.part(data, "pos"), std["pos"])
-    return error_state.update_quat(estimate, sensor.part(data, "quat"), std["quat"])
+    estimate = updates.update_pos(estimate, sensor.part(data, "pos"), std["pos"])
+    return updates.update_quat(estimate, sensor.part(data, "quat"), std["quat"])
 
 
 def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     scale = sensor.interval(data) * sensor.read(data).scale[0]
     gyro = imu.measured_states(data)["ang_vel"]
-    return error_state.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, std["flow"])
+    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, std["flow"])
 
 
 def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     distance = sensor.latest(data)
     deviation = range_deviation(distance, std["range"])[0]
-    after = error_state.update_range(estimate, rot, distance[0], deviation)
+    after = updates.update_range(estimate, rot, distance[0], deviation)
     return error_state.select(distance[0] < sensor.read(data).max_range[0], after, estimate)
 
 
@@ -203,11 +203,9 @@ def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Arra
     anchors, measured = sensor.read(data).anchors, sensor.latest(data)
     for k in range(measured.shape[0]):
         if sensor.tdoa:
-            estimate = error_state.update_difference(
-                estimate, anchors[0], anchors[k + 1], measured[k], std["difference"]
-            )
+            estimate = updates.update_difference(estimate, anchors[0], anchors[k + 1], measured[k], std["difference"])
         else:
-            estimate = error_state.update_distance(estimate, anchors[k], measured[k], std["distance"])
+            estimate = updates.update_distance(estimate, anchors[k], measured[k], std["distance"])
     return estimate
 
 
@@ -218,9 +216,7 @@ def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot
         for diode in system.diodes:
             for plane, tilt in enumerate(SWEEP_TILTS):
                 station = pos, rotation.matrix(quat)
-                after = error_state.update_sweep(
-                    estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"]
-                )
+                after = updates.update_sweep(estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"])
                 estimate = error_state.select(visible[k] > 0, after, estimate)
             k += 1
     return estimate

@@ -7,7 +7,7 @@ import pytest
 from consistency import assert_chi_squared, errors, normalised
 
 from crazysim import ConfigError, Sim, rotation
-from crazysim.plugins.estimators import ESKF, error_state
+from crazysim.plugins.estimators import ESKF, error_state, updates
 from crazysim.plugins.sensors import (
     GPS,
     IMU,
@@ -96,11 +96,11 @@ MEASURED = {
 }
 """Measurements of a state, by kind."""
 UPDATES = {
-    "vel": lambda at, z, rot, std: error_state.update_vel(at, z, std),
-    "direction": lambda at, z, rot, std: error_state.update_direction(at, z, KNOWN, std),
-    "flow": lambda at, z, rot, std: error_state.update_flow(at, rot, z, GYRO_NOW, jnp.asarray(SCALE), std),
-    "ray": lambda at, z, rot, std: error_state.update_ray(at, z[0], std),
-    "differences": lambda at, z, rot, std: error_state.update_differences(at, ANCHORS, z, std),
+    "vel": lambda at, z, rot, std: updates.update_vel(at, z, std),
+    "direction": lambda at, z, rot, std: updates.update_direction(at, z, KNOWN, std),
+    "flow": lambda at, z, rot, std: updates.update_flow(at, rot, z, GYRO_NOW, jnp.asarray(SCALE), std),
+    "ray": lambda at, z, rot, std: updates.update_ray(at, z[0], std),
+    "differences": lambda at, z, rot, std: updates.update_differences(at, ANCHORS, z, std),
 }
 
 

@@ -1,0 +1,217 @@
+"""Measurements that correct a filter with error states, as functions of one drone: the models of its aids.
+
+Those of the Crazyflie's firmware take the attitude ``rot`` of its loop before (the mm_*.c of
+bitcraze/crazyflie-firmware, commit 2a18fc29).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim import rotation
+from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate, select, update
+
+LOWEST = 0.1
+"""Least height that the flow is predicted for, m (mm_flow.c)."""
+LOWEST_COSINE = 0.1
+"""Least cosine of the tilt at which a distance to the ground is used (mm_tof.c)."""
+HALF_CONE = 0.5 * 15 * math.pi / 180
+"""Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
+
+
+def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured position, world frame, m, (3,), of a standard deviation, m. () or (3,)"""
+    for k, std in enumerate(_each(deviation)):
+        estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], std)
+    return estimate
+
+
+def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured velocity, world frame, m/s, (3,), of a standard deviation. () or (3,)"""
+    rot = rotation.matrix(estimate.quat)
+    for k, std in enumerate(_each(deviation)):
+        across = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
+        predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(across, estimate.att_error)[0]
+        estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], across]), vel[k] - predicted, std)
+    return estimate
+
+
+def update_direction(estimate: Estimate, direction: Array, known: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured direction, such as that of a magnetic field.
+
+    Args:
+        estimate: The estimate.
+        direction: Measured direction, body frame; its length is that of ``known`` but for errors. (3,)
+        known: The direction, world frame, unit. (3,)
+        deviation: Standard deviation along each axis, rad. () or (3,)
+    """
+    predicted = rotation.rotate_inverse(estimate.quat, known)
+    slopes = rotation.cross_matrix(predicted)
+    for k, std in enumerate(_each(deviation)):
+        error = direction[k] - predicted[k] - rotation.dot(slopes[k], estimate.att_error)[0]
+        estimate = update(estimate, ATT, slopes[k], error, std)
+    return estimate
+
+
+def update_quat(estimate: Estimate, quat: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured attitude, body to world, unit, xyzw, (4,).
+
+    Its standard deviation about each axis is in rad. () or (3,)
+    """
+    residual = rotation.multiply(rotation.conjugate(estimate.quat), quat)
+    error = 2 * residual[:3] / residual[3]
+    for k, std in enumerate(_each(deviation)):
+        estimate = update(estimate, [ATT[k]], jnp.ones_like(quat[:1]), error[k], std)
+    return estimate
+
+
+def update_flow(
+    estimate: Estimate, rot: Array, flow: Array, gyro: Array, scale: Array, deviation: Array | float
+) -> Estimate:
+    """Return the estimate after a measured motion of the image of the ground.
+
+    Args:
+        estimate: The estimate.
+        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        flow: Motion of the image along x and y of the body, pixels. (2,)
+        gyro: Angular velocity as measured, body frame, rad/s. (3,)
+        scale: Pixels by which the image moves at 1 rad/s. ()
+        deviation: Standard deviation of a motion, pixels.
+    """
+    for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
+        height = jnp.maximum(estimate.pos[2], LOWEST)
+        rate = rot[2, 2] / height
+        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-estimate.vel[k] * rate / height, rate]
+        if estimate.gyro_bias is not None:
+            turn = turn - estimate.gyro_bias[axis]
+            rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(rate, -sign)]
+        predicted = scale * (estimate.vel[k] * rate + sign * turn)
+        estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
+    return estimate
+
+
+def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured distance to the floor, m; a drone tilted by 84 degrees measures none.
+
+    Args:
+        estimate: The estimate.
+        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        distance: Shortest distance within the cone of the sensor. ()
+        deviation: Standard deviation of the distance, m.
+    """
+    upright = rot[2, 2] > LOWEST_COSINE
+    cosine = jnp.where(upright, rot[2, 2], 1.0)
+    tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum(1 - cosine**2, 0.0)), cosine)
+    gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE, 0.0))
+    after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
+    return select(upright, after, estimate)
+
+
+def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured distance to level ground at z = 0 along the negative z axis of the body.
+
+    Args:
+        estimate: The estimate.
+        distance: The distance, m; a drone tilted by 84 degrees measures none. ()
+        deviation: Standard deviation of the distance, m.
+    """
+    down = rotation.matrix(estimate.quat)[2]
+    sees = down[2] > LOWEST_COSINE
+    gain = 1 / jnp.where(sees, down[2], 1.0)
+    predicted = gain * estimate.pos[2]
+    h = gain * jnp.stack([jnp.ones_like(gain), predicted * down[1], -predicted * down[0]])
+    return select(sees, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate)
+
+
+def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after a measured distance, m, () to an anchor, world frame, m. (3,)"""
+    apart = estimate.pos - anchor
+    predicted = rotation.safe_norm(apart)
+    away = predicted > 0
+    direction = jnp.where(away, apart / jnp.where(away, predicted, 1.0), jnp.asarray([1.0, 0.0, 0.0], apart.dtype))
+    return update(estimate, POS, direction, distance - predicted[0], deviation)
+
+
+def update_difference(
+    estimate: Estimate, first: Array, second: Array, difference: Array, deviation: Array | float
+) -> Estimate:
+    """Return the estimate after a measured difference of distances to two anchors, m.
+
+    Args:
+        estimate: The estimate.
+        first: Position of the first anchor, world frame, m. (3,)
+        second: Position of the second anchor. (3,)
+        difference: Distance to the second minus distance to the first. ()
+        deviation: Standard deviation of the difference, m.
+    """
+    to_first, to_second = estimate.pos - first, estimate.pos - second
+    d_first, d_second = rotation.safe_norm(to_first), rotation.safe_norm(to_second)
+    away = (d_first > 0) & (d_second > 0)
+    h = to_second / jnp.where(away, d_second, 1.0) - to_first / jnp.where(away, d_first, 1.0)
+    after = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
+    return select(away[0], after, estimate)
+
+
+def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
+    """Return the estimate after measured differences of distances to that to the first anchor, all at one time.
+
+    They have the errors of the first distance in common. A distance minus the mean of those before it is a combination
+    of the differences whose errors are independent, with k distances before it of the variance ``1 + 1 / k``.
+
+    Args:
+        estimate: The estimate.
+        anchors: Positions of the anchors, world frame, m. (n, 3)
+        differences: Distances to all anchors but the first minus the distance to the first, m. (n - 1,)
+        deviation: Standard deviation of a distance, m.
+    """
+    at, apart = estimate.pos, estimate.pos - anchors
+    distance = rotation.safe_norm(apart)
+    direction = apart / jnp.where(distance > 0, distance, 1.0)
+    for k in range(1, anchors.shape[0]):
+        h = direction[k] - jnp.sum(direction[:k], axis=0) / k
+        predicted = distance[k, 0] - jnp.sum(distance[:k]) / k + jnp.dot(h, estimate.pos - at)
+        measured = differences[k - 1] - jnp.sum(differences[: k - 1]) / k
+        estimate = update(estimate, POS, h, measured - predicted, math.sqrt(1 + 1 / k) * deviation)
+    return estimate
+
+
+def update_sweep(
+    estimate: Estimate,
+    rot: Array,
+    sensor: Array,
+    station: tuple[Array, Array],
+    tilt: float,
+    angle: Array,
+    deviation: Array | float,
+) -> Estimate:
+    """Return the estimate after a measured angle of a light plane that sweeps over the drone.
+
+    Args:
+        estimate: The estimate.
+        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        sensor: Position of the sensor, body frame, m. (3,)
+        station: Position of the station, world frame, m, (3,) and its attitude, station to world, as a matrix. (3, 3)
+        tilt: Tilt of the plane, rad.
+        angle: The angle of the sweep, rad. ()
+        deviation: Standard deviation of the angle, rad.
+    """
+    place, frame = station
+    x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - place)
+    tangent, squared = math.tan(tilt), x * x + y * y
+    rest = squared - (z * tangent) ** 2
+    sees = rest > 1e-4
+    squared, rest = jnp.where(sees, squared, 1.0), jnp.where(sees, rest, 1.0)
+    ratio = jnp.where(sees, z * tangent, 0.0) / jnp.sqrt(squared)
+    predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt(1 - ratio**2))
+    q = tangent / jnp.sqrt(rest)
+    h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
+    return select(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
+
+
+def _each(deviation: Array | float) -> Sequence[Array | float]:
+    """Return the standard deviation of each of three axes."""
+    return [deviation] * 3 if jnp.ndim(deviation) == 0 else [deviation[k] for k in range(3)]  # type: ignore[index]
