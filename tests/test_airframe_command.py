@@ -28,6 +28,13 @@ def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
     assert main(["airframe", "check", str(path), "--picture", str(picture)]) == 0
     found = rows(capsys.readouterr().out)
     assert found["wheelbase"] == "240 mm, the largest distance of two rotors"  # twice the arm
+    assert [found[f"rotor {k}"].split("; turns ")[1].split()[0] for k in range(1, 5)] == [
+        "counter-clockwise",
+        "clockwise",
+    ] * 2
+    assert {found[f"rotor {k}"].split(";")[0] for k in range(1, 5)} == {  # 120 mm over the root of two
+        f"85 mm {a}, 85 mm {b}" for a in ("forward", "back") for b in ("left", "right")
+    }
     assert found["thrust over weight"] == "4.00"
     assert found["hover"] == "25% of the largest thrust"
     assert found["tilt at full thrust"] == "holds height up to 76 degrees"  # arccos(1 / 4) = 75.5 degrees

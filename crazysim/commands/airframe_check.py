@@ -84,6 +84,11 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     positions = airframe.value("rotors.position")
     wheelbase = np.max(np.linalg.norm(positions[:, None] - positions, axis=-1))
     yield "wheelbase", f"{1000 * wheelbase:.0f} mm, the largest distance of two rotors"
+    signs = airframe.value("rotors.yaw_torque_sign")
+    for number, ((x, y, _), sign) in enumerate(zip(1000 * positions, signs, strict=True), 1):
+        place = f"{abs(x):.0f} mm {'forward' if x > 0 else 'back'}, {abs(y):.0f} mm {'left' if y > 0 else 'right'}"
+        sense = "counter-clockwise" if sign < 0 else "clockwise"
+        yield f"rotor {number}", f"{place}; turns {sense} seen from above"
     yield "thrust over weight", f"{ratio:.2f}"
     yield "hover", f"{1 / ratio:.0%} of the largest thrust"
     yield "tilt at full thrust", f"holds height up to {np.degrees(np.arccos(1 / ratio)):.0f} degrees"
@@ -118,7 +123,7 @@ def _battery(airframe: Airframe) -> str:
     if keys:
         return f"lacks {', '.join(keys)} in [battery] for Battery() without arguments"
     cells, capacity, resistance = (float(airframe.value(f"battery.{k}")) for k in ("cells", "capacity", "resistance"))
-    return f"{cells:.0f} cells, {capacity:.3g} A h, {resistance:.3g} ohm"
+    return f"{cells:.0f} cell{'s' * (cells != 1)}, {capacity:.3g} A h, {resistance:.3g} ohm"
 
 
 def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:

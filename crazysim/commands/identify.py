@@ -96,8 +96,7 @@ def run(options: argparse.Namespace) -> None:
         _write(options.out, text)
         return
     result = identify(logs, options.airframe, mass=options.mass)
-    for name, x in result.values.items():
-        print(f"{name:20}{x:12.4g} +- {result.deviations[name]:.2g}")
+    print("\n".join(result.describe()))
     logs = [aligned(log, result.delays[log.name]) for log in logs]
     held_out = [aligned(log, fast_rotation([log], result.model.params).delays[0]) for log in held_out]
     models = {

@@ -94,11 +94,17 @@ def _columns(log: Log) -> dict[str, NDArray]:
         ConfigError: If the log has no attitude commands or has gaps.
     """
     cmd = log.attitude_command
-    if cmd is None or len(log.gaps):
+    if cmd is None:
         raise ConfigError(
-            f"{log.name}: expected attitude commands and no gaps, got "
-            f"{'none' if cmd is None else f'{len(log.gaps)} gaps'}. "
-            "Name roll, pitch, yaw and thrust as attitude_command, and cut the log at gaps."
+            f"{log.name}: expected attitude commands, got none. Name roll, pitch, yaw and thrust as attitude_command."
+        )
+    if len(log.gaps):
+        ends = np.array([0, *log.gaps, len(log.t)])
+        longest = int(np.argmax(log.t[ends[1:] - 1] - log.t[ends[:-1]]))
+        first, last = log.t[ends[longest]], log.t[ends[longest + 1] - 1]
+        raise ConfigError(
+            f"{log.name}: expected no gaps, got {len(log.gaps)}. Cut the log: its longest piece without gaps is "
+            f"from t = {first:.6g} to {last:.6g} s."
         )
     return {"time": log.t, "pos": log.pos, "quat": log.quat, "cmd_rpy": cmd[:, :3], "cmd_f": cmd[:, 3]}
 

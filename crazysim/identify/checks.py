@@ -256,16 +256,18 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
         scaled(pos=down, vel=down, quat=(*down, 1), ang_vel=down),
     )
     yield "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz", scaled(pos=(1, 1, -1), vel=(1, 1, -1))
-    for key, word in (("vel", "velocity"), ("ang_vel", "angular velocity"), ("pos", "position")):
+    for key, word, unit, given in (
+        ("vel", "velocity", 1.0, ""),
+        ("ang_vel", "angular velocity", 1.0, ""),
+        ("ang_vel", "angular velocity", degrees, f" and rad_per_unit={degrees:.6g}"),
+        ("pos", "position", 1.0, ""),
+    ):
         if key in derived:
             continue
         for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
             fields = getattr(Columns(), key)
             names = ",".join(("-" if sign < 0 else "") + fields[k] for k, sign in zip(order, signs, strict=True))
             yield (
-                f"The {word} fits as {key}={names}, with names of your columns",
-                {
-                    **data,
-                    key: data[key][:, order] * signs,
-                },
+                f"The {word} fits as {key}={names}{given}, with names of your columns",
+                {**data, key: data[key][:, order] * signs * unit},
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from crazysim.identify.logs import Log
 from crazysim.identify.motion import integral
 from crazysim.identify.motors import motor_lag, with_speeds
 from crazysim.identify.prediction import Model, windows
-from crazysim.identify.rotation import BLOCK, aligned, fast_rotation, median
+from crazysim.identify.rotation import BLOCK, FEWEST, aligned, fast_rotation, median
 from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
 from crazysim.rotation import rotate, rotate_inverse
 
@@ -40,9 +41,13 @@ FORCES = (
 )  # fmt: skip
 """Parameters of the force: a factor, and coefficients in N s/m and N s^2/m^2."""
 TORQUES = (
-    "centre of mass x", "centre of mass y", "torque z", *(f"torque_per_vel {a}{b}" for a in "xyz" for b in "xyz"),
+    "centre of mass x", "centre of mass y", "torque z", *(f"torque {a} per velocity {b}" for a in "xyz" for b in "xyz"),
 )  # fmt: skip
 """Parameters of the torque, m, N m and N s."""
+UNITS = dict(
+    zip((*FORCES, *TORQUES), ("", *["N s/m"] * 3, *["N s^2/m^2"] * 3, "m", "m", "N m", *["N s"] * 9), strict=True)
+)
+"""Units of these parameters; empty for factors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +64,8 @@ class Identification:
     """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, of logs with
     commands and measured speeds."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between blocks or windows."""
+    """Standard deviations of the parameters, from the scatter between blocks of 10 s; NaN of fewer than three blocks,
+    and zero of drag that is at its limit of zero."""
     delays: dict[str, float]
     """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
@@ -73,6 +79,12 @@ class Identification:
                 changes[f"residual.{key}"] = np.asarray(x, np.float64)
         airframe = load_airframe(_nested(self.base, self.airframe.name.removesuffix("_identified"), changes))
         return replace(self, airframe=airframe, model=Model.create(airframe), changes=changes)
+
+    def describe(self) -> list[str]:
+        """Return a line for each parameter: name, value, standard deviation and unit."""
+        units = UNITS | {"motor lag": "1/s"}
+        spreads = {key: "unknown" if math.isnan(x) else f"{x:.2g}" for key, x in self.deviations.items()}
+        return [f"{key:26}{x:10.4g} +- {spreads[key]} {units.get(key, '')}".rstrip() for key, x in self.values.items()]
 
     @property
     def doubtful(self) -> list[str]:
@@ -105,7 +117,7 @@ class Identification:
             numbers = np.reshape(text, value.shape).tolist()
             lines.append(f'{key} = {{ value = {numbers}, unit = "{units[path]}", source = "flights" }}')
         lines += ["", "# Every parameter with its standard deviation."]
-        lines += [f"# {name}: {x:.4g} +- {self.deviations[name]:.2g}" for name, x in self.values.items()]
+        lines += [f"# {line}" for line in self.describe()]
         return "\n".join(lines) + "\n"
 
 
@@ -263,7 +275,8 @@ def _regressed(
     score = np.einsum("wri,wr,wr->wi", x, weights, rest)
     each = np.stack([score[block == b].sum(axis=0) for b in np.unique(block)])
     inverse = np.linalg.pinv(normal, hermitian=True)
-    return found, np.sqrt(np.diag(inverse @ (each.T @ each) @ inverse)) * free
+    spread = np.sqrt(np.diag(inverse @ (each.T @ each) @ inverse))
+    return found, np.where(free, spread if len(each) >= FEWEST else np.nan, 0.0)
 
 
 def _smooth(x: NDArray, size: int = 9) -> NDArray:

@@ -136,10 +136,10 @@ def read_log(
     derived = tuple(key for key in ("vel", "ang_vel") if key not in data)
     if "vel" in derived:
         data["vel"] = capture.velocity_of(t, data["pos"])
-        repairs.append("differentiated the position, for want of a velocity")
+        repairs.append("differentiated the position, since the log has no velocity")
     if "ang_vel" in derived:
         data["ang_vel"] = capture.ang_vel_of(t, data["quat"])
-        repairs.append("differentiated the attitude, for want of an angular velocity")
+        repairs.append("differentiated the attitude, since the log has no angular velocity")
     keep = check_motion(name, t, data, (*derived, *(["quat"] if columns.rpy else [])), repairs)
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if "voltage" in data:

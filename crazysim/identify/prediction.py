@@ -250,7 +250,7 @@ def prediction_errors(
 
 def errors_table(errors: dict[str, NDArray], horizons: Sequence[float] = HORIZONS) -> str:
     """Return errors as a table of text."""
-    head = f"{'Error after':48}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
+    head = f"{'RMSE, or mean error, after':48}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
     unit = {"p": "m", "a": "degrees"}
     return "\n".join(
         [head, *(f"{f'{k}, {unit[k[0]]}':48}" + "".join(f"{x:10.4g}" for x in v) for k, v in errors.items())]

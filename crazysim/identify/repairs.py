@@ -119,7 +119,9 @@ def gaps_of(name: str, t: NDArray, repairs: list[str]) -> NDArray:
         longest = float(np.max(steps[gaps - 1]))
         if longest > 10 * (t[-1] - t[0] - longest):
             raise ConfigError(f"{name}: expected one flight, got a pause of {longest:.3g} s. Cut the log into flights.")
-        repairs.append(f"{len(gaps)} gaps, the longest {longest:.3g} s; no prediction crosses them")
+        repairs.append(
+            f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, the longest {longest:.3g} s; no prediction crosses them"
+        )
     return gaps
 
 

@@ -11,6 +11,7 @@ Commands are free of that: where a log has them, they are the instruments of two
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -29,6 +30,8 @@ LAGS = 0.15
 """Duration of the response from commands to rotor speeds, s."""
 BLOCK = 10.0
 """Duration of the blocks of a log that are solved for themselves, each with a delay of its own, s."""
+FEWEST = 3
+"""Fewest blocks whose scatter gives a standard deviation."""
 LONGEST = 0.04
 """Largest delay, s."""
 
@@ -95,7 +98,10 @@ def aligned(log: Log, delay: float) -> Log:
 
 
 def median(x: NDArray, variance: NDArray) -> tuple[float, float]:
-    """Return the median, weighted by inverse variances, and its standard deviation from the scatter."""
+    """Return the median, weighted by inverse variances, and its standard deviation from the scatter.
+
+    The standard deviation is NaN for fewer than ``FEWEST`` numbers.
+    """
     weight = 1 / np.maximum(variance, 0.25 * np.median(variance))  # so that no single block decides
 
     def middle(x: NDArray) -> float:
@@ -103,6 +109,8 @@ def median(x: NDArray, variance: NDArray) -> tuple[float, float]:
         return float(x[order][np.searchsorted(np.cumsum(weight[order]), 0.5 * np.sum(weight))])
 
     center = middle(x)
+    if len(x) < FEWEST:
+        return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
     # 1.4826: from the median absolute to the standard deviation; 1.2533: of the median over that of the mean (Gauss).
     return center, 1.4826 * 1.2533 * middle(np.abs(x - center)) / np.sqrt(count)

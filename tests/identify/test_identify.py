@@ -1,5 +1,6 @@
 """Identification finds the airframe that made a log, and refuses or repairs bad logs."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -124,6 +125,8 @@ def test_command_writes_an_airframe(flights, tmp_path, capsys):
     assert "between 5 and 6 s, got 0" in printed.err
     assert "held-out logs" in printed.out
     assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+    # One block of 10 s.
+    assert re.search(r"^drag z +-[0-9.]+ \+- unknown N s/m$", printed.out, re.MULTILINE)
     sim = Sim(drone=out, control="rotor_vel")
     sim.add(Residual())
     assert sim.data.plugins["residual"].output.shape == (6, 4)
@@ -154,7 +157,7 @@ def test_time_that_goes_back_is_dropped(flights):
 def test_gaps_are_reported(flights):
     read = read_log({k: np.delete(x, np.arange(200, 230)) for k, x in flights[0].items()})
     assert read.gaps.tolist() == [200]
-    assert "1 gaps" in read.repairs[0]
+    assert "1 gap, the longest" in read.repairs[0]
 
 
 def test_nan_is_interpolated_or_refused(flights):
@@ -225,7 +228,11 @@ UNITS = [
     (dict.fromkeys(("vx", "vy", "vz"), 1e3), "velocity seems to be in mm/s: give speed_per_unit=0.001"),
     (dict.fromkeys(("wx", "wy", "wz"), 180 / np.pi), "degrees per second: give rad_per_unit=0.0174533"),
     ({"vx": -1}, "velocity fits as vel=-vx,vy,vz"),
-    ({"wy": -1}, "angular velocity fits as ang_vel=wx,-wy,wz"),
+    ({"wy": -1}, "angular velocity fits as ang_vel=wx,-wy,wz, with"),
+    (
+        {"wx": 180 / np.pi, "wy": -180 / np.pi, "wz": -180 / np.pi},
+        "fits as ang_vel=wx,-wy,-wz and rad_per_unit=0.0174533",
+    ),
     ({"z": -1, "vz": -1}, "pos=x,y,-z vel=vx,vy,-vz"),
     (dict.fromkeys("y z vy vz qy qz wy wz".split(), -1), "z seems to point down, in world and body"),
     (dict.fromkeys(("qx", "qy", "qz"), -1), "world to body"),

@@ -8,7 +8,7 @@ from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing, state_variable_filter
 from crazysim.dynamics.utils.identification import sys_id_rotation, sys_id_translation
 from crazysim.errors import ConfigError
-from crazysim.identify import FittedModel, prediction_errors, read_log
+from crazysim.identify import FittedModel, identify_attitude, prediction_errors, read_log
 from crazysim.sim import Sim
 
 MODEL = "so_rpy_rotor_drag"
@@ -93,6 +93,13 @@ def test_a_residual_of_a_fitted_model_is_refused(flight, tmp_path, capsys):
     assert main(["identify", str(path), "--dynamics", MODEL, "--out", str(out), "--network", "0"]) != 0
     assert "Leave --network out" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_the_longest_piece_without_gaps_is_named(flight):
+    log = read_log({key: np.delete(x, [*range(300, 330), *range(900, 940)]) for key, x in flight.items()})
+    first, last = flight["t"][[940, -1]]
+    with pytest.raises(ConfigError, match=f"expected no gaps, got 2.*from t = {first:.6g} to {last:.6g} s"):
+        identify_attitude([log], "cf2x_L250", MODEL, "flight")
 
 
 def test_logs_without_commands_and_other_models_are_refused(flight, tmp_path, capsys):

@@ -88,7 +88,7 @@ def test_pauses_of_a_stream_are_gaps(tmp_path):
     log = read_log(crazyflie(tmp_path / "log00", pause=range(150, 220)), COLUMNS)
     assert len(log.gaps) == 1
     assert np.diff(log.t)[log.gaps[0] - 1] == pytest.approx(0.72, abs=0.02)
-    assert "gaps" in log.repairs[0]
+    assert "1 gap," in log.repairs[0]
 
 
 def test_compressed_attitudes_are_unpacked():

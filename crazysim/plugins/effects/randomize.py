@@ -156,11 +156,13 @@ class Randomize(Plugin):
             air_vel=per_drone(sim, 0.0, 3) if blows else None,
         )
         for name in (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay"):
-            limits = getattr(record, name)
-            if limits is not None and np.any(np.asarray(limits[..., 0]) > np.asarray(limits[..., 1])):
+            limits, given = getattr(record, name), getattr(self, name)
+            if limits is not None and np.ndim(given) == 0:
                 raise ConfigError(
-                    f"expected {name} as (low, high), got {getattr(self, name)!r}. Use the smaller number first."
+                    f"expected {name} as (low, high), got {given!r}. Use ({given}, {given}) for a fixed number."
                 )
+            if limits is not None and np.any(np.asarray(limits[..., 0]) > np.asarray(limits[..., 1])):
+                raise ConfigError(f"expected {name} as (low, high), got {given!r}. Use the smaller number first.")
         return record
 
     def check_plugins(self, sim: Simulation) -> None:

@@ -172,6 +172,8 @@ def test_a_task_flies_other_drones_in_every_episode():
 def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
     with pytest.raises(ConfigError, match=r"expected mass as \(low, high\), got \(1.1, 0.9\)"):
         build(mass=(1.1, 0.9))
+    with pytest.raises(ConfigError, match=r"mass as \(low, high\), got 0.1. Use \(0.1, 0.1\) for a fixed"):
+        build(mass=0.1)
     with pytest.raises(ConfigError, match="mass to be finite and positive"):
         build(mass=(-1.0, 0.9))
     with pytest.raises(ConfigError, match="mass as real numbers of shape"):
