@@ -14,7 +14,7 @@ Comparisons of crazysim with closed forms, other simulators, the Crazyflie's fir
 figures stay. This page is written, in a checkout of the sources, by
 
 ```sh
-pip install -e ".[demo]" {packages}
+pip install -e {packages}
 crazysim validate --data FOLDER --out docs/validation.md
 ```
 
@@ -65,7 +65,7 @@ def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: 
     if bad:
         summary += " Outside: " + "; ".join(row.what for row in bad) + "."
     packages = dict.fromkeys(name for section in sections for name in section.packages.values())
-    parts = [INTRODUCTION.format(packages=" ".join(packages)).strip(), made + summary]
+    parts = [INTRODUCTION.format(packages=" ".join(['".[demo]"', *packages])).strip(), made + summary]
     for section in sections:
         repeat = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.logs}`"
         if section.packages:

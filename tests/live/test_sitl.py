@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common
 from waiting import wait_for
 
 from crazysim import IMU, ConfigError, Sim
+from crazysim.drones import load_airframe
 from crazysim.live.sitl import ArduPilot, Betaflight, Measured, Origin, Px4, SoftwareInTheLoop
 from crazysim.live.sitl.loop import FIELD, motor_order
 from crazysim.live.sitl.measured import quat_ned
@@ -288,8 +289,13 @@ def test_each_motor_drives_the_rotor_at_its_place(link):
     link = object.__new__(link)  # no ports
     order = motor_order(airframe, link)
     assert [tuple(np.sign(p[:2])) for p in airframe.value("rotors.position")[order]] == list(link.positions)
-    with pytest.raises(ConfigError, match=rf"motors 1 to 4 of {type(link).__name__}.*Pass reversed=False, and set"):
+    with pytest.raises(ConfigError, match=rf"motors 1 to 4 of {type(link).__name__}.*Pass reversed=False, with the"):
         motor_order(airframe, link, reversed=True)
+    signs = {"yaw_torque_sign": (-airframe.value("rotors.yaw_torque_sign")).tolist()}
+    turned = load_airframe({"name": "turned", "base": airframe.name, "rotors": signs})
+    with pytest.raises(ConfigError, match=f"Pass reversed=True, and {link.remedy}"):
+        motor_order(turned, link)
+    np.testing.assert_array_equal(motor_order(turned, link, reversed=True), order)
 
 
 def test_wrong_settings_are_refused():

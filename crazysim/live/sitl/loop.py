@@ -246,8 +246,11 @@ def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) 
     turns = tuple(map(int, airframe.value("rotors.yaw_torque_sign")[order]))
     expected = tuple(-sign if reversed else sign for sign in link.yaw_torque_signs)
     if turns != expected:
+        change = (
+            "reversed=False, with the firmware's default senses" if reversed else f"reversed=True, and {link.remedy}"
+        )
         raise ConfigError(
             f"expected rotors of {airframe.name!r} whose drag turns the body by {expected} about z, for motors 1 "
-            f"to 4 of {type(link).__name__}, got {turns}. Pass reversed={not reversed}, and {link.remedy}."
+            f"to 4 of {type(link).__name__}, got {turns}. Pass {change}."
         )
     return order
