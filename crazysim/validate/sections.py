@@ -86,10 +86,11 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "angular acceleration by zero: compare it with our rows at constant body rates, where the airframe gives "
             "the forces alone.\n\n"
             "With its own torques `cf21B_500` loses the attitude within 0.25 s. In these flights the torque of the "
-            "rotors about x and y is, below 1 Hz, 10 to 30 times what the angular acceleration takes: it balances "
-            "a torque of the air that grows with the velocity, which that airframe does not have, so that its "
-            "prediction turns over. [Identification](guides/identification.md#cf21b_500_idsia) has the details, and "
-            "says why `cf21B_500_idsia` is off, too.",
+            "rotors about x and y is, below 1 Hz, 15 to 27 times what the angular acceleration takes, 2 to 3 times "
+            "in those of squares: it balances a torque of the air that grows with the velocity, which that airframe "
+            "does not have, so that its prediction turns over. "
+            "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
+            "`cf21B_500_idsia` is off, too.",
             (partial(flights.open_loop, idsia),), absent=absent(idsia), logs=True,
             axes=("prediction over, s", "mean error"),
         ),
