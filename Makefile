@@ -1,56 +1,68 @@
-# `make demo`, `make test` and `make check` set up everything they need in .venv first.
+# Each target sets up what it needs in .venv first: `make demo` what the demonstration needs, `make test` adds what tests
+# need, `make docs` what the pages need, and `make check` the checkers.
 PYTHON ?= python3
 VENV ?= .venv
 # Further requirements of an environment, such as PINS="jax<0.12"; one environment for each, named by VENV.
 PINS ?=
-# Processes that run tests, which together take up to 0.7 of the memory.
-WORKERS ?= 2
+# Processes that run tests; auto is one for each core and 4 GB of memory (tests/machine.py).
+WORKERS ?= auto
 RUN = $(VENV)/bin/python
-# One worker runs all tests of a file, which share simulations.
-PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile
+# One worker runs all tests of a file, which share simulations. The durations of all tests are kept in out/tests/.
+PYTEST = $(RUN) -m pytest -n $(WORKERS) --dist loadfile --junitxml=out/tests/$@$(VENV:.venv%=%).xml
+# What `make test` runs, some eight minutes on two quiet cores; TESTS=tests/control for another part.
+tests_of = $(patsubst %,tests/$(1)/test_%.py,$(2))
+TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
+  $(patsubst %,tests/test_%.py,eager jaxcompat machine package prose pytree rotation storage surroundings utils) \
+  $(call tests_of,control,allocation attitude flat_state flatness setpoint state) \
+  $(call tests_of,docs,first_pages imports site) \
+  $(call tests_of,engine,gradient_kernels interpret ir passes plan rules simplify step symbolic) \
+  $(call tests_of,envs,actions brax contract pettingzoo task vector wrappers) \
+  $(call tests_of,geometry,heightfield manifold rays shapes) \
+  $(call tests_of,scene,build contact_report contacts sync) \
+  tests/trajectories/test_formation.py
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
-.PHONY: demo test test-fast test-all test-gpu check docs format benchmark clean
+.PHONY: demo test test-rest test-all test-gpu check docs format benchmark clean
 
-$(VENV)/installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --quiet --disable-pip-version-check --upgrade pip
-	$(RUN) -m pip install --quiet --disable-pip-version-check -e ".[dev]" $(foreach pin,$(PINS),"$(pin)")
-	touch $@
+# The stamp of an extra of pyproject.toml that is installed; `test` includes `demo`.
+$(VENV)/installed-%: pyproject.toml
+	$(RUN) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --quiet --disable-pip-version-check --no-compile -e ".[$*]" $(foreach pin,$(PINS),"$(pin)")
+	touch $@ $(if $(filter test,$*),$(VENV)/installed-demo)
 
-demo: $(VENV)/installed
+demo: $(VENV)/installed-demo
 	$(RUN) -m crazysim demo
 
-# All tests that are not marked slow; TESTS=tests/control for a part.
-test: $(VENV)/installed
+test: $(VENV)/installed-test
 	$(PYTEST) -m "not slow" $(TESTS)
 
-test-fast: $(VENV)/installed
-	$(PYTEST) -m fast $(TESTS)
+# What `make test` leaves out, except for the slow ones: CI runs both.
+test-rest: $(VENV)/installed-test
+	$(PYTEST) -m "not slow" $(addprefix --ignore=,$(TESTS))
 
-# The slow ones too, and new examples for the tests of properties.
-test-all: $(VENV)/installed
-	CRAZYSIM_HYPOTHESIS=explore $(PYTEST) $(TESTS)
+# Everything, with new examples for the tests of properties.
+test-all: $(VENV)/installed-test
+	CRAZYSIM_HYPOTHESIS=explore $(PYTEST)
 
 # On a machine with an NVIDIA GPU, which the workers share; PINS="jax[cuda12]" installs JAX for it.
-test-gpu: $(VENV)/installed
+test-gpu: $(VENV)/installed-test
 	XLA_FLAGS=--xla_backend_optimization_level=3 $(PYTEST) --dist worksteal tests/gpu
 
-check: $(VENV)/installed
+check: $(VENV)/installed-check
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/pyright
 	$(VENV)/bin/lint-imports --no-cache
 
-docs: $(VENV)/installed
+docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict  # --quiet would hide its warnings from --strict
 	@echo "wrote out/site/index.html"
 
-format: $(VENV)/installed
+format: $(VENV)/installed-check
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
 
-benchmark: $(VENV)/installed
+benchmark: $(VENV)/installed-demo
 	$(RUN) benchmarks/loop.py
 	$(RUN) benchmarks/step.py
 	$(RUN) benchmarks/compile.py

@@ -2,7 +2,7 @@
 
 A block ``text`` that follows a block ``python`` shows what that block prints. ``text title="for example"`` shows what
 it printed once: times and other numbers that differ from run to run are not compared. ``python docs/outputs.py PAGE``
-runs a page and writes the outputs that are missing or have changed; ``tests/docs/test_pages.py`` compares them.
+runs a page and writes the outputs that are missing or have changed; the tests of ``tests/docs`` compare them.
 """
 
 from __future__ import annotations

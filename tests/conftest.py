@@ -4,6 +4,7 @@ import gc
 import os
 
 import compiling
+import machine
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 # XLA logs an error of 3,000 characters for every program from the cache that could use another vector width.
@@ -28,6 +29,11 @@ settings.register_profile("explore", deadline=None, max_examples=200)
 settings.load_profile(os.environ.get("CRAZYSIM_HYPOTHESIS", "same"))
 
 
+def pytest_xdist_auto_num_workers():
+    """Return the number of processes of ``make test``."""
+    return machine.n_workers(machine.cores(), machine.memory())
+
+
 def pytest_collection_finish():
     """Look for garbage less often: tracing makes millions of objects, and looking at them took a tenth of all time."""
     gc.collect()
@@ -35,14 +41,47 @@ def pytest_collection_finish():
     gc.set_threshold(100_000, 20, 100)
 
 
+LONG = 5
+"""Processor time above which a test needs a reason, s."""
+REASONS = ("long", "slow")
+"""Markers whose argument is the reason."""
+BEGIN = pytest.StashKey[float]()
+
+
+def _processor_time():
+    return sum(os.times()[:4])  # of this process, and of those that it waited for
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item):
+    """Keep the processor time at which a test begins."""
+    item.stash[BEGIN] = _processor_time()
+    yield
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Fail what is skipped where nothing may be: a skip in CI would hide a test that never ran."""
+    """Report the processor time of a test, and fail a skip where none may be: in CI it would hide what never ran."""
     outcome = yield
     report = outcome.get_result()
     if report.skipped and os.environ.get("CRAZYSIM_NO_SKIP"):
         report.outcome = "failed"
         report.longrepr = f"{item.nodeid} was skipped where CRAZYSIM_NO_SKIP forbids it: {report.longrepr}"
+    if report.when == "teardown":
+        report.user_properties.append(("processor_s", round(_processor_time() - item.stash[BEGIN], 2)))
+        report.user_properties += [("reason", mark.args[0]) for mark in item.iter_markers() if mark.name in REASONS]
+
+
+def pytest_terminal_summary(terminalreporter):
+    """List the tests that took long, and why."""
+    ended = (r for reports in terminalreporter.stats.values() for r in reports if getattr(r, "user_properties", None))
+    took = {report.nodeid: dict(report.user_properties) for report in ended}
+    long = sorted((-entry["processor_s"], name) for name, entry in took.items() if entry["processor_s"] > LONG)
+    if long:
+        terminalreporter.section(f"tests over {LONG} s of processor time")
+    for seconds, name in long:
+        reason = took[name].get("reason", "no reason given: share what it builds, or mark it long")
+        terminalreporter.write_line(f"{-seconds:5.1f} s  {name}: {reason}")
 
 
 @pytest.fixture

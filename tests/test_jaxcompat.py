@@ -11,8 +11,6 @@ import pytest
 from crazysim import jaxcompat
 from crazysim.engine.errors import UnsupportedError
 
-pytestmark = pytest.mark.fast
-
 
 def equation(fn, *args, name=None):
     """Return the only equation of a function, or the first of a primitive's name."""

@@ -14,8 +14,6 @@ import yaml
 
 import crazysim
 
-pytestmark = pytest.mark.fast
-
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SOURCES = sorted((ROOT / "crazysim").rglob("*.py"))
@@ -79,6 +77,41 @@ def test_every_target_of_make_that_is_named_exists(path):
     named = set(re.findall(r"\bmake ([a-z-]+)", (ROOT / path).read_text()))
     assert named
     assert named <= targets
+
+
+def made(*arguments):
+    """Return the commands that make would run."""
+    make = ["make", "--dry-run", "--no-print-directory", *arguments]
+    return subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("target", "extra"),
+    [
+        ("demo", "demo"),
+        ("test", "test"),
+        ("test-rest", "test"),
+        ("test-all", "test"),
+        ("check", "check"),
+        ("docs", "docs"),
+    ],
+)
+def test_a_target_installs_its_extra_once(target, extra, tmp_path):
+    settings = f"VENV={tmp_path}", "PINS=jax<0.12 casadi"
+    installed = [re.findall(r'"(.+?)"', line) for line in made(target, *settings) if " install " in line]
+    assert installed == [[f".[{extra}]", "jax<0.12", "casadi"]]
+    (tmp_path / f"installed-{extra}").touch()
+    lines = made(target, *settings)
+    assert lines
+    assert not [line for line in lines if " install " in line]
+
+
+def test_the_rest_is_what_make_test_leaves_out():
+    chosen = made("test")[-1].split('"not slow" ')[1].split()
+    rest = made("test-rest")[-1].split('"not slow" ')[1].split()
+    assert rest == [f"--ignore={path}" for path in chosen]
+    assert all((ROOT / path).exists() for path in chosen)
+    assert made("test", "TESTS=tests/control")[-1].endswith('"not slow" tests/control')
 
 
 def test_workflows_and_templates_are_complete():

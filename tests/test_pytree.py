@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from crazysim import ConfigError, PyTree, leaf, static
 from crazysim.pytree import as_parameter, check_axes, map_batched, scopes, select_worlds
 
-pytestmark = pytest.mark.fast
-
 
 class Rotor(PyTree):
     speed: jax.Array = leaf("drone", 1)

@@ -19,7 +19,7 @@ from crazysim.live import attitude
 ROUNDING = {"rtol": 1e-12, "atol": 1e-12}
 
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 vectors = functools.partial(cases.vectors, allow_subnormal=False)
 unit_quats = cases.unit_quats(allow_subnormal=False)

@@ -31,7 +31,6 @@ def test_images_need_no_setting_without_a_screen():
     assert result.stdout.split() == ["egl", "(48,", "64,", "3)"], result.stderr
 
 
-@pytest.mark.fast
 @pytest.mark.parametrize("variable", VARIABLES)
 def test_a_screen_or_a_choice_is_kept(bare, variable):
     bare.setenv(variable, "osmesa")
@@ -40,7 +39,6 @@ def test_a_screen_or_a_choice_is_kept(bare, variable):
     assert dict(os.environ) == before
 
 
-@pytest.mark.fast
 def test_without_egl_nothing_is_chosen(bare):
     def missing(name):
         raise OSError(name)
@@ -50,7 +48,6 @@ def test_without_egl_nothing_is_chosen(bare):
     assert "MUJOCO_GL" not in os.environ
 
 
-@pytest.mark.fast
 def test_the_log_of_xla_is_quiet_unless_chosen(monkeypatch):
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
     surroundings.set_variables()

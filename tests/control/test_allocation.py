@@ -12,7 +12,7 @@ from crazysim.control import COMMAND_FIELDS, AllocationParams, Control, command_
 from crazysim.control.levels import allocation_matrix
 from crazysim.dynamics.rotor import curve
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 allocate = jax.jit(force_torque2rotor_vel)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from crazysim import load_airframe
 from crazysim.control import AttitudeParams, attitude2force_torque, body_rate2force_torque
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 LEVEL, ZERO = np.array([0.0, 0, 0, 1]), np.zeros(3)
 HALF = 0.4  # N, half of what the four rotors give: as far from every limit as can be

@@ -171,7 +171,6 @@ def test_a_far_setpoint_is_approached_without_losing_height():
 # Parts ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.fast
 @given(body=unit_quats(), desired=unit_quats())
 @example(
     body=np.array([0.74740932, 0, 0, -0.66436384]), desired=np.array([0.10349082, 0.98124632, 0.1149898, 0.1149898])
@@ -200,7 +199,6 @@ def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
 jitted_axes, jitted_quat = jax.jit(error_of_axes), jax.jit(error_of_quat)
 
 
-@pytest.mark.fast
 def test_upside_down_the_error_is_a_full_turn_about_x():
     """Where the direction of the shortest turn is undefined, so that such a drone does not stay there."""
     x, y, z = (np.float32(v) for v in ([1, 0, 0], [0, -1, 0], [0, 0, -1]))
@@ -209,7 +207,6 @@ def test_upside_down_the_error_is_a_full_turn_about_x():
     np.testing.assert_allclose(jitted_axes(-x, y, -z)[2], 2.0, atol=1e-3)  # turned by 180 degrees
 
 
-@pytest.mark.fast
 def test_the_gains_are_damped_as_documented():
     """Poles of s^3 / a + s^2 + kd s + kp over a, and of s^2 / a + s + kd: the numbers of the module's docstring."""
     poles = np.roots([1, 1, DAMPING, STIFFNESS])
@@ -222,7 +219,6 @@ def test_the_gains_are_damped_as_documented():
     np.testing.assert_allclose(np.exp(-np.pi * damping / np.sqrt(1 - damping**2)), 0.07, atol=0.002)
 
 
-@pytest.mark.fast
 def test_gains_by_hand():
     """cf21B_500: lag 16.094 1/s, made faster to 50 1/s; with 1.5 periods of 500 Hz that is 43.48 1/s."""
     airframe = load_airframe("cf21B_500")
@@ -237,7 +233,6 @@ def test_gains_by_hand():
     assert AutoParams.create(airframe, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
 
 
-@pytest.mark.fast
 def test_the_drag_torque_over_thrust_of_the_curves_is_that_of_the_tables():
     """Derived from thrust and torque curves around hover, within 15% of the firmware's number where there is one."""
     for name in ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "crazyflie", "bumblebee", "bumblebee_lab"):

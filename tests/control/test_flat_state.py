@@ -12,7 +12,7 @@ from crazysim import rotation
 from crazysim.control.flatness import flat_state
 from crazysim.control.setpoint import Setpoint
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 MASS, INERTIA = 0.5, np.array([[2e-3, 1e-4, 0.0], [1e-4, 3e-3, 2e-4], [0.0, 2e-4, 5e-3]])
 GRAVITY = np.array([0.0, 0.0, -9.81])

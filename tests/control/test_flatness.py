@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from crazysim.control.flatness import attitude_of_thrust
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 attitude = jax.jit(attitude_of_thrust)
 slopes = jax.jit(jax.jacrev(attitude_of_thrust, argnums=(0, 1, 2, 3)))

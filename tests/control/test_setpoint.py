@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim.control.setpoint import Setpoint
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 SIZES = {"pos": 3, "vel": 3, "acc": 3, "jerk": 3, "snap": 3, "yaw": 1, "yaw_rate": 1, "yaw_acc": 1}
 

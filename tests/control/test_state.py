@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim.control import StateParams, state2attitude
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 LEVEL = np.array([0.0, 0, 0, 1])
 controller = jax.jit(state2attitude, static_argnames="ctrl_freq")

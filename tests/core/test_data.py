@@ -11,8 +11,6 @@ from hypothesis import strategies as st
 from crazysim import Sim
 from crazysim.core.data import SimState, as_key, command_shape, grid_2d
 
-pytestmark = pytest.mark.fast
-
 
 @given(n=st.integers(1, 200), spacing=st.floats(0.1, 5))
 def test_grid_2d_keeps_distance_and_fills_from_its_centre(n, spacing):

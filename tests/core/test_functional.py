@@ -10,8 +10,6 @@ from crazysim.core import functional as F
 from crazysim.core.data import command_shape
 from crazysim.errors import ConfigError
 
-pytestmark = pytest.mark.fast
-
 
 def sim_of(dynamics, control):
     return shared_sim(n_worlds=2, n_drones=2, dynamics=dynamics, control=control)

@@ -18,8 +18,6 @@ from crazysim.core.pipeline import (
 )
 from crazysim.errors import UnknownNameError
 
-pytestmark = pytest.mark.fast
-
 
 def first(x):
     return x

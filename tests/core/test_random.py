@@ -8,8 +8,6 @@ from cases import shared_sim
 
 from crazysim.core.random import drone_keys, normal, uniform
 
-pytestmark = pytest.mark.fast
-
 
 def bits(keys):
     return np.asarray(jax.random.key_data(keys))

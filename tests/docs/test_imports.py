@@ -6,7 +6,7 @@ import inspect
 from pathlib import Path
 
 import pytest
-from test_pages import PAGES, ROOT, outputs
+from pages import PAGES, ROOT, outputs
 
 MODULES = {
     "crazysim",

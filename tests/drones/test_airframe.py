@@ -16,8 +16,6 @@ from crazysim.drones.keys import LAYOUT, TABLES
 from crazysim.drones.loading import FOLDER
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
 
-pytestmark = pytest.mark.fast
-
 FILES = sorted(FOLDER.glob("*.toml"))
 
 

@@ -10,8 +10,6 @@ from crazysim.control.bandwidth import rotor_rate
 from crazysim.drones import estimate_airframe, load_airframe
 from crazysim.dynamics import supported_dynamics
 
-pytestmark = pytest.mark.fast
-
 QUAD = {"mass": 1.2, "propeller": 0.127, "arm": 0.12, "thrust_to_weight": 4.0}
 SMALL = {"mass": 0.25, "propeller": 0.0762, "arm": 0.07, "thrust_to_weight": 4.0}
 HEXA = {"mass": 4.0, "propeller": 0.33, "arm": 0.36, "n_rotors": 6, "thrust_to_weight": 2.4}

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim.dynamics.drag import drag_force
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 vectors = arrays(np.float64, 3, elements=st.floats(-30, 30))
 quats = arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 0.1)

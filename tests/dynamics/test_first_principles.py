@@ -14,7 +14,7 @@ from crazysim import load_airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 model = jax.jit(first_principles.dynamics)
 

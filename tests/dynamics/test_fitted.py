@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from crazysim import load_airframe, rotation
 from crazysim.dynamics import Dynamics, fitted
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 model = jax.jit(fitted.dynamics)
 

@@ -12,8 +12,6 @@ from crazysim.dynamics import Dynamics, first_principles, fitted, load_fn_params
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.sim.sim import rotor_vel_limits
 
-pytestmark = pytest.mark.fast
-
 COMMON = {"gravity_vec": (3,), "mass": (), "J": (3, 3), "J_inv": (3, 3), "thrust_min": (), "thrust_max": ()}
 SHAPES = {
     "first_principles": {

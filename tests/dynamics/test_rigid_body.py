@@ -15,7 +15,7 @@ from crazysim.dynamics.rigid_body import (
     stable_angular_acceleration,
 )
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 vectors = arrays(np.float64, 3, elements=st.floats(-10, 10))
 # A full inertia, kg m^2: positive definite, and such as a real body has.

@@ -22,7 +22,7 @@ from crazysim.dynamics.rotor import (
     rotor_vel_of_thrust,
 )
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("x64")]
+pytestmark = pytest.mark.usefixtures("x64")
 
 speeds = arrays(np.float64, 4, elements=st.floats(0, 25_000))
 vectors = arrays(np.float64, 3, elements=st.floats(-20, 20))

@@ -16,8 +16,6 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf
 
-pytestmark = pytest.mark.fast
-
 ONE = jax.ShapeDtypeStruct((), np.float32)
 
 

@@ -1,11 +1,8 @@
 """Blocks: built once, never changed."""
 
 import numpy as np
-import pytest
 
 from crazysim.engine.ir.blocks import Builder
-
-pytestmark = pytest.mark.fast
 
 F = np.float32
 

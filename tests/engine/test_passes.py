@@ -18,8 +18,6 @@ from crazysim.engine.optimise import apply
 from crazysim.engine.passes import schedule
 from crazysim.jaxcompat import is_key
 
-pytestmark = pytest.mark.fast
-
 N_WORLDS = 5
 F32 = np.float32
 

@@ -21,8 +21,6 @@ from crazysim.engine.lowering.jaxprs import RULES
 from crazysim.errors import EngineWarning
 from crazysim.pytree import PyTree, leaf
 
-pytestmark = pytest.mark.fast
-
 
 @stage("drone")
 def sway(data):

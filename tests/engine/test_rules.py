@@ -19,8 +19,6 @@ from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.errors import EngineWarning
 
-pytestmark = pytest.mark.fast
-
 
 def lanes_of(g):
     """Return the numbers of all drones: of what they share one, of the rest one for each lane."""

@@ -7,8 +7,6 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero, simplify
 from crazysim.engine.ir.blocks import Builder
 
-pytestmark = pytest.mark.fast
-
 F = np.float32
 
 

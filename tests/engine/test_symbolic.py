@@ -10,7 +10,7 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.tools import symbolic
 
-pytestmark = [pytest.mark.fast, pytest.mark.usefixtures("casadi", "x64")]
+pytestmark = pytest.mark.usefixtures("casadi", "x64")
 
 REFUSED = {
     "integers": "'and' on int32",

@@ -12,8 +12,6 @@ from crazysim.dynamics import first_principles, fitted, supported_dynamics
 from crazysim.envs import Actions, actions_of
 from crazysim.envs.actions import RATES, REACH, TILT, YAW, hover_thrust
 
-pytestmark = pytest.mark.fast
-
 CASES = [
     (drone, dynamics, control)
     for drone in Drone

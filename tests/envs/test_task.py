@@ -15,8 +15,6 @@ from crazysim.envs.task import total
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
 
-pytestmark = pytest.mark.fast
-
 
 def test_making_a_task_changes_no_simulation_and_installing_it_does():
     sim = Sim(n_worlds=2, control="attitude")

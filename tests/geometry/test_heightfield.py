@@ -13,8 +13,6 @@ from crazysim.geometry import Shape, hfield
 from crazysim.geometry import distance as eager_distance
 from crazysim.geometry import point_distance as eager_point_distance
 
-pytestmark = pytest.mark.fast
-
 distance = jax.jit(eager_distance, static_argnums=(0, 1))
 point_distance = jax.jit(eager_point_distance, static_argnums=0)
 

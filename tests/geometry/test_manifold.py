@@ -10,8 +10,6 @@ from oracle import rotations, unit
 from crazysim.geometry import manifold
 from crazysim.geometry.heightfield import FAR
 
-pytestmark = pytest.mark.fast
-
 HALF_A, HALF_B = (0.1, 0.05, 0.08), (0.12, 0.2, 0.06)
 EYE, ZERO = np.eye(3), np.zeros(3)
 N = 500

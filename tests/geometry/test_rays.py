@@ -10,8 +10,6 @@ from oracle import SHAPES, places, rays, unit
 
 from crazysim.geometry import ray_distance
 
-pytestmark = pytest.mark.fast
-
 N = 4000
 
 

@@ -6,8 +6,6 @@ import pytest
 from crazysim import ConfigError
 from crazysim.geometry import Shape, hfield, hull
 
-pytestmark = pytest.mark.fast
-
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 

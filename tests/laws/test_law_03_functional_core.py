@@ -13,8 +13,6 @@ from cases import by_stages, hover_command, to_all, trees_equal, with_states
 from crazysim import Sim, dynamics
 from crazysim.core import functional as F
 
-pytestmark = pytest.mark.fast
-
 MASK = np.array([False, True, False])
 ROUNDING = {"rtol": 2e-6, "atol": 2e-6}  # float32: another program around the step fuses and rounds differently
 

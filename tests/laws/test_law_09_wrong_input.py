@@ -16,9 +16,6 @@ from crazysim.media import View
 from crazysim.sim import use_box_collision
 from crazysim.sim.visualize import change_material, draw_capsule, draw_points
 
-pytestmark = pytest.mark.fast
-
-
 # Arguments, and parts of the message: the given value, then the expected one or the remedy.
 WRONG_SETTINGS = [
     ({"n_worlds": 0}, "n_worlds is 0", "positive whole number"),

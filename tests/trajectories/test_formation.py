@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from crazysim.errors import ConfigError
 from crazysim.trajectories import formation
 
-pytestmark = pytest.mark.fast
 SHAPES = {"line": formation.line, "grid": formation.grid, "circle": formation.circle}
 
 

@@ -246,7 +246,7 @@ def test_flow_range_and_differences_are_used_as_they_err():
     assert_chi_squared(normalised(innovation, h @ cov @ h.transpose(0, 2, 1) + noise), 4)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("four filters of 128 drones for 4 s; the test above flies three of the aids together")
 def test_every_kind_of_aid_is_used_as_it_errs():
     """NEES of filters on one kind of sensor."""
     filters = {
@@ -260,7 +260,7 @@ def test_every_kind_of_aid_is_used_as_it_errs():
         assert_chi_squared(normalised(*all_errors(sim, name)), 15)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("128 drones for 8 s; the tests above fly other aids through the same filter")
 def test_satellites_barometer_and_magnetometer_are_enough():
     """NEES after 8 s: 15; the heading is known by the field alone, whose noise is 0.08 rad in a sample."""
     field = Magnetometer((2e-5, 0.0, -4.5e-5), Triad(noise=5e-7))

@@ -67,7 +67,11 @@ def pushed(stage):
     return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
 
 
-@pytest.mark.parametrize("plugins", [filters, pytest.param(everything, marks=pytest.mark.slow)])
+SLOW = pytest.mark.slow("compiles the derivative of every plugin; the filters alone cover the method")
+
+
+@pytest.mark.long("compiles the derivative of each stage, in float64")
+@pytest.mark.parametrize("plugins", [filters, pytest.param(everything, marks=SLOW)])
 def test_law_08_slopes_are_central_differences(plugins, x64):
     """Of every real number of the data, by the states at the start, with the stages as they are written.
 

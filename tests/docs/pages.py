@@ -1,0 +1,30 @@
+"""The pages, and how tests run them."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FIRST = [ROOT / "README.md", ROOT / "docs" / "quick_start.md"]
+"""What a newcomer reads first."""
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+spec = importlib.util.spec_from_file_location("outputs", ROOT / "docs" / "outputs.py")
+outputs = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(outputs)
+
+
+def run(page):
+    """Run the blocks of a page, in its order and in one namespace, and compare what they print with what it shows."""
+    text = page.read_text()
+    for package, sign in (("casadi", "import casadi"), ("viser", "from crazysim.media import web")):
+        if sign in text:
+            pytest.importorskip(package)
+    namespace = {"__name__": "page"}
+    for block in outputs.blocks(text):
+        printed = outputs.run(block, page, namespace)
+        line = text[: block.end].count("\n")
+        if block.output is not None and not outputs.same(block.output, printed, block.example):
+            name = page.relative_to(ROOT)
+            pytest.fail(f"the block that ends at line {line} prints\n{printed}; run `python docs/outputs.py {name}`")

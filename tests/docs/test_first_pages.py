@@ -1,0 +1,10 @@
+"""README and quick start: every Python block runs, in the order of the page, and prints what is shown."""
+
+import pytest
+from pages import FIRST, run
+
+
+@pytest.mark.parametrize("page", FIRST, ids=lambda page: page.name)
+def test_page_runs(page, tmp_path, monkeypatch, opengl):
+    monkeypatch.chdir(tmp_path)
+    run(page)

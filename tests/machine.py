@@ -1,0 +1,35 @@
+"""The machine that tests run on: how many processes of them it has cores and memory for."""
+
+import os
+from pathlib import Path
+
+WORKER_MEMORY = 4e9
+"""Memory that one process of tests gets, B: all tests of two processes took 3.1 GB in the larger one."""
+LIMITS = Path("/sys/fs/cgroup")
+"""Folder of a Linux container's limits."""
+
+
+def n_workers(cores: float, memory: float) -> int:
+    """Return how many processes fit into these cores and this memory, B; at least one."""
+    return max(1, int(min(cores, memory / WORKER_MEMORY)))
+
+
+def cores(limits: Path = LIMITS) -> float:
+    """Return the number of cores that this process may use, by its affinity and the quota of its container."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota, period = _words(limits / "cpu.max", "max 100000")
+    return count if quota == "max" else min(count, int(quota) / int(period))
+
+
+def memory(limits: Path = LIMITS) -> float:
+    """Return the memory that this process may use, B: the machine's, or the limit of its container."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    (limit,) = _words(limits / "memory.max", "max")
+    return total if limit == "max" else min(total, int(limit))
+
+
+def _words(path: Path, otherwise: str) -> list[str]:
+    try:
+        return path.read_text().split()
+    except OSError:
+        return otherwise.split()
