@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 WORKER_MEMORY = 4e9
-"""Memory that one process of tests gets, B: all tests of two processes took 3.1 GB in the larger one."""
+"""Memory for one process of tests, B: one of two held 3.1 GB when they had run two fifths of all tests."""
 LIMITS = Path("/sys/fs/cgroup")
 """Folder of a Linux container's limits."""
 
