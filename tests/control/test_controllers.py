@@ -359,6 +359,7 @@ def every_controller(control):
     return sim, slope
 
 
+@pytest.mark.long("compiles the gradient of every controller")
 @pytest.mark.parametrize("control", LEVELS)
 def test_no_nan_in_values_or_gradients(control):
     """Law 7: from any attitude, at rest, spinning at 100 rad/s, with commands far beyond all limits, and motors off."""

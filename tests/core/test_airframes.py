@@ -148,6 +148,7 @@ def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():
     np.testing.assert_array_equal(np.asarray(speed)[0, 0, 4:], 0)
 
 
+@pytest.mark.long("compiles gradients through a controller for each airframe")
 @pytest.mark.parametrize(
     ("control", "controller", "engine"),
     [("state", "crazyflow", None), ("state", "geometric", None), ("rotor_vel", "crazyflow", "lanes")],

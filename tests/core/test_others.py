@@ -177,6 +177,7 @@ class Push(Plugin):
         return data.replace(states=data.states.replace(force=data.states.force + both.sum(0)))
 
 
+@pytest.mark.long("compiles RK4 of two numbers of drones in every engine")
 def test_an_inner_vmap_and_an_influence_may_reduce():
     """RK4 evaluates an influence four times a step, each time at the places of that time."""
     for n_drones, engines in ((3, ["plain", *ENGINES]), (9, ("interpret", *FAST[1:]))):

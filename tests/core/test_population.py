@@ -129,6 +129,7 @@ def test_semi_implicit_euler_keeps_energy():
     assert energies["euler"] > 1.3
 
 
+@pytest.mark.long("compiles gradients in three engines")
 def test_gradients_pass_through_populations():
     """In reverse as through stages without an engine, and forwards through a kernel, which is derived on lanes."""
     cmd = np.ones((4, 2, 3, 3), np.float32)

@@ -4,6 +4,7 @@ import pytest
 from pages import FIRST, run
 
 
+@pytest.mark.long("runs every block of a page as a reader would")
 @pytest.mark.parametrize("page", FIRST, ids=lambda page: page.name)
 def test_page_runs(page, tmp_path, monkeypatch, opengl):
     monkeypatch.chdir(tmp_path)

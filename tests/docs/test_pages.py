@@ -4,6 +4,7 @@ import pytest
 from pages import FIRST, PAGES, ROOT, outputs, run
 
 
+@pytest.mark.long("runs every block of a page as a reader would")
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if page not in FIRST], ids=lambda page: str(page.relative_to(ROOT))
 )

@@ -79,6 +79,7 @@ def drift(found, expected, ulp):
 ULPS = {"pos": 4, "quat": 8, "vel": 64, "ang_vel": 512, "rotor_vel": 512}
 
 
+@pytest.mark.long("compiles a step in every engine")
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_one_step_agrees_with_plain(dynamics, control):
     """7 worlds of 3 drones, 21 lanes: no multiple of a vector's or a block's length, so that tails are masked."""
@@ -99,6 +100,7 @@ def test_one_step_agrees_with_plain(dynamics, control):
                 assert (x.shape, x.dtype) == (y.shape, y.dtype)
 
 
+@pytest.mark.long("compiles every integrator in every engine, in float64")
 @pytest.mark.parametrize("dynamics, control, integrator", [
     ("first_principles", "state", "euler"), ("first_principles", "attitude", "symplectic_euler"),
     ("so_rpy_rotor_drag", "attitude", "rk4"), ("first_principles", "rotor_vel", "rk4"),
@@ -224,6 +226,7 @@ def with_stages(n_drones, *stages):
     return sim, scattered(sim)
 
 
+@pytest.mark.long("compiles a step in every engine")
 @pytest.mark.parametrize("stages, n_segments", [
     ((gust,), 1), ((separation,), 3), ((undeclared,), 3), ((gust, separation, undeclared), 4),
 ])  # fmt: skip
@@ -322,6 +325,7 @@ def assert_gradients_equal(found, expected):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * scale)
 
 
+@pytest.mark.long("compiles gradients of every engine, in float64")
 def test_gradients_equal_those_of_the_stages_in_float64(x64):
     """Reverse mode through 40 steps of the attitude controller; without an engine forwards, which compiles sooner."""
     sim = Sim(n_worlds=2, n_drones=2, control="attitude")
@@ -334,6 +338,7 @@ def test_gradients_equal_those_of_the_stages_in_float64(x64):
     assert_gradients_equal(found, expected)
 
 
+@pytest.mark.long("compiles gradients in both directions")
 def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
     """From ``LONG`` steps on few beginnings are kept; what is zero in an inertia has a derivative all the same."""
     monkeypatch.setattr(lanes, "LONG", 16)

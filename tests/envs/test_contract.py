@@ -175,6 +175,7 @@ def test_gymnasium_makes_it(name):
     assert vec.action_space == batch_space(vec.single_action_space, N_FLYING)
 
 
+@pytest.mark.long("compiles the vector environment of each task")
 def test_the_number_of_worlds_changes_nothing(env, begun, flown):
     """Law 10 again: the first of many worlds fly as a few do."""
     (obs, info), state = flown.start, begun
@@ -322,6 +323,7 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.obs, after.reward, after.info["error"])))
 
 
+@pytest.mark.long("compiles the gradient of each task")
 @pytest.mark.parametrize("name", entries(classes_once=True), indirect=True)
 def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
     """Law 7, for actions and states, at the beginning of an episode and where random flight leads.

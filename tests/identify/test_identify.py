@@ -79,6 +79,7 @@ def test_identification_finds_the_airframe_of_the_logs(result):
     assert not result.doubtful, result.values
 
 
+@pytest.mark.long("identifies an airframe, for the tests after it")
 def test_identified_model_predicts_held_out_flights(flights, result):
     errors = prediction_errors([read_log(flights[-1])], result.model)
     assert np.all(errors["position"] < 0.1 * errors["position at constant velocity"])
@@ -109,6 +110,7 @@ def test_of_one_prediction_the_mean_is_the_root_mean_square(flights, result):
         np.testing.assert_allclose(chord, errors[name], rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.long("identifies, trains and predicts as the command does")
 def test_command_writes_an_airframe(flights, tmp_path, capsys):
     table = {k: x for k, x in flights[0].items() if k != "t"} | {"seconds": flights[0]["t"]}
     # Commands that these speeds follow with a lag of first order of 25 1/s.
@@ -469,12 +471,14 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
     assert np.all(without.values[:2] > 1.07 * true), without.values
 
 
+@pytest.mark.long("compiles the gradient of a flight of 0.5 s, and trains")
 def test_training_a_residual_lowers_the_errors_of_predictions(flights, result):
     """Rotor speeds that are 5% too high in the log: the residual takes the thrust away."""
     logs = [read_log(x | {f"rpm{k}": 1.05 * x[f"rpm{k}"] for k in range(1, 5)}) for x in flights[:3]]
     before = prediction_errors(logs, result.model)
     for n_hidden in (0, 4):
-        trained = fit_residual(logs, result.model, n_hidden=n_hidden, iterations=60, batch_size=64, validation=logs[:1])
+        steps = {"iterations": 30, "batch_size": 8, "learning_rate": 1e-2}
+        trained = fit_residual(logs, result.model, n_hidden=n_hidden, validation=logs[:1], **steps)
         assert prediction_errors(logs, trained)["position"][-1] < 0.5 * before["position"][-1], n_hidden
 
 

@@ -87,6 +87,7 @@ CASES = [
 sooner: the slopes of physics and controllers are defined forwards alone, and JAX transposes them."""
 
 
+@pytest.mark.long("compiles gradients of every dynamics and engine")
 @pytest.mark.parametrize(("dynamics", "control", "engine", "mode"), CASES)
 def test_gradient_equals_central_differences(dynamics, control, engine, mode, x64):
     """100 steps in float64, along a random direction in each input on its own, away from switches.
@@ -156,6 +157,7 @@ def test_at_saturation_the_gradient_is_one_side(at, x64):
     assert float(gradient(outside)) == 0.0
 
 
+@pytest.mark.long("compiles the gradient of all stages")
 def test_on_the_floor_and_at_rest_gradients_are_finite():
     """A drone that rests, one that hits the floor, one that hovers, one with its motors off."""
     sim = Sim(n_worlds=4, control="attitude")

@@ -52,6 +52,7 @@ def after_all_stages(sim, data):
     return data
 
 
+@pytest.mark.long("traces the step for every number of worlds and drones")
 @pytest.mark.parametrize("dynamics, control", PAIRS)
 def test_a_step_keeps_every_shape_and_type(dynamics, control):
     """Law 2: whatever the numbers of worlds and drones, equal ones included, parameters shared or one per drone."""

@@ -118,6 +118,7 @@ def test_vmap_over_commands_is_a_loop(start):
     assert np.all(spread.max(-1) > 1e-3)  # the commands did matter
 
 
+@pytest.mark.long("compiles the gradient of all stages")
 def test_grad_is_finite_and_points_up(start):
     """Law 3: the thrust command of a drone lifts that drone and no other, here in stages without an engine."""
     sim, data, _, _, commands = start

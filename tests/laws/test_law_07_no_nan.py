@@ -112,6 +112,7 @@ def start_of(data, commands):
     return {"command": commands} | {name: getattr(data.states, name) for name in names}
 
 
+@pytest.mark.long("compiles the gradient of every dynamics and command level")
 @pytest.mark.parametrize("dynamics, control, engine", ENGINES)
 def test_values_and_gradients_are_finite(dynamics, control, engine):
     """Law 7: every situation, every kind of dynamics and command, after 50 steps."""

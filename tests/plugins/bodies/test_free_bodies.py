@@ -148,6 +148,7 @@ def test_a_stack_of_two_stands_as_in_mujoco():
     np.testing.assert_allclose(ours[1][-1], [[0, 0, 0, 1]] * 2, atol=2e-4)
 
 
+@pytest.mark.long("10 s of contacts of five boxes")
 def test_a_stack_of_five_rests(rng):
     """Boxes beside each other's middles, for 10 s: under 1 mm/s after 0.2 s, in which the impulses are found."""
     pos = np.zeros((1, 5, 3)) + [1.0, 0.0, 0.0]
@@ -262,6 +263,7 @@ def test_law_08_momentum_and_angular_momentum_are_kept(rng):
     np.testing.assert_allclose(after[1], before[1], atol=2e-3)  # about the origin 30 m below, float32
 
 
+@pytest.mark.long("compiles contacts of a scene of its own")
 def test_a_drone_lands_on_a_body_and_rides_on_it():
     """It comes to rest on a sliding slab, and moves with it; the slab carries its weight."""
     sim, plugin = build(1, (0.6, 0.6, 0.1), 1.0, pos=(0, 0, 0.05), friction=0.9, drone_pos=(0.0, 0.0, 0.2))
@@ -281,6 +283,7 @@ def test_a_drone_lands_on_a_body_and_rides_on_it():
     np.testing.assert_allclose(drone_vel, vel, rtol=0.02)
 
 
+@pytest.mark.long("compiles contacts of a scene of its own")
 def test_a_box_and_a_drone_ride_on_a_moving_platform_as_in_mujoco():
     """The platform starts at 1 m/s: both slip back by v^2 / (2 mu g) = 8.5 cm, then move with it.
 
@@ -342,6 +345,7 @@ def test_an_object_moved_by_the_user_pushes_a_body():
     np.testing.assert_allclose(np.asarray(body.vel)[0, 0, 0], 0.2, atol=5 * 0.6 * 9.81 / FREQ)
 
 
+@pytest.mark.long("compiles contacts of a scene of its own")
 def test_objects_of_any_kind_carry_bodies():
     sim = Sim(control="rotor_vel", engine="plain")
     sim.scene.add("landing_pad", pos=(0, 0, 0.3), radius=0.4, mocap=False)
@@ -445,6 +449,7 @@ def test_law_07_a_body_under_a_constant_torque_stays_finite():
     assert np.isfinite(np.asarray(body.ang_vel)).all()
 
 
+@pytest.mark.long("compiles the gradient of contacts")
 def test_law_08_gradients_equal_central_differences(x64):
     """Of a slide with friction, with respect to the speed at the start: d(v^2 / (2 mu g)) / dv."""
     sim, plugin = build(1, (0.2, 0.2, 0.1), 0.5, pos=(0, 0, 0.05))
