@@ -79,7 +79,7 @@ def test_identification_finds_the_airframe_of_the_logs(result):
     assert not result.doubtful, result.values
 
 
-@pytest.mark.long("identifies an airframe, for the tests after it")
+@pytest.mark.long("compiles predictions of flights")
 def test_identified_model_predicts_held_out_flights(flights, result):
     errors = prediction_errors([read_log(flights[-1])], result.model)
     assert np.all(errors["position"] < 0.1 * errors["position at constant velocity"])
