@@ -1,14 +1,24 @@
-"""The folder in which compiled programs and kernels are kept between processes."""
+"""The folder in which compiled programs and kernels are kept between processes.
+
+The engine keeps its kernels there without being asked, and crazysim the XLA programs that it compiles itself
+(``keep_programs``). ``enable_cache`` keeps all programs of the process, the user's own included. What JAX is configured
+to use comes first: its folder then holds the kernels, too, and nothing of its configuration is changed.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import os
+import platform
+import shutil
 import stat
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -19,22 +29,118 @@ from crazysim.trust import REMEDY, distrust, make_private
 VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 LIMIT = 1_000_000_000
-"""Size of all files, bytes, above which the oldest are removed when the cache is enabled: some 5,000 programs."""
-KEPT = 0.8
+"""Size of all files, bytes, above which the oldest are removed when the cache is first used: some 5,000 programs."""
+SHARE_LEFT = 0.8
 """Share of the limit that is left by a removal, so that not every process has to remove files."""
-PATTERNS = ("*-cache", "*-atime", "crazysim/*.so")
+MIN_FREE = 50_000_000
+"""Free space below which a disk counts as full, bytes: the programs of some simulations."""
+PATTERNS = ("*-cache", "*-atime", "crazysim/*.so", "crazysim/*.ptx", "crazysim/*.cubin")
 """Names of the files that JAX and the engine write; other files in the folder are never removed."""
+CPU_INFO = Path("/proc/cpuinfo")
+"""File in which Linux lists the features of the CPU."""
+
+
+def caches_folder() -> Path:
+    """Return crazysim's folder in the user's folder of caches: ``$XDG_CACHE_HOME/crazysim`` or ``~/.cache/crazysim``.
+
+    Raises:
+        ConfigError: If the user has no home folder.
+    """
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    if Path(home).is_absolute():
+        return Path(home) / "crazysim"
+    try:
+        return Path.home() / ".cache" / "crazysim"
+    except RuntimeError:
+        raise ConfigError(
+            f"expected a home folder for compiled programs, got none. Set {VARIABLE} to a folder, or to off."
+        ) from None
 
 
 def default_cache() -> Path | None:
-    """Return the folder that ``enable_cache`` uses by default; None where ``CRAZYSIM_CACHE`` is ``off``."""
+    """Return the folder that is used by default; None where ``CRAZYSIM_CACHE`` is ``off``.
+
+    Programs of XLA are machine code whose key does not hold the features of the CPU, so each kind of CPU that shares
+    the folder has one of its own in it.
+
+    Raises:
+        ConfigError: If ``CRAZYSIM_CACHE`` is not set and the user has no home folder.
+    """
+    root = _root()
+    return None if root is None else root / f"cpu-{hashlib.sha256(cpu_features().encode()).hexdigest()[:8]}"
+
+
+def _root() -> Path | None:
     chosen = os.environ.get(VARIABLE, "")
     if chosen.lower() in ("off", "0", "false", "no"):
         return None
-    if chosen:
+    if not chosen:
+        return caches_folder() / "jax"
+    try:
         return Path(chosen).expanduser()
-    home = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "crazysim" / "jax"
+    except RuntimeError:
+        raise ConfigError(f"expected a folder in {VARIABLE}, got {chosen!r}, whose user has no home folder.") from None
+
+
+def cpu_features() -> str:
+    """Return the architecture of the CPU and, where the system lists them, its features."""
+    try:
+        lines = CPU_INFO.read_text().splitlines()
+    except OSError:
+        lines = []
+    listed = next((line for line in lines if line.split(":")[0].strip().lower() in ("flags", "features")), "")
+    return f"{platform.machine()} {platform.processor()} {listed}"
+
+
+def folder() -> Path | None:
+    """Return the folder of this process: that of JAX's configuration, else the default one; None if there is none.
+
+    A default folder that cannot be used is a line on stderr, once; the process then keeps nothing.
+    """
+    configured = jaxcompat.cache_folder()
+    if configured is not None:
+        return Path(configured)
+    return _usable(*map(os.environ.get, (VARIABLE, "XDG_CACHE_HOME", "HOME")))
+
+
+@functools.cache
+def _usable(*environment: str | None) -> Path | None:
+    """Return the default folder, prepared, if it can be used in this environment."""
+    del environment  # the folder follows from it
+    try:
+        path = default_cache()
+        if path is not None:
+            _prepare(path)
+            trim(path.parent)
+    except ConfigError as error:
+        message = f"compiled programs are not kept: {error}"
+        print(message if VARIABLE in message else f"{message} {VARIABLE} names another.", file=sys.stderr)
+        return None
+    return path
+
+
+def _prepare(path: Path) -> None:
+    """Make the folder of a cache.
+
+    Raises:
+        ConfigError: If it cannot be made or written, belongs to another user, or its disk is full.
+    """
+    try:
+        make_private(path)
+        free = shutil.disk_usage(path).free
+    except OSError as error:
+        raise ConfigError(
+            f"expected a folder for compiled programs, got {str(path)!r}: {error}. Use another."
+        ) from error
+    if reason := distrust(path):
+        raise ConfigError(f"expected a folder that only this user can write, got {str(path)!r}: {reason}. {REMEDY}")
+    if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
+        raise ConfigError(f"expected a folder that can be written, got {str(path)!r}. Use another.")
+    if free < MIN_FREE:
+        raise ConfigError(
+            f"expected {MIN_FREE / 1e6:g} MB of free space for compiled programs, got {free / 1e6:.1f} MB in "
+            f"{str(path)!r}. Free some, or use another folder."
+        )
 
 
 def enable_cache(
@@ -43,33 +149,29 @@ def enable_cache(
     min_compile_time_secs: float = 0.0,
     enable_xla_caches: bool = False,
 ) -> Path | None:
-    """Keep compiled programs on disk from now on, and return the folder.
+    """Keep all programs that this process compiles from now on, your own included, and return the folder.
 
-    What is in the folder is executed, so it is made for this user alone. Where it holds more than ``LIMIT`` bytes, the
-    programs that have not been used for the longest time are removed.
+    What crazysim compiles itself is kept without it. What is in the folder is executed, so it is made for this user
+    alone. Where it holds more than ``LIMIT`` bytes, the programs that have not been used for the longest time are
+    removed.
 
     Args:
         cache_path: Folder; None for that of the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
-            the user's folder of caches. Where the variable is ``off``, None keeps nothing and returns None.
+            the user's folder of caches, where each kind of CPU has a folder of its own. Where the variable is ``off``,
+            None keeps nothing and returns None.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
         min_compile_time_secs: Shortest compilation whose program is kept, s.
         enable_xla_caches: True to let XLA keep files of its own beside JAX's.
 
     Raises:
-        ConfigError: If the folder cannot be made, belongs to another user, or can be written by others.
+        ConfigError: If the folder cannot be made or written, belongs to another user, can be written by others, or its
+            disk is full.
     """
     path = default_cache() if cache_path is None else Path(cache_path)
     if path is None:
         return None
-    try:
-        make_private(path)
-    except OSError as error:
-        raise ConfigError(
-            f"expected a folder for compiled programs, got {str(path)!r}: {error}. Use another."
-        ) from error
-    if reason := distrust(path):
-        raise ConfigError(f"expected a folder that only this user can write, got {str(path)!r}: {reason}. {REMEDY}")
-    trim(path)
+    _prepare(path)
+    trim(path if cache_path is not None else path.parent)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", min_entry_size_bytes)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time_secs)
@@ -78,20 +180,47 @@ def enable_cache(
     return path
 
 
-def enable_for_command() -> None:
-    """Enable the cache for a command, unless JAX has one already, and print a line when its folder is made.
+class keep_programs(contextlib.ContextDecorator):
+    """Block or function in which the programs that this thread compiles are kept.
 
-    A folder that cannot be used is a line, as the command runs without it.
+    Where JAX has a cache of its own nothing changes. What the thread compiles outside is not kept.
     """
-    path = default_cache()
-    if path is None or jaxcompat.cache_folder() is not None:
+
+    _entered = threading.local()
+
+    def __init__(self, when: bool = True):
+        """Take whether the block keeps programs at all."""
+        self._when = when
+
+    def __enter__(self) -> None:
+        """Open the cache, unless an outer block has."""
+        stack = self._entered.__dict__.setdefault("stack", [])
+        context = None
+        if self._when and not any(stack) and jaxcompat.cache_folder() is None and (path := folder()) is not None:
+            context = jaxcompat.compilation_cache(str(path))
+            context.__enter__()
+        stack.append(context)
+
+    def __exit__(self, *error: Any) -> None:
+        """Close it."""
+        context = self._entered.stack.pop()
+        if context is not None:
+            context.__exit__(*error)
+
+
+def enable_for_command() -> None:
+    """Keep all programs of a command, unless JAX has a cache already, and print a line when its folder is made."""
+    if jaxcompat.cache_folder() is not None:
         return
-    is_new = not path.exists()
     try:
-        enable_cache(path)
-    except ConfigError as error:
-        print(f"compiled programs are not kept: {error}", file=sys.stderr)
+        path = default_cache()
+        is_new = path is not None and not path.exists()
+    except ConfigError:
+        is_new = False
+    path = folder()  # prints a line where it cannot be used
+    if path is None:
         return
+    enable_cache()
     if is_new:
         print(
             f"compiled programs are kept in {path}, {LIMIT / 1e9:g} GB at most; {VARIABLE}=off keeps none",
@@ -115,17 +244,13 @@ def announce(work: str, seconds: str) -> None:
     if work in _announced:
         return
     _announced.add(work)
-    later = (
-        "less once it is in the cache"
-        if jaxcompat.cache_folder() is not None
-        else ("less in later runs with crazysim.enable_cache()")
-    )
-    print(f"{work}: {seconds} on two cores, {later}", file=sys.stderr, flush=True)
+    later = "" if folder() is None else ", less in later runs"
+    print(f"{work}: {seconds} on two cores{later}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
 def announced(work: str, seconds: str) -> Iterator[None]:
-    """Announce work that has not ended after ``PATIENCE``, as it does where its programs are in the cache.
+    """Keep the programs of long work, and announce it where it has not ended after ``PATIENCE``.
 
     Args:
         work: Name of the work, such as ``"compiling the gradient"``.
@@ -135,7 +260,8 @@ def announced(work: str, seconds: str) -> Iterator[None]:
     timer.daemon = True
     timer.start()
     try:
-        yield
+        with keep_programs():
+            yield
     finally:
         timer.cancel()
 
@@ -149,7 +275,7 @@ def trim(folder: Path, limit: int = LIMIT) -> None:
     """
     found = []
     for pattern in PATTERNS:
-        for path in folder.glob(pattern):
+        for path in (*folder.glob(pattern), *folder.glob(f"cpu-*/{pattern}")):
             with contextlib.suppress(OSError):  # another process has removed it
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode):
@@ -161,5 +287,5 @@ def trim(folder: Path, limit: int = LIMIT) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         size -= n
-        if size <= KEPT * limit:
+        if size <= SHARE_LEFT * limit:
             return

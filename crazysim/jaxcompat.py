@@ -41,6 +41,7 @@ __all__ = [
     "bits_generator",
     "cache_folder",
     "closed",
+    "compilation_cache",
     "compute_capability",
     "custom_vmap",
     "equations",
@@ -359,6 +360,36 @@ def n_compilations(jitted: Callable[..., Any]) -> int:
 def cache_folder() -> str | None:
     """Return the folder of JAX's persistent compilation cache; None if there is none."""
     return jax.config.jax_compilation_cache_dir or None  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def compilation_cache(folder: str) -> Iterator[None]:
+    """Let JAX keep the programs that this thread compiles in a block; its configuration stays as it is.
+
+    JAX opens the cache once a process. So that a folder which is configured later is used, it is closed in the end.
+    Without these names of JAX nothing is kept.
+    """
+    try:
+        from jax._src import compilation_cache as cache
+        from jax._src import config
+
+        settings = (
+            config.compilation_cache_dir(folder),
+            config.persistent_cache_min_entry_size_bytes(-1),
+            config.persistent_cache_min_compile_time_secs(0.0),
+        )
+        close = cache.reset_cache
+    except (ImportError, AttributeError):
+        yield
+        return
+    with contextlib.ExitStack() as stack:
+        for setting in settings:
+            stack.enter_context(setting)
+        close()
+        try:
+            yield
+        finally:
+            close()
 
 
 def ffi_include_folder() -> str:

@@ -12,6 +12,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from crazysim import jaxcompat
+from crazysim.cache import keep_programs
 from crazysim.control import Control
 from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import placed, staged_fields
@@ -117,6 +118,7 @@ class Step:
         self.stages = as_stages(pipeline)
         self._plans: dict[Any, Plan] = {}
         self._reported: set[str] = set()
+        self._called: set[tuple[int, int | None]] = set()
         self._zeros = ZerosCache()
         self._pack = PackCache()
         self._at_home: Any = None
@@ -164,7 +166,10 @@ class Step:
         step, inputs = plan.static if isinstance(n_steps, int) else plan.dynamic, flat.inputs()
         if plan.direct is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
             step = plan.direct
-        out = step(inputs, n_steps)
+        program = id(plan), n_steps if isinstance(n_steps, int) else None
+        with keep_programs(when=program not in self._called):
+            out = step(inputs, n_steps)
+        self._called.add(program)
         leaves = with_leaves(flat.leaves, plan.written, out)  # type: ignore[arg-type]  # a list, but for a host call
         leaves[plan.synced] = self._false(leaves[plan.synced])
         return FlatData(leaves, flat.treedef, plan, flat.packed)

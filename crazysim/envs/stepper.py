@@ -11,6 +11,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from crazysim import jaxcompat
+from crazysim.cache import keep_programs
 from crazysim.core.stage import with_leaves
 from crazysim.envs.fused_step import FusedEnvStep, PackedState
 from crazysim.envs.state import EnvState, bare
@@ -37,7 +39,10 @@ class EnvStepper:
 
     @state.setter
     def state(self, state: EnvState) -> None:
-        state = bare(state).replace(obs={})
+        with keep_programs():
+            self._hold(bare(state).replace(obs={}))
+
+    def _hold(self, state: EnvState) -> None:
         leaves, treedef = jax.tree.flatten(state)
         structure = (treedef, [(x.shape, x.dtype) for x in leaves])
         if self._steps is None or structure != self._structure:
@@ -63,7 +68,9 @@ class EnvStepper:
         """
         if self._steps is None:
             raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
-        return self._steps.step(actions)
+        compiled = self._steps.compiled
+        with keep_programs(when=compiled is None or not jaxcompat.n_compilations(compiled)):
+            return self._steps.step(actions)
 
 
 class _PackedSteps:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 from jax import Array
 
+from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
@@ -71,13 +72,15 @@ class SceneQueries:
         """Return the result of a query about poses, which is compiled once for its settings."""
         if self._model is not self._scene.mj_model:
             self._model, self._compiled = self._scene.mj_model, {}
-        if (name, *settings) not in self._compiled:
+        first = (name, *settings) not in self._compiled
+        if first:
             self._compiled[name, *settings] = jax.jit(_of_poses(build(), data))
         states, objects = data.states, data.objects
         # Only what the query needs: a compiled call costs by the number of its arrays.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
-        return self._compiled[name, *settings](*poses, mocap)
+        with keep_programs(when=first):
+            return self._compiled[name, *settings](*poses, mocap)
 
     def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""

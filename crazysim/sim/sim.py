@@ -14,6 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.cache import keep_programs
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import DEFAULT
 from crazysim.core import functional as F
@@ -80,6 +81,7 @@ class Sim:
     plugins: PluginRegistry
     """The plugins by name, in the order in which they were added."""
 
+    @keep_programs()
     def __init__(
         self,
         n_worlds: int = 1,

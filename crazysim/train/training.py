@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 import crazysim
-from crazysim.cache import announced
+from crazysim.cache import announced, keep_programs
 from crazysim.core.settings import positive
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
@@ -110,6 +110,7 @@ def train(
     kept_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
     _make_folder(folder)
 
+    @keep_programs()
     def start() -> tuple[Learner, Policy]:
         if resume:
             files = checkpoint.restore(path, stored, {"learner": shapes, "kept": kept_shapes})
@@ -118,11 +119,13 @@ def train(
         learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
         return learner, learner.as_policy()
 
+    @keep_programs()
     def compile_evaluation() -> dict[str, Any]:
         zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), kept_shapes)
         evaluate(eval_env, jax.device_put(zeros, base.sim.device))
         return describe(base)
 
+    @keep_programs()
     def compile_iteration() -> tuple[Any, float]:
         compiling = time.perf_counter()
         compiled = algorithm.iterate.lower(_on_device(shapes, base.sim.device), env, hyperparameters).compile()

@@ -7,6 +7,7 @@ package, no compiler on the machine, and no Python at run time.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dataclasses
 import functools
@@ -21,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
+from crazysim.engine.backends import kernel_cache
 from crazysim.engine.backends.exchange import WARP
 from crazysim.engine.backends.frame import UNBOUNDED, Kernel, interval
 from crazysim.engine.backends.native import Launch
@@ -232,9 +234,35 @@ def nvrtc() -> ctypes.CDLL | None:
 
 
 def _compile(source: str, arch: str, kind: str) -> bytes:
+    """Return what NVRTC makes of a source, from the cache of kernels if it is there.
+
+    Args:
+        source: The source.
+        arch: Architecture.
+        kind: ``"PTX"`` or ``"CUBIN"``.
+
+    Raises:
+        KernelError: If NVRTC is missing, or refuses the source, with its message.
+    """
     library = nvrtc()
     if library is None:
         raise KernelError("NVRTC was not found; it comes with pip install 'jax[cuda13]' or 'jax[cuda12]'")
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+    key = kernel_cache.digest(source, arch, kind, *OPTIONS, f"{major.value}.{minor.value}")
+    place = kernel_cache.folder()
+    for path in kernel_cache.find(place, key):
+        with contextlib.suppress(OSError):  # another process has removed it
+            return path.read_bytes()
+    image = _run(library, source, arch, kind)
+    if place != kernel_cache.temporary():
+        with contextlib.suppress(OSError):  # its disk is full
+            kernel_cache.store(place, key, image, f".{kind.lower()}")
+    return image
+
+
+def _run(library: ctypes.CDLL, source: str, arch: str, kind: str) -> bytes:
+    """Return what NVRTC makes of a source."""
     program = ctypes.c_void_p()
     library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)
     try:

@@ -22,12 +22,13 @@ import re
 import shutil
 import stat
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from crazysim import jaxcompat
+from crazysim import cache
 from crazysim.trust import REMEDY, distrust, make_private
 
 LENGTH = 24
@@ -47,10 +48,10 @@ def digest(*parts: str | bytes) -> str:
 
 
 def folder() -> Path:
-    """Return the folder of compiled kernels: beside JAX's compilation cache, or of this process alone."""
-    cache = jaxcompat.cache_folder()
-    if cache is not None:
-        shared = Path(cache) / "crazysim"
+    """Return the folder of compiled kernels: in that of compiled programs, or of this process alone."""
+    kept = cache.folder()
+    if kept is not None:
+        shared = kept / "crazysim"
         with contextlib.suppress(OSError):
             make_private(shared)
         if shared.is_dir():
@@ -154,8 +155,8 @@ def _abandoned(name: str, age: float) -> bool:
 
 def find(place: Path, key: str) -> Iterator[Path]:
     """Yield the intact files of a key; damaged ones are removed, and those of other users are left out."""
-    for path in sorted(place.glob(f"{key}-*.so")):
-        if distrust(path):
+    for path in sorted(place.glob(f"{key}-*")):
+        if path.suffix == ".tmp" or distrust(path):
             continue
         try:
             intact = path.stem == f"{key}-{digest(path.read_bytes())}"
@@ -168,9 +169,24 @@ def find(place: Path, key: str) -> Iterator[Path]:
                 path.unlink()
 
 
-def store(place: Path, key: str, made: Path) -> Path:
-    """Move a file that was made in the same folder to the name of its key and contents, and return it."""
-    path = place / f"{key}-{digest(made.read_bytes())}.so"
-    made.chmod(0o700)
-    made.replace(path)
+def store(place: Path, key: str, content: bytes, suffix: str) -> Path:
+    """Write a file into a folder, under the name of its key and contents, and return it.
+
+    Args:
+        place: The folder.
+        key: The key.
+        content: Contents.
+        suffix: End of the name, such as ``".so"``.
+
+    Raises:
+        OSError: If the folder cannot be written, or its disk is full.
+    """
+    path = place / f"{key}-{digest(content)}{suffix}"
+    part = place / f"{path.stem}.{owner()}-{threading.get_ident()}.tmp"
+    try:
+        part.touch(mode=0o700)
+        part.write_bytes(content)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
     return path

@@ -24,6 +24,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
+from crazysim.cache import cpu_features
 from crazysim.engine.backends import kernel_cache
 from crazysim.engine.backends.frame import Kernel, interval
 from crazysim.engine.errors import KernelError
@@ -57,9 +58,6 @@ kill -9 $!
 exit $status"""
 """Script that runs a command whose input is a pipe to this process. When the pipe closes, which is at the latest when
 this process ends, however it ends, it kills the command with all its children."""
-
-CPU_INFO = Path("/proc/cpuinfo")
-"""File in which Linux lists the features of the CPU."""
 
 KEPT = 256 * 1024
 """Memory of what the steps begin with that a core goes back through at once, bytes: as much as is near to it."""
@@ -199,19 +197,9 @@ def toolchain(words: tuple[str, ...]) -> str:
     versions of JAX and of this package.
     """
     # Asked for its steps, a compiler prints its version and the options that -march=native is replaced by.
-    steps = _run([*words, "-fsyntax-only", "-x", "c++", os.devnull, "-###"], kernel_cache.temporary(), TIMEOUT)
+    steps = _run([*words, "-fsyntax-only", "-x", "c++", os.devnull, "-###"], kernel_cache.temporary(), limit())
     libc = " ".join(platform.libc_ver())
     return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
-
-
-def cpu_features() -> str:
-    """Return the architecture of the CPU and, where the system lists them, its features."""
-    try:
-        lines = CPU_INFO.read_text().splitlines()
-    except OSError:
-        lines = []
-    listed = next((line for line in lines if line.split(":")[0].strip().lower() in ("flags", "features")), "")
-    return f"{platform.machine()} {platform.processor()} {listed}"
 
 
 def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
@@ -221,10 +209,12 @@ def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
         library = _loaded(path)
         if library is not None:
             return library
+    made = _compile(words, source)
     for where in dict.fromkeys((place, kernel_cache.temporary())):  # code in a shared folder may not be executable
-        library = _loaded(_compile(words, key, source, where))
-        if library is not None:
-            return library
+        with contextlib.suppress(OSError):  # its disk is full
+            library = _loaded(kernel_cache.store(where, key, made, ".so"))
+            if library is not None:
+                return library
     raise KernelError(f"the kernel that {words[0]} compiled cannot be loaded; check that it compiles for this machine")
 
 
@@ -237,8 +227,8 @@ def _loaded(path: Path) -> ctypes.CDLL | None:
     return library if hasattr(library, "crazysim_call") else None
 
 
-def _compile(words: Sequence[str], key: str, source: str, place: Path) -> Path:
-    """Compile a kernel into a folder, and return the file.
+def _compile(words: Sequence[str], source: str) -> bytes:
+    """Compile a kernel, and return the library's contents.
 
     Raises:
         ConfigError: If CXX, CXXFLAGS or the limit of time is wrong.
@@ -250,20 +240,17 @@ def _compile(words: Sequence[str], key: str, source: str, place: Path) -> Path:
             f"a kernel of {n_lines:,} lines takes {words[0]} longer than {seconds:g} s; use loops (lax.fori_loop) for "
             f"what is unrolled, or set CRAZYSIM_COMPILE_TIMEOUT to a larger number of seconds"
         )
-    made = place / f"{key}.{kernel_cache.owner()}-{threading.get_ident()}.tmp"
-    work = Path(tempfile.mkdtemp(dir=kernel_cache.temporary()))
-    try:
-        (work / "kernel.cpp").write_text(source)
-        done = _run([*words, str(work / "kernel.cpp"), "-o", str(made)], work, seconds)
-        if done.returncode:
-            _check_settings(work)
-            raise KernelError(f"{words[0]} refused the kernel: {done.stderr.strip()[:2000]}")
-        return kernel_cache.store(place, key, made)
-    except OSError as error:
-        raise KernelError(f"{words[0]} left no library: {error}") from error
-    finally:
-        made.unlink(missing_ok=True)
-        shutil.rmtree(work, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as name:
+        work, made = Path(name), Path(name) / "kernel.so"
+        try:
+            (work / "kernel.cpp").write_text(source)
+            done = _run([*words, str(work / "kernel.cpp"), "-o", str(made)], work, seconds)
+            if done.returncode:
+                _check_settings(work)
+                raise KernelError(f"{words[0]} refused the kernel: {done.stderr.strip()[:2000]}")
+            return made.read_bytes()
+        except OSError as error:
+            raise KernelError(f"{words[0]} left no library: {error}") from error
 
 
 def _check_settings(work: Path) -> None:
@@ -279,7 +266,7 @@ def _check_settings(work: Path) -> None:
 
     def error(options: bool) -> str:
         words = [*command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
-        done = _run(words, work, TIMEOUT)
+        done = _run(words, work, limit())
         return (done.stderr.strip()[:500] or f"exit status {done.returncode}") if done.returncode else ""
 
     message = error(options=True)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import jaxcompat
+from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
@@ -86,7 +87,9 @@ class Reset:
         Raises:
             ConfigError: If the mask has another shape or type.
         """
-        return self._compiled(data, default_data, as_mask(mask, data.core.steps.shape[:1]))
+        mask = as_mask(mask, data.core.steps.shape[:1])
+        with keep_programs(when=not self._cache_size()):
+            return self._compiled(data, default_data, mask)
 
     def plain(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
         """Return the same, without a compiled call."""
