@@ -20,6 +20,8 @@ TESTS ?= tests/laws tests/golden tests/core tests/dynamics tests/drones \
   $(call tests_of,geometry,heightfield manifold rays shapes) \
   $(call tests_of,scene,build contact_report contacts sync) \
   tests/trajectories/test_formation.py
+# Tests start processes that import JAX: without bytecode each takes seconds more.
+unexport PYTHONDONTWRITEBYTECODE
 export MUJOCO_GL ?= $(if $(DISPLAY),glfw,egl)
 
 .PHONY: demo test test-rest test-all test-gpu check docs format benchmark clean

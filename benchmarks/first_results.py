@@ -54,7 +54,7 @@ print(env.step(np.zeros((16, 4), np.float32))[1])
 print(crazysim.Sim().render("rgb_array").mean())
 """,
 }
-"""Programs after ``import crazysim; crazysim.enable_cache()``."""
+"""Programs after ``import crazysim``."""
 
 
 def main() -> None:
@@ -77,7 +77,7 @@ def main() -> None:
 def measured(case: str, cache: str) -> tuple[float, float]:
     """Return the wall time and the CPU time of a process, s."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {VARIABLE: cache}
-    program = f"import crazysim\ncrazysim.enable_cache()\n{CASES[case]}"
+    program = f"import crazysim\n{CASES[case]}"
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-c", program], env=environment, check=True, stdout=subprocess.DEVNULL)
     wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -1,6 +1,6 @@
 """The folder in which compiled programs and kernels are kept between processes.
 
-The engine keeps its kernels there without being asked, and crazysim the XLA programs that it compiles itself
+The engine keeps its kernels there by default, and crazysim the XLA programs that it compiles itself
 (``keep_programs``). ``enable_cache`` keeps all programs of the process, the user's own included. What JAX is configured
 to use comes first: its folder then holds the kernels, too, and nothing of its configuration is changed.
 """
@@ -53,7 +53,7 @@ def caches_folder() -> Path:
         return Path.home() / ".cache" / "crazysim"
     except RuntimeError:
         raise ConfigError(
-            f"expected a home folder for compiled programs, got none. Set {VARIABLE} to a folder, or to off."
+            f"expected a home folder for compiled programs, got none. Set XDG_CACHE_HOME, or {VARIABLE}, to a folder."
         ) from None
 
 
@@ -110,8 +110,7 @@ def _usable(*environment: str | None) -> Path | None:
     try:
         path = default_cache()
         if path is not None:
-            _prepare(path)
-            trim(path.parent)
+            _prepare(path.parent, path)
     except ConfigError as error:
         message = f"compiled programs are not kept: {error}"
         print(message if VARIABLE in message else f"{message} {VARIABLE} names another.", file=sys.stderr)
@@ -119,14 +118,19 @@ def _usable(*environment: str | None) -> Path | None:
     return path
 
 
-def _prepare(path: Path) -> None:
-    """Make the folder of a cache.
+def _prepare(root: Path, path: Path) -> None:
+    """Make the folder of a cache, and remove what is too much in it.
+
+    Args:
+        root: Folder whose size is limited.
+        path: The same folder, or one in it.
 
     Raises:
         ConfigError: If it cannot be made or written, belongs to another user, or its disk is full.
     """
     try:
-        make_private(path)
+        for folder in (root, path):
+            make_private(folder)
         free = shutil.disk_usage(path).free
     except OSError as error:
         raise ConfigError(
@@ -141,6 +145,7 @@ def _prepare(path: Path) -> None:
             f"expected {MIN_FREE / 1e6:g} MB of free space for compiled programs, got {free / 1e6:.1f} MB in "
             f"{str(path)!r}. Free some, or use another folder."
         )
+    trim(root)
 
 
 def enable_cache(
@@ -170,8 +175,7 @@ def enable_cache(
     path = default_cache() if cache_path is None else Path(cache_path)
     if path is None:
         return None
-    _prepare(path)
-    trim(path if cache_path is not None else path.parent)
+    _prepare(path if cache_path is not None else path.parent, path)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", min_entry_size_bytes)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time_secs)

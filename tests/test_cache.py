@@ -1,16 +1,20 @@
 """The cache of compiled programs: where it is, what it keeps, and what a user reads of it."""
 
 import os
+import shutil
 import subprocess
 import sys
 import threading
 import time
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from crazysim import cache
-from crazysim.cache import announce, announced, default_cache, enable_cache, enable_for_command, trim
+from crazysim.cache import announce, announced, default_cache, enable_cache, enable_for_command, keep_programs, trim
+from crazysim.engine.backends import kernel_cache
+from crazysim.errors import ConfigError
 
 PROGRAM = """
 import sys
@@ -39,14 +43,130 @@ def settings(monkeypatch):
 
 def test_the_folder_is_that_of_the_variable_or_in_the_folder_of_caches(settings, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert default_cache() == tmp_path / ".cache" / "crazysim" / "jax"
+    assert default_cache().parent == tmp_path / ".cache" / "crazysim" / "jax"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # ignored, as the specification of XDG says
-    assert default_cache() == tmp_path / ".cache" / "crazysim" / "jax"
+    assert default_cache().parent == tmp_path / ".cache" / "crazysim" / "jax"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert default_cache() == tmp_path / "xdg" / "crazysim" / "jax"
+    assert default_cache().parent == tmp_path / "xdg" / "crazysim" / "jax"
     monkeypatch.setenv(cache.VARIABLE, "~/mine")
-    assert enable_cache() == tmp_path / "mine"
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "mine")
+    assert enable_cache() == default_cache()
+    assert default_cache().parent == tmp_path / "mine"
+    assert jax.config.jax_compilation_cache_dir == str(default_cache())
+
+
+def test_each_kind_of_cpu_has_a_folder_of_its_own(settings, monkeypatch, tmp_path):
+    """XLA's programs are machine code whose key does not hold the features of the CPU."""
+    info = tmp_path / "cpuinfo"
+    monkeypatch.setattr(cache, "CPU_INFO", info)
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "kept"))
+    folders = set()
+    for features in ("fpu avx512f", "fpu avx2", "fpu avx512f"):
+        info.write_text(f"flags : {features}\n")
+        folders.add(default_cache())
+    assert len(folders) == 2
+
+
+def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkeypatch, tmp_path):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = [getattr(jax.config, name) for name in names]
+
+    def kept():
+        return {path.name.split("-")[0] for path in default_cache().glob("*-cache")}
+
+    with keep_programs():
+        with keep_programs():
+            jax.jit(_inner)(jnp.ones(7))
+        jax.jit(_after)(jnp.ones(7))
+    jax.jit(_outside)(jnp.ones(7))
+    assert {"jit__inner", "jit__after"} <= kept()
+    assert "jit__outside" not in kept()
+    assert [getattr(jax.config, name) for name in names] == before
+    own = tmp_path / "own"
+    jax.config.update("jax_compilation_cache_dir", str(own))  # JAX opens a cache once a process
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    with keep_programs():
+        jax.jit(_of_user)(jnp.ones(7))
+    assert [path.name.split("-")[0] for path in own.glob("jit__of_user*-cache")] == ["jit__of_user"]
+    assert "jit__of_user" not in kept()
+
+
+def _inner(x):
+    return jnp.cos(x) * 2
+
+
+def _after(x):
+    return jnp.cos(x) * 3
+
+
+def _outside(x):
+    return jnp.cos(x) * 4
+
+
+def _of_user(x):
+    return jnp.cos(x) * 5
+
+
+SNIPPET = """
+import jax
+import numpy as np
+from crazysim import Sim
+from crazysim import functional as F
+sim = Sim(n_worlds=2, n_drones=2, control="state")
+sim.step()
+print(sim.contacts().any(), sim.data.states.pos[0, 0])
+step = sim.build_step_fn()
+print(jax.grad(lambda z: step(F.state_control(sim.data, pos=z * np.eye(3)[2]), 10).states.pos[..., 2].mean())(1.0))
+print(jax.config.jax_compilation_cache_dir)
+"""
+
+
+def test_a_second_process_finds_what_the_first_one_compiled_without_being_asked(tmp_path):
+    def run(folder):
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "CRAZYSIM"))}
+        environment |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu", "CXX": f"{folder / 'g++'}"}
+        command = [sys.executable, "-c", SNIPPET]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+        return done.stdout, (folder / "compiled").read_text().count("kernel.cpp") if folder.exists() else 0
+
+    script = tmp_path / "bin" / "g++"
+    script.parent.mkdir()
+    script.write_text(f'#!/bin/sh\necho "$@" >> {script.parent}/compiled\nexec {shutil.which("g++")} "$@"\n')
+    script.chmod(0o755)
+    first, n_first = run(script.parent)
+    programs = sorted((tmp_path / "crazysim").rglob("*-cache"))
+    second, n_second = run(script.parent)
+    assert first == second
+    assert first.splitlines()[-1] == "None", "JAX's own configuration is left alone"
+    assert n_first == n_second >= 2, "nothing is compiled again"
+    assert any(path.name.startswith("jit_sync_sim2mjx") for path in programs)
+    assert sorted((tmp_path / "crazysim").rglob("*-cache")) == programs
+
+
+@pytest.mark.parametrize("fault", ["file", "full", "homeless"])
+def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings, monkeypatch, tmp_path, capsys, fault):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    if fault == "file":
+        (tmp_path / "caches").write_text("")
+    elif fault == "full":
+        monkeypatch.setattr(cache.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, 0))
+    else:
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for a user without an entry in passwd
+    cache._usable.cache_clear()
+    for _ in range(2):
+        with keep_programs():
+            jax.jit(_inner)(jnp.ones(3))
+        assert kernel_cache.folder() == kernel_cache.temporary()
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert told.startswith("compiled programs are not kept: expected ")
+    assert cache.VARIABLE in told
+    with pytest.raises(ConfigError, match="expected"):
+        enable_cache()
+    cache._usable.cache_clear()
 
 
 def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_path, capsys):
@@ -67,10 +187,11 @@ def test_a_command_tells_once_and_leaves_the_cache_that_jax_has(settings, monkey
     assert "1 GB" in told
     jax.config.update("jax_compilation_cache_dir", None)
     enable_for_command()
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kept")
+    kept = str(default_cache())
+    assert jax.config.jax_compilation_cache_dir == kept
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "other"))
     enable_for_command()
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kept")
+    assert jax.config.jax_compilation_cache_dir == kept
     assert capsys.readouterr().err == ""
 
 
@@ -113,15 +234,13 @@ def test_a_second_command_reads_the_cache_in_silence(tmp_path):
     assert not folder.exists(), "a report of bugs changes nothing"
     first = run("train")
     assert first.stderr.startswith(f"compiled programs are kept in {folder}")
-    programs = set(folder.iterdir())
+    programs = set(folder.glob("cpu-*/*-cache"))
     assert programs
     assert folder.stat().st_mode & 0o077 == 0
     second = run("train")
     assert second.stderr == ""
     assert second.stdout == first.stdout
-    assert {path for path in folder.iterdir() if path.name.endswith("-cache")} == {
-        path for path in programs if path.name.endswith("-cache")
-    }
+    assert set(folder.glob("cpu-*/*-cache")) == programs
 
 
 def test_long_work_is_announced_once_for_each_kind(settings, capsys):
@@ -129,7 +248,7 @@ def test_long_work_is_announced_once_for_each_kind(settings, capsys):
         announce(work, "5 s")
     told = capsys.readouterr().err.splitlines()
     assert [line.split(":")[0] for line in told] == ["compiling this", "compiling that"]
-    assert all("5 s" in line and "enable_cache" in line for line in told)
+    assert all("5 s on two cores, less in later runs" in line for line in told)
 
 
 def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):

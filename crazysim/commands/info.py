@@ -28,18 +28,19 @@ VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XL
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the command that describes the installation."""
-    parser = commands.add_parser("info", help="print versions, devices, compiler and caches, for reports of bugs")
+    parser = commands.add_parser("info", help="print versions, devices, compiler and cache, for reports of bugs")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print versions, devices, compiler, caches and rendering of this installation, a line each.
+    """Print versions, devices, compiler, cache and rendering of this installation, a line each.
 
     A part that is missing or broken is a line with the reason.
     """
     del options
     text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _parts())
-    print(text.replace(f"{Path.home()}{os.sep}", f"~{os.sep}"))  # reports are public
+    home = os.path.expanduser("~")
+    print(text.replace(f"{home}{os.sep}", f"~{os.sep}") if home != "~" else text)  # reports are public
 
 
 def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
@@ -53,7 +54,7 @@ def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
     yield "devices", _devices
     yield "C++ compiler", _compiler
     yield "NVRTC", _nvrtc
-    yield "caches", _caches
+    yield "cache", _cache
     yield "rendering", _rendering
     yield "variables", _variables
 
@@ -98,7 +99,7 @@ def _compiler() -> str:
 
     program = native.compiler()
     if program is None:
-        return "none; steps run on a slower engine. Install g++ or clang++."
+        return f"none; steps run on a slower engine: {native.MISSING}"
     done = subprocess.run([*shlex.split(program), "--version"], capture_output=True, text=True, timeout=20, check=False)
     return f"{program}, {_first_line(done.stdout or done.stderr)}; {shlex.join(native.command()[1:])}"
 
@@ -110,21 +111,18 @@ def _nvrtc() -> str:
     return "not found; needed for GPUs only" if library is None else str(library._name)
 
 
-def _caches() -> str:
+def _cache() -> str:
     from crazysim import jaxcompat
     from crazysim.cache import default_cache
     from crazysim.trust import distrust
 
-    default, used = default_cache(), jaxcompat.cache_folder()
-    folders = {} if default is None else {default: ""}
-    if used is not None:
-        folders[Path(used)] = " (in use)"
-    described = []
-    for folder, remark in folders.items():
-        reason = distrust(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
-        size = _size(folder) if folder.is_dir() else "not there"
-        described.append(f"{folder}{remark}: {size}" + (f", kernels refused: {reason}" if reason else ""))
-    return "; ".join(described) or "none"
+    configured = jaxcompat.cache_folder()
+    folder = default_cache() if configured is None else Path(configured)
+    if folder is None:
+        return "off"
+    reason = distrust(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
+    size = _size(folder) if folder.is_dir() else "not there yet"
+    return f"{folder}: {size}" + (f", kernels refused: {reason}" if reason else "")
 
 
 def _size(folder: Path) -> str:

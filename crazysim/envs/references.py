@@ -17,6 +17,7 @@ from collections.abc import Container
 from pathlib import Path
 from types import ModuleType
 
+from crazysim.cache import caches_folder
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError
 from crazysim.trust import distrust, make_private
@@ -167,21 +168,26 @@ def _from_module(name: str) -> ModuleType:
 
 
 def _list_path() -> Path:
-    """Return the file with the references that this user has named, a line each."""
-    return Path.home() / ".cache" / "crazysim" / "tasks"
+    """Return the file with the references that this user has named, a line each.
+
+    Raises:
+        ConfigError: If the user has no home folder.
+    """
+    return caches_folder() / "tasks"
 
 
 def _noted() -> list[str]:
-    path = _list_path()
-    if not path.is_file() or distrust(path):
-        return []
-    return path.read_text(encoding="utf-8").splitlines()
+    with contextlib.suppress(ConfigError):
+        path = _list_path()
+        if path.is_file() and not distrust(path):
+            return path.read_text(encoding="utf-8").splitlines()
+    return []
 
 
 def _note(reference: str) -> None:
     """Add a reference to the list; where that is impossible, it is to be named again in another process."""
-    path = _list_path()
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ConfigError):
+        path = _list_path()
         make_private(path.parent)
         if distrust(path.parent) or reference in _noted():
             return

@@ -85,9 +85,7 @@ def test_a_folder_of_another_user_is_refused(cache):
 def test_a_file_of_another_user_is_not_loaded(cache):
     """It may have been put there before the folder was closed."""
     folder = kernel_cache.folder()
-    made = folder / "made.tmp"
-    made.write_bytes(b"library")
-    library = kernel_cache.store(folder, "key", made)
+    library = kernel_cache.store(folder, "key", b"library", ".so")
     assert list(kernel_cache.find(folder, "key")) == [library]
     os.chown(library, OTHERS, OTHERS)
     assert not list(kernel_cache.find(folder, "key"))

@@ -2,9 +2,11 @@
 
 import ctypes
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +14,9 @@ import pytest
 from cases import shared_sim
 from waiting import wait_for
 
+from crazysim.cache import default_cache
 from crazysim.engine import Step
-from crazysim.engine.backends import kernel, kernel_cache, native
+from crazysim.engine.backends import fused, kernel, kernel_cache, native
 from crazysim.engine.errors import KernelError
 from crazysim.errors import ConfigError
 from crazysim.sim import Sim
@@ -60,7 +63,7 @@ def fake_compiler(folder, monkeypatch, version="1.0", march="znver3"):
     """Put a script in place of the compiler that says which machine it compiles for."""
     script = folder / "c++"
     script.write_text(
-        f'#!/bin/sh\ncase "$*" in *fsyntax-only*) echo "gcc version {version} -march={march}" >&2; exit 0;; esac\n'
+        f'#!/bin/sh\ncase "$*" in *"-###"*) echo "gcc version {version} -march={march}" >&2; exit 0;; esac\n'
         f'exec {COMPILER} "$@"\n'
     )
     script.chmod(0o755)
@@ -93,7 +96,7 @@ def test_the_key_holds_machine_compiler_and_versions(source, place, compilations
     fake_compiler(folder, monkeypatch)
     info = folder / "cpuinfo"
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2 avx512f\n")
-    monkeypatch.setattr(native, "CPU_INFO", info)
+    monkeypatch.setattr("crazysim.cache.CPU_INFO", info)
     changed("another CPU")
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2\n")
     changed("a CPU with fewer features")
@@ -127,9 +130,7 @@ def test_a_library_that_does_not_load_here_is_compiled_again(source, place, comp
     key = native.target(source).removeprefix("crazysim_advance_")
     (library,) = place.iterdir()
     library.unlink()
-    foreign = place / f"{key}.tmp"
-    foreign.write_bytes(b"\x7fELF of another machine")
-    foreign = kernel_cache.store(place, key, foreign)
+    foreign = kernel_cache.store(place, key, b"\x7fELF of another machine", ".so")
     again(source)
     assert len(compilations) == 2
     assert foreign.exists()
@@ -141,7 +142,7 @@ def test_a_folder_that_forbids_execution_does_no_harm(source, place, compilation
     real = native._loaded
     monkeypatch.setattr(native, "_loaded", lambda path: None if path.is_relative_to(place) else real(path))
     native.target(source)
-    assert len(compilations) == 2  # once more, in a folder of this process
+    assert len(compilations) == 1
 
 
 def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):
@@ -158,14 +159,13 @@ def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_facto
     """The name of a library appears when it is complete, and a compiler that fails leaves nothing behind."""
     listed = []
 
-    def run(*args, real=native._run):
-        done = real(*args)
+    def replace(self, target, real=Path.replace):
         listed.append([p.suffix for p in place.iterdir()])
-        return done
+        return real(self, target)
 
-    monkeypatch.setattr(native, "_run", run)
+    monkeypatch.setattr(Path, "replace", replace)
     native.target(source)
-    assert listed == [[], [".tmp"]]
+    assert listed == [[".tmp"]]
     assert [p.suffix for p in place.iterdir()] == [".so"]
 
     monkeypatch.setenv("CXXFLAGS", "-std=c++98")
@@ -182,7 +182,10 @@ def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatc
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
     assert kernel_cache.folder() == tmp_path / "crazysim"
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: None)
+    monkeypatch.setenv("CRAZYSIM_CACHE", "off")
     assert kernel_cache.folder() == kernel_cache.temporary()
+    monkeypatch.setenv("CRAZYSIM_CACHE", str(tmp_path / "kept"))
+    assert kernel_cache.folder() == default_cache() / "crazysim"
 
 
 def test_boundaries_between_the_parts_of_a_key_count():
@@ -244,7 +247,7 @@ def test_lines_that_select_count_for_more(place, monkeypatch):
         ("x = select_n_(a, b, c);", 4_200, KernelError),
     ):
         with pytest.raises(error):
-            native._compile(["g++"], "key", f"{line}\n" * n_lines, place)
+            native._compile(["g++"], f"{line}\n" * n_lines)
 
 
 def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
@@ -257,17 +260,45 @@ def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
         native.compiler.cache_clear()
 
 
+def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place, monkeypatch, tmp_path_factory):
+    """Without its libraries, in one second rather than twenty; the key does not hold the working directory."""
+    pytest.importorskip("ziglang")
+    monkeypatch.setenv("CXXFLAGS", "")  # the tests have options of g++
+    which = shutil.which
+    monkeypatch.setattr(native.shutil, "which", lambda name, path=None: path and which(name, path=path))
+    monkeypatch.delenv("CXX", raising=False)
+    native.compiler.cache_clear()
+    try:
+        assert Path(native.command()[0]).name.startswith("zig")
+        name = native.target(source)
+        monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+        assert again(source) == name
+        assert len(list(place.iterdir())) == 1
+        assert not any(p.is_dir() for p in kernel_cache.temporary().iterdir()), "zig keeps nothing"
+    finally:
+        native.compiler.cache_clear()
+
+
+def test_without_any_compiler_one_line_names_the_remedy(monkeypatch, capsys):
+    monkeypatch.setattr(native, "compiler", lambda: None)
+    fused._announce_missing.cache_clear()
+    assert fused.missing("cpu") == fused.missing("cpu") == native.MISSING
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "pip install 'crazysim[compiler]'" in told
+
+
 COMPILE = """
 import signal, sys
-from pathlib import Path
 from crazysim.engine.backends import native
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it runs in the background
 slow = "constexpr long f() { long s = 0; for (long i = 0; i < 1000000000; i++) s += i; return s; }"
 slow += "constexpr long x = f();"
 flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
-source = "int x;" if sys.argv[2] == "quick" else slow
-compile = lambda key: native._compile([*native.command(), *flags], key, source, Path(sys.argv[1]))
-if sys.argv[2] == "threads":
+quick = 'extern "C" __attribute__((visibility("default"))) int crazysim_call = 1;'
+source = quick if sys.argv[1] == "quick" else slow
+compile = lambda key: native._library([*native.command(), *flags], key, source)
+if sys.argv[1] == "threads":
     with native.compiling_threads(2) as pool:
         list(pool.map(compile, "abcd"))
 else:
@@ -277,10 +308,10 @@ else:
 
 def compile_in_another_process(folder, speed):
     """Start a process that compiles a kernel into a folder."""
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "TMPDIR": str(folder)}
     place = folder / "cache"
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "TMPDIR": str(folder), "JAX_COMPILATION_CACHE_DIR": str(place)}
     place.mkdir(exist_ok=True)
-    return subprocess.Popen([sys.executable, "-c", COMPILE, place, speed], env=environment, stderr=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-c", COMPILE, speed], env=environment, stderr=subprocess.DEVNULL)
 
 
 def compilers(folder):
@@ -303,7 +334,7 @@ def test_compilers_end_with_their_process(tmp_path, end, where):
             process.kill()
     wait_for(lambda: not compilers(tmp_path))
     assert compile_in_another_process(tmp_path, "quick").wait(300) == 0
-    assert [path.suffix for path in (tmp_path / "cache").iterdir()] == [".so"]
+    assert [path.suffix for path in (tmp_path / "cache" / "crazysim").iterdir()] == [".so"]
     assert [path.name for path in tmp_path.iterdir()] == ["cache"]
 
 
@@ -329,7 +360,7 @@ def test_two_machines_share_a_home(tmp_path):
     """
     other = tmp_path / "cpuinfo"
     other.write_text("flags : none of the first machine's\n")
-    swap = f"import pathlib, crazysim.engine.backends.native as n; n.CPU_INFO = pathlib.Path({str(other)!r})\n"
+    swap = f"import pathlib, crazysim.cache as c; c.CPU_INFO = pathlib.Path({str(other)!r})\n"
     speeds, files = [], []
     for begin in ("", swap, ""):
         done = subprocess.run(

@@ -5,6 +5,8 @@ A call of a kernel is a primitive of its own, which becomes the kernel of the pl
 
 from __future__ import annotations
 
+import functools
+import sys
 import weakref
 from collections.abc import Sequence
 from functools import partial
@@ -95,7 +97,16 @@ def missing(platform: str) -> str | None:
         )
     if platform != "cpu":
         return f"there are no kernels for {platform}"
-    return None if native.compiler() else "no C++ compiler was found (g++, clang++, or the variable CXX)"
+    if native.compiler():
+        return None
+    _announce_missing()
+    return native.MISSING
+
+
+@functools.cache
+def _announce_missing() -> None:
+    """Print, once, that simulations on the CPU are slow, and the remedy."""
+    print(f"simulations run on XLA, up to ten times slower: {native.MISSING}", file=sys.stderr)
 
 
 class FusedRun:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import importlib.util
 import math
 import os
 import platform
@@ -37,6 +38,13 @@ FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-
 """Options of the compiler, before those of the variable CXXFLAGS. Products and sums may be contracted; no option
 assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them without a sign."""
 
+ZIG = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
+"""Arguments that make zig a compiler of kernels. As ``c++``, or without ``-nostdlib``, it would first compile libraries
+that kernels do not need, for 20 s."""
+
+MISSING = "no C++ compiler was found; run pip install 'crazysim[compiler]', install g++ or clang++, or set CXX"
+"""Reason why there are no kernels on the host, and the remedy."""
+
 TIMEOUT = 300.0
 """Time that the compiler may take, s, unless the variable CRAZYSIM_COMPILE_TIMEOUT says otherwise."""
 
@@ -49,6 +57,9 @@ SELECTING = re.compile(r"^.*\b(?:select_n_|max_|min_|clamp_|at_least|at_most)\(.
 """Lines of a kernel that select between numbers."""
 SELECTION = 2.4
 """Lines that a selecting line counts for: by the same measurements those of conditions take 5.9 s for 10,000."""
+
+TEMPORARY = ("TMPDIR", "ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
+"""Variables that name the folder of a compiler's temporary files."""
 
 SHELL = """exec 3<&0 </dev/null
 (read -r _ <&3; kill -9 0) >/dev/null 2>&1 &
@@ -103,18 +114,25 @@ class HostLaunch:
 
 @functools.cache
 def compiler() -> str | None:
-    """Return the C++ compiler: that of the variable CXX, else the first that is found; None if there is none.
+    """Return the C++ compiler: that of the variable CXX, else g++, clang++ or that of ziglang; None if there is none.
 
     Raises:
         ConfigError: If there is no such program as CXX names.
     """
     chosen = _words("CXX")
     if not chosen:
-        return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None)
+        return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None) or _zig()
     path = shutil.which(chosen[0])
     if path is None:
         raise ConfigError(f"expected a C++ compiler in CXX, got {os.environ['CXX']!r}. Install it, or unset CXX.")
-    return shlex.join([path, *chosen[1:]])
+    return shlex.join([os.path.abspath(path), *chosen[1:]])
+
+
+def _zig() -> str | None:
+    """Return the command of the compiler in the package ziglang, which the extra ``compiler`` installs."""
+    package = importlib.util.find_spec("ziglang")
+    folders = [] if package is None else package.submodule_search_locations or []
+    return next((shlex.join([path, *ZIG]) for folder in folders if (path := shutil.which("zig", path=folder))), None)
 
 
 def command(options: bool = True) -> list[str]:
@@ -129,7 +147,7 @@ def command(options: bool = True) -> list[str]:
     """
     program = compiler()
     if program is None:
-        raise KernelError("no C++ compiler was found; install g++ or clang++, or set CXX")
+        raise KernelError(MISSING)
     return [*shlex.split(program), *FLAGS, *_words("CXXFLAGS" if options else ""), "-I", jaxcompat.ffi_include_folder()]
 
 
@@ -197,7 +215,9 @@ def toolchain(words: tuple[str, ...]) -> str:
     versions of JAX and of this package.
     """
     # Asked for its steps, a compiler prints its version and the options that -march=native is replaced by.
-    steps = _run([*words, "-fsyntax-only", "-x", "c++", os.devnull, "-###"], kernel_cache.temporary(), limit())
+    with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as work:
+        # Clang prints the working directory, too.
+        steps = _run([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), limit(), cwd=os.sep)
     libc = " ".join(platform.libc_ver())
     return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
 
@@ -301,13 +321,14 @@ _RUNNING: set[IO[str]] = set()
 """Pipes of the compilers that run; one that is closed ends its compiler."""
 
 
-def _run(words: Sequence[str], work: Path, seconds: float) -> subprocess.CompletedProcess[str]:
+def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = None) -> subprocess.CompletedProcess[str]:
     """Run the compiler, which ends with all its children when its time is over or this process ends.
 
     Args:
         words: Its command.
         work: Folder of its temporary files.
         seconds: Time that it may take, s.
+        cwd: Working directory; None for that of this process.
 
     Raises:
         KernelError: If it cannot be run, or takes too long.
@@ -318,7 +339,7 @@ def _run(words: Sequence[str], work: Path, seconds: float) -> subprocess.Complet
         try:
             process = subprocess.Popen(
                 ["/bin/sh", "-c", SHELL, "sh", *words], stdin=watched, stdout=pipe, stderr=pipe, text=True,
-                start_new_session=True, env=os.environ | {"TMPDIR": str(work)},
+                start_new_session=True, cwd=cwd, env=os.environ | dict.fromkeys(TEMPORARY, str(work)),
             )  # fmt: skip
         except OSError as error:
             raise KernelError(f"{words[0]} cannot be run: {error}") from error
