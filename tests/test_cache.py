@@ -122,6 +122,7 @@ print(jax.config.jax_compilation_cache_dir)
 """
 
 
+@pytest.mark.long("two processes import JAX and compile")
 def test_a_second_process_finds_what_the_first_one_compiled_without_being_asked(tmp_path):
     def run(folder):
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "CRAZYSIM"))}
@@ -219,6 +220,7 @@ def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path
     assert left() == {"crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache"}
 
 
+@pytest.mark.long("three processes import JAX")
 def test_a_second_command_reads_the_cache_in_silence(tmp_path):
     """XLA writes errors about features of the CPU for each program that it reads, if it is not told otherwise."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP", "CRAZYSIM"))}
