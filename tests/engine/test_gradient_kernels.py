@@ -94,6 +94,7 @@ def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
         np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
 
+@pytest.mark.long("compiles four gradients as kernels, and by XLA to compare")
 @needs_compiler
 def test_a_kernel_goes_back(x64, monkeypatch):
     """Twice with the same bits; in intervals too; for many batches of worlds; and it is differentiable once more."""
@@ -117,6 +118,7 @@ def test_a_kernel_goes_back(x64, monkeypatch):
     assert "lanes" not in explain(step, data)
 
 
+@pytest.mark.long("compiles kernels with many tangents")
 @needs_compiler
 def test_a_kernel_takes_tangents_along(x64):
     """Of one direction and of many, with respect to what drones have and to what they share; twice as well."""
@@ -134,6 +136,7 @@ def test_a_kernel_takes_tangents_along(x64):
     assert_same(jax.jit(tangent)(at[1]), jnp.einsum("wvdi,vdi->w", expected[0][1], at[1]))
 
 
+@pytest.mark.long("compiles second derivatives")
 @needs_compiler
 def test_second_derivatives_are_those_of_lanes(x64):
     """Forward over forward, and forward over reverse."""
@@ -168,6 +171,7 @@ def long(data):
     return data.replace(states=data.states.replace(force=jnp.zeros(3).at[1].set(1e-2 * x)))
 
 
+@pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_what_has_no_kernel_is_differentiated_on_lanes(x64):
     ((fast, step, data), (plain, *_)), at = functions(stages=[long], n_steps=1, dynamics="so_rpy")
@@ -182,6 +186,7 @@ def undeclared(data):
     return data.replace(states=data.states.replace(force=1e-2 * jnp.sin(data.states.pos)))
 
 
+@pytest.mark.long("compiles a gradient in two engines")
 @needs_compiler
 def test_a_step_that_splits_is_differentiated_on_lanes(x64):
     ((fast, step, data), (plain, *_)), at = functions(stages=[undeclared], n_steps=1, dynamics="so_rpy")
@@ -245,6 +250,7 @@ def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, inte
     assert memory.size * 4 <= cuda.KEPT
 
 
+@pytest.mark.long("compiles tangents in two engines")
 @needs_compiler
 def test_forward_mode_takes_a_number_of_steps_that_is_an_array(x64):
     ((fast, *_), (plain, *_)), at = functions(n_steps=jnp.int32(3))

@@ -58,6 +58,7 @@ def test_an_episode_takes_its_time_in_every_mode(env):
     assert not np.stack([terminated for _, _, terminated, _, _ in results]).any()
 
 
+@pytest.mark.long("compiles an environment for two devices")
 def test_episodes_stay_on_the_device_that_was_asked_for():
     """Compiled or not, where the key and the actions are on JAX's default device; a moved state stays there."""
     default, device = jax.devices()

@@ -171,6 +171,7 @@ def test_large_swarms_are_computed_in_chunks():
     np.testing.assert_array_equal(report.nearest_drone, apart.argmin(axis=-1))
 
 
+@pytest.mark.long("builds a scene of 4,096 drones")
 def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
     """MuJoCo goes through the whole spec for every geom it is given: built one by one, this would take minutes."""
     n, rows = 4096, 64
@@ -338,6 +339,7 @@ def test_law_09_wrong_queries_are_refused(attached):
         sim.contact_report((), floor=False, drones=False)
 
 
+@pytest.mark.long("compiles contacts in the step and in a report")
 @pytest.mark.parametrize("box", [False, True])
 @pytest.mark.parametrize("n_drones", [1, 3, 9])
 def test_the_log_has_the_contacts_between_drones_of_a_report(n_drones, box, rng):
@@ -378,6 +380,7 @@ def test_one_kernel_reports_what_xla_does(n_drones, rng):
 BALL = "<geom type='sphere' size='.1' pos='{} {} {}' conaffinity='2'/>"
 
 
+@pytest.mark.long("builds a scene of 3,031 objects, and another program to compare")
 @pytest.mark.parametrize("box", [False, True])
 def test_thousands_of_objects_are_reported_by_a_small_program(box, rng):
     """Balls that move and that do not, boxes in any attitude, and a body of forty balls.

@@ -117,6 +117,7 @@ def test_touching_is_a_distance_below_zero(crowd):
         assert 3 < np.sum(distance < 0) < N_WORLDS - 3, f"{pair}: both outcomes must occur for this to test anything"
 
 
+@pytest.mark.long("compiles MJX's contacts of boxes")
 def test_boxes_touch_where_c_mujoco_says_so():
     """With box collision drones touch the floor, the ball, the pole and each other as C MuJoCo's distances have it."""
     sim = Sim(n_worlds=N_WORLDS, n_drones=2)

@@ -94,6 +94,7 @@ def reference(sim, world):
     return data
 
 
+@pytest.mark.long("compiles MJX's kinematics, for the tests after it")
 @pytest.mark.parametrize("world", range(3))
 def test_every_transform_is_that_of_c_mujoco(sim, synced, world):
     """Bodies, geoms and cameras of every world are where C MuJoCo has them, quaternions converted to wxyz."""
@@ -134,6 +135,7 @@ def test_the_data_comes_back_with_its_flag_set_and_nothing_else_changed(sim, syn
     jax.tree.map(np.testing.assert_array_equal, before, after)
 
 
+@pytest.mark.long("compiles MJX's kinematics and contacts in a scan")
 def test_a_sync_works_within_transformations(sim, synced):
     """Within jit and scan it gives what it gives alone: rollouts may look for contacts at every step."""
 
