@@ -1,5 +1,8 @@
-"""The number of processes that run tests follows the cores and the memory of the machine, or of its container."""
+"""How tests run: as many at a time as the machine, or its container, has room for; what takes long says why."""
 
+from types import SimpleNamespace
+
+import conftest
 import machine
 import pytest
 
@@ -21,3 +24,18 @@ def test_limits_of_a_container_count(tmp_path):
     (tmp_path / "cpu.max").write_text("50000 100000\n")
     (tmp_path / "memory.max").write_text("1000000\n")
     assert (machine.cores(tmp_path), machine.memory(tmp_path)) == (0.5, 1e6)
+
+
+def test_what_took_long_is_listed_with_its_reason():
+    def report(name, seconds, **reason):
+        return SimpleNamespace(nodeid=name, user_properties=[("processor_s", seconds), *reason.items()])
+
+    lines = []
+    ended = [report("quick", 4.9), report("long", 6.0), report("longer", 12.34, reason="compiles much")]
+    reporter = SimpleNamespace(stats={"": ended, "error": ["no report"]}, section=lines.append, write_line=lines.append)
+    conftest.pytest_terminal_summary(reporter)
+    assert lines == [
+        "tests over 5 s of processor time",
+        " 12.3 s  longer: compiles much",
+        "  6.0 s  long: no reason given: share what it builds, or mark it long",
+    ]
