@@ -58,6 +58,80 @@ class Key(NamedTuple):
     """Range of all entries."""
 
 
+def bounds(low: float = -np.inf, high: float = np.inf, positive: bool = False) -> Range:
+    """Return the range of finite numbers between two bounds, or of positive ones."""
+    most = "" if high > LARGEST else f" to {high:.4g}"
+    if positive:
+        return Range(f"positive{most and f', at most {high:.4g}'}", 1 / LARGEST, min(high, LARGEST))
+    if low < -LARGEST:
+        return ANY if not most else Range(f"finite and at most {high:.4g}", -LARGEST, high)
+    return Range(f"from {low:.4g}{most}" if most else f"finite and at least {low:.4g}", low, min(high, LARGEST))
+
+
+def numbers(
+    name: str,
+    value: Any,
+    allowed: Range = ANY,
+    shapes: Shapes | None = None,
+    *,
+    whole: bool = False,
+    owner: str = "",
+    remedy: str = "",
+) -> NDArray:
+    """Return a number or an array of numbers, checked, read-only, in float64 or, whole ones, in int64.
+
+    Args:
+        name: Name for messages.
+        value: The number or array.
+        allowed: Range of all entries.
+        shapes: Allowed shapes; None for any that is not empty.
+        whole: True for whole numbers.
+        owner: Kind and name of what it belongs to, for the beginning of messages.
+        remedy: Sentence for the end of messages.
+
+    Raises:
+        ConfigError: If it is anything else, such as text, has another shape, or an entry is out of the range.
+    """
+    owner, remedy = owner and f"{owner}: ", remedy and f". {remedy}"
+    array = _as_array(name, value, shapes, whole, owner, remedy)
+    if shapes is None and not array.size:
+        raise ConfigError(f"{owner}expected {name} as a number or array, got an empty one{remedy}")
+    if shapes is not None and not any(_fits(array.shape, shape) for shape in shapes):
+        raise ConfigError(f"{owner}expected {name} of shape {' or '.join(map(str, shapes))}, got {array.shape}{remedy}")
+    if not np.all((array >= allowed.low) & (array <= allowed.high)):
+        raise ConfigError(f"{owner}expected {name} to be {allowed.text}, got {shown(array.tolist())}{remedy}")
+    return array
+
+
+def number(name: str, value: Any, allowed: Range = ANY, remedy: str = "") -> float:
+    """Return one number, checked as by ``numbers``."""
+    return float(numbers(name, value, allowed, ((),), remedy=remedy))
+
+
+def _as_array(
+    name: str, value: Any, shapes: Shapes | None = None, whole: bool = False, owner: str = "", remedy: str = ""
+) -> NDArray:
+    """Return a number or an array of numbers as an array.
+
+    Raises:
+        ConfigError: If it is anything else, such as text.
+    """
+    try:
+        array = np.array(value)
+    except (TypeError, ValueError, RecursionError):
+        array = np.array(None)
+    if array.dtype.kind not in ("iu" if whole else "iuf"):
+        kind = f"a {'whole ' if whole else ''}number{'' if shapes == ((),) else ' or array'}"
+        raise ConfigError(f"{owner}expected {name} as {kind}, got {shown(value)}{remedy}")
+    array = array.astype(np.int64 if whole else np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _fits(shape: tuple[int, ...], allowed: tuple[int | str, ...]) -> bool:
+    return len(shape) == len(allowed) and all(a in ("any", b) for a, b in zip(allowed, shape, strict=True))
+
+
 def as_numbers(owner: str, path: str, value: Any) -> NDArray[np.float64]:
     """Return a number or an array of numbers in float64, read-only.
 
@@ -71,15 +145,7 @@ def as_numbers(owner: str, path: str, value: Any) -> NDArray[np.float64]:
     """
     if isinstance(value, Mapping) and "value" in value:
         value = value["value"]
-    try:
-        array = np.array(value)
-    except (TypeError, ValueError, RecursionError):
-        array = np.array(None)
-    if array.dtype.kind not in "iuf":
-        raise ConfigError(f"{owner}: expected {path} as a number or array, got {shown(value)}")
-    array = array.astype(np.float64)
-    array.setflags(write=False)
-    return array
+    return _as_array(path, value, owner=f"{owner}: ")
 
 
 def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -> None:
@@ -95,15 +161,8 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
     Raises:
         ConfigError: If it has another shape, or an entry is out of the range.
     """
-    shapes = [tuple(n if length == "n" else length for length in shape) for shape in key.shapes]
-    fits = any(
-        len(shape) == value.ndim and all(a in ("any", b) for a, b in zip(shape, value.shape, strict=True))
-        for shape in shapes
-    )
-    if not fits:
-        raise ConfigError(f"{owner}: expected {path} of shape {' or '.join(map(str, shapes))}, got {value.shape}")
-    if not np.all((value >= key.range.low) & (value <= key.range.high)):
-        raise ConfigError(f"{owner}: expected {path} to be {key.range.text}, got {shown(value.tolist())}")
+    shapes = tuple(tuple(n if length == "n" else length for length in shape) for shape in key.shapes)
+    numbers(path, value, key.range, shapes, owner=owner)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """A small population for tests: point masses on springs, alone or tied to the drones of their world."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import jax
@@ -28,7 +29,7 @@ class Masses(Members):
 class Springs(Population):
     """Masses of 1 kg, each on a spring towards the command that its controller has taken over."""
 
-    members: int = 1
+    members: int | Sequence[str] = 1
     name: str = "springs"
     rate: int | None = 100
     stiffness: float | tuple = parameter(default=STIFFNESS)

@@ -6,7 +6,7 @@ Exported here are the functions with which stages and resets are written.
 from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn
 from crazysim.core.plugin import FunctionPlugin, Placement, Plugin, check_parameter, parameter
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
-from crazysim.core.settings import dividing_rate
+from crazysim.core.settings import dividing_rate, setting
 from crazysim.core.sharding import shard, world_mesh
 from crazysim.pytree import map_batched, scopes, select_worlds
 
@@ -29,6 +29,7 @@ __all__ = [
     "scopes",
     "seed_sim",
     "select_worlds",
+    "setting",
     "shard",
     "world_key",
     "world_keys",

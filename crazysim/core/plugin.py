@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar, dataclass_transform
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, dataclass_transform
 
 import numpy as np
 from jax import Array
@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
+from crazysim.core.settings import Setting, check_settings, setting, settings_of
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree, on_device
-from crazysim.tables import LARGEST
+from crazysim.tables import bounds, numbers
 
 P = TypeVar("P", bound="Plugin")
 R = TypeVar("R", bound=PyTree)
@@ -77,16 +78,6 @@ class Placement:
     """Name of the stage; None for the plugin's."""
 
 
-class _Limits(NamedTuple):
-    """Values that a setting may have; the arguments of ``check_parameter`` that a plugin declares."""
-
-    low: float
-    high: float
-    positive: bool
-    per_axis: bool
-    dtype: DTypeLike | None
-
-
 def parameter(
     *,
     default: Any = dataclasses.MISSING,
@@ -99,10 +90,11 @@ def parameter(
     """Declare a field of a plugin whose value only fills numbers of its record.
 
     ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
-    ``derivative`` must read the number from the record, never from the field. ``Plugin.filled`` checks it against the
-    limits given here, which are those of ``check_parameter``.
+    ``derivative`` must read the number from the record, never from the field. Its range is checked as that of
+    ``setting`` is, its shape by ``Plugin.filled``.
     """
-    return dataclasses.field(default=default, metadata={"parameter": _Limits(low, high, positive, per_axis, dtype)})
+    declared = Setting(bounds(low, high, positive), True, per_axis, dtype)
+    return dataclasses.field(default=default, metadata={"setting": declared})
 
 
 def of_airframes(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
@@ -155,8 +147,8 @@ def check_parameter(
     Raises:
         ConfigError: If the shape, the type or a value is invalid.
     """
-    array = np.asarray(value)
-    batch = sim.data.states.pos.shape[:2]
+    allowed = bounds(low, high, positive)
+    batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
     if core == (1,) and array.shape == batch:
         array = array[..., None]
     is_number = array.dtype.kind in ("iu" if dtype is not None and np.issubdtype(dtype, np.integer) else "iuf")
@@ -167,14 +159,7 @@ def check_parameter(
             f"{(*batch, *core)} = (n_worlds, n_drones, {core[0]}) for each, got shape {array.shape} and type "
             f"{array.dtype}"
         )
-    if (
-        not np.all(np.abs(array.astype(np.float64)) <= LARGEST)
-        or np.any(array < low)
-        or np.any(array > high)
-        or (positive and np.any(array < 1 / LARGEST))
-    ):
-        bounds = "positive" if positive else f"from {low} to {high}"
-        raise ConfigError(f"expected {name} to be finite and {bounds}, got {value!r}")
+    array = numbers(name, array, allowed, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
     return on_device(np.broadcast_to(array, core) if is_shared else array, dtype)
 
@@ -185,7 +170,7 @@ def per_drone(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     return on_device(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, dataclasses.field))
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, setting, dataclasses.field))
 class Plugin:
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
 
@@ -209,6 +194,14 @@ class Plugin:
         if "name" not in {f.name for f in dataclasses.fields(cls)}:  # type: ignore[arg-type]
             raise TypeError(f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'")
 
+    def __post_init__(self) -> None:
+        """Check the settings that do not depend on a simulation.
+
+        Raises:
+            ConfigError: If one has another type than its field, or a number is not finite or out of its range.
+        """
+        check_settings(self)
+
     @property
     def is_dynamic(self) -> bool:
         """True if the integrator must call ``influence``, ``derivative`` or ``constrain``."""
@@ -225,6 +218,14 @@ class Plugin:
     def scope(self) -> str:
         """Scope of the plugin's own states, and of the data that ``derivative`` is written for."""
         return "drone"
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """Terms of the model that the plugin replaces, such as ``"drag"``, or adds where the model has none.
+
+        Two plugins that replace the same term are refused, as it would count twice.
+        """
+        return ()
 
     def record(self, sim: Simulation) -> PyTree | None:
         """Return the plugin's record for all worlds, or None if it has none; check settings and simulation.
@@ -250,23 +251,24 @@ class Plugin:
         Args:
             sim: The simulation.
             kind: Class of the record.
-            given: Fields as they are to be.
+            given: Fields as they are to be. Settings of those that are None are checked nevertheless.
 
         Raises:
             ConfigError: If a setting is invalid.
         """
-        limits = {f.name: f.metadata.get("parameter") for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        settings = {name: each for name, each in settings_of(type(self)).items() if each.is_parameter}
         values = dict(given)
         for field in dataclasses.fields(kind):  # type: ignore[arg-type]
             name, scope, core = field.name, field.metadata.get("scope"), field.metadata.get("core")
-            if name in given:
+            if values.get(name) is not None:
                 continue
             if scope == "drone" and core is not None:
-                values[name] = per_drone(sim, 0.0, *core)
-            elif scope == "parameter" and limits.get(name):
+                values.setdefault(name, per_drone(sim, 0.0, *core))
+            elif scope == "parameter" and name in settings:
                 value, core = getattr(self, name), core or sim.data.states.rotor_vel.shape[-1:]
-                checked = None if value is None else check_parameter(sim, name, value, core, **limits[name]._asdict())
-                values[name] = checked
+                dtype, per_axis = settings[name].dtype, settings[name].per_axis
+                checked = value is not None and check_parameter(sim, name, value, core, dtype=dtype, per_axis=per_axis)
+                values.setdefault(name, None if value is None else checked)
         return kind(**values)
 
     def check_plugins(self, sim: Simulation) -> None:

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import itertools
-from collections.abc import Mapping
+import sys
+import types
+import typing
+from collections.abc import Mapping, Sequence
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from crazysim.control import Control, Controller
 from crazysim.control.switch import Switch
 from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.tables import ANY, Range, Shapes, bounds, numbers
 
 E = TypeVar("E", bound=Enum)
 
@@ -27,6 +33,8 @@ MAX_FRICTION = 1000.0
 MAX_SOFTNESS = 10.0
 """Largest softness of contacts, s."""
 
+NUMERIC = frozenset((int, float, np.ndarray))
+"""Types of fields with numbers; an array stands for ``ArrayLike``."""
 SLOW_FREQ = 200
 """Rate of physics steps, Hz, below which half of it is too slow for a controller: the cascades of small drones are
 stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
@@ -65,39 +73,148 @@ def flag(name: str, value: object) -> bool:
     return bool(value)
 
 
-def check_flags(settings: Any) -> None:
-    """Check every field of a record of settings, such as a plugin, that is declared as ``bool``.
+class Setting(NamedTuple):
+    """Values that a field of a record of settings may have."""
 
-    Raises:
-        ConfigError: If one is anything but True or False.
-    """
-    for field in dataclasses.fields(settings):
-        if field.type in (bool, "bool"):
-            flag(f"{field.name} of {type(settings).__name__}", getattr(settings, field.name))
+    range: Range = ANY
+    """Range of its numbers."""
+    is_parameter: bool = False
+    """True for a field of a plugin that only fills numbers of its record."""
+    per_axis: bool = False
+    """True to accept one number for a vector, for each axis."""
+    dtype: DTypeLike | None = None
+    """Type of the numbers; None for real ones."""
+    shapes: Shapes | None = None
+    """Shapes of its array; None for any, or for those that the simulation decides."""
 
 
-def check_contacts(
-    freq: int, friction: ArrayLike, restitution: ArrayLike, softness: ArrayLike, iterations: object
-) -> None:
-    """Check the settings of contacts.
+def setting(
+    *,
+    default: Any = dataclasses.MISSING,
+    default_factory: Any = dataclasses.MISSING,
+    low: float = -np.inf,
+    high: float = np.inf,
+    positive: bool = False,
+    shapes: Shapes | None = None,
+) -> Any:
+    """Declare a field with numbers of a record of settings, such as a task, and the values that it may have.
+
+    ``check_settings`` checks it. Numbers of fields that are not declared so must be finite.
 
     Args:
-        freq: Rate of physics steps, Hz.
-        friction: Coulomb's coefficients.
-        restitution: Ratios of the speeds after and before a bounce.
-        softness: Time constant with which an overlap is pushed out, s.
-        iterations: Iterations of the solver.
+        default: Value where none is given.
+        default_factory: Function that returns it.
+        low: Least value allowed.
+        high: Largest value allowed.
+        positive: Refuse zero and negative values.
+        shapes: Shapes of an array, ``"any"`` for any length; None for all.
+    """
+    default = {"default": default} if default_factory is dataclasses.MISSING else {"default_factory": default_factory}
+    return dataclasses.field(**default, metadata={"setting": Setting(bounds(low, high, positive), shapes=shapes)})
+
+
+def color(n: bool = False) -> Any:
+    """Declare a field with a colour, red, green, blue and opacity from 0 to 1, which is None by default.
+
+    Args:
+        n: True for a field that may have one for each of several things.
+    """
+    return setting(default=None, low=0.0, high=1.0, shapes=((4,), ("any", 4)) if n else ((4,),))
+
+
+@functools.cache
+def settings_of(kind: type) -> dict[str, Setting]:
+    """Return what the fields of a class declare by ``setting`` or ``parameter``.
+
+    A field that replaces one of a base class, with another default, has the declaration of that unless it has its own.
+    """
+    found = {}
+    for base in reversed(kind.__mro__):
+        fields = vars(base).get("__dataclass_fields__", {})
+        found |= {name: f.metadata["setting"] for name, f in fields.items() if "setting" in f.metadata}
+    return {field.name: found.get(field.name, Setting()) for field in dataclasses.fields(kind)}
+
+
+def check_settings(settings: Any) -> None:
+    """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
+
+    Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
+    finite numbers in the range of ``setting`` or ``parameter``; fields of classes, instances of them. None is a value
+    of fields whose annotation or default has it. Shapes that depend on the simulation are checked with it.
 
     Raises:
-        ConfigError: If one is invalid.
+        ConfigError: If a field has anything else.
     """
-    settings = {"friction": (friction, 0.0, MAX_FRICTION), "restitution": (restitution, 0.0, 1.0)}
-    for name, (value, low, high) in (settings | {"softness": (softness, 2 / freq, MAX_SOFTNESS)}).items():
-        array = np.asarray(value)
-        if array.dtype.kind not in "iuf" or not np.all((array >= low) & (array <= high)):
-            least = f"two steps, {low:.4g} s," if low else "0"
-            raise ConfigError(f"expected {name} to be from {least} to {high:g}, got {shown(value)}")
-    positive("iterations", iterations, MAX_ITERATIONS)
+    kind = type(settings)
+    for field in dataclasses.fields(settings):
+        value, kinds = getattr(settings, field.name), alternatives(kind)[field.name]
+        if (value is None and (type(None) in kinds or field.default is None)) or not kinds:
+            continue
+        name, declared = f"{field.name} of {kind.__name__}", settings_of(kind)[field.name]
+        remedy = f"help({kind.__name__}) describes it."
+        kinds = set(kinds) - {type(None)}
+        classes = tuple(kinds - NUMERIC)
+        if kinds == {bool}:
+            flag(name, value)
+        elif kinds == {Mapping}:
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"expected {name} as a dict of numbers by name, got {shown(value)}. {remedy}")
+            for key, item in value.items():
+                numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
+        elif kinds & NUMERIC and not isinstance(value, classes):
+            shapes = declared.shapes if np.ndarray in kinds else ((),)
+            whole = kinds & NUMERIC == {int} or declared.dtype is not None
+            numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
+        elif not isinstance(value, classes):
+            names = " or ".join(sorted(k.__name__ for k in kinds))
+            raise ConfigError(f"expected {name} as {names}, got {shown(value)}. {remedy}")
+
+
+@functools.cache
+def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
+    """Return the types that each field may have; none for a field whose annotation is not one of checked types.
+
+    An array stands for ``ArrayLike`` and sequences of numbers.
+    """
+    found = {}
+    for base in reversed(kind.__mro__):
+        names = {**vars(sys.modules[base.__module__]), "ArrayLike": np.ndarray} if base is not object else {}
+        for name, hint in inspect.get_annotations(base).items():
+            found[name] = _types(hint, names)
+    return {field.name: found.get(field.name, ()) for field in dataclasses.fields(kind)}
+
+
+def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
+    """Return the types of an annotation; none if it has others than classes, numbers and mappings of them."""
+    if isinstance(hint, str):
+        try:
+            hint = eval(hint, dict(names))
+        except Exception:  # a name that is imported for type checkers alone
+            return ()
+    if hint == ArrayLike:
+        return (np.ndarray,)
+    if typing.get_origin(hint) is Mapping and typing.get_args(hint)[1:] == (float,):
+        return (Mapping,)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        parts = [_types(part, names) for part in typing.get_args(hint)]
+        return tuple(itertools.chain(*parts)) if all(parts) else ()
+    if typing.get_origin(hint) is Sequence and (inner := _types(typing.get_args(hint)[0], names)):
+        return (np.ndarray,) if NUMERIC.issuperset(inner) else ()
+    if hint is None:
+        return (type(None),)
+    is_class = inspect.isclass(hint) and hint not in (Any, object) and not typing.get_args(hint)
+    return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()
+
+
+def check_softness(freq: int, softness: ArrayLike) -> None:
+    """Check the time constant with which an overlap is pushed out, s, at ``freq`` steps per second, Hz.
+
+    Raises:
+        ConfigError: If it is shorter than two steps.
+    """
+    numbers(
+        "softness", softness, Range(f"from two steps, {2 / freq:.4g} s, to {MAX_SOFTNESS:g}", 2 / freq, MAX_SOFTNESS)
+    )
 
 
 def physics_freq(freq: object) -> int:

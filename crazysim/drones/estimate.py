@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.drones.checks import GRAVITY
 from crazysim.errors import ConfigError, shown
 from crazysim.storage import is_file
+from crazysim.tables import POSITIVE, number
 
 AIR_DENSITY = 1.225
 """Density of air at sea level in the standard atmosphere, kg/m^3."""
@@ -29,6 +30,9 @@ DRAG_RATE = 0.45
 """Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.35 to 0.58."""
 ROTOR_TIME = 0.05
 """Time constant of rotors up to 10 inches, s."""
+TABLE_ERROR = 0.05
+"""Part of the largest thrust or torque of a motor table by which it may fall with the speed, or two columns may differ:
+an assumption about the errors of data sheets."""
 IDLE = 0.05
 """Smallest over largest thrust of a rotor that is on, 1."""
 MOTOR_EFFICIENCY = 0.75
@@ -145,8 +149,8 @@ def estimate_airframe(
         ("capacity", capacity),
         ("resistance", resistance),
     ):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise ConfigError(f"expected {key} to be positive, got {shown(value)}")
+        if value is not None:
+            number(key, value, POSITIVE)
     file = _File(name)
     places, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
     file.add("rigid_body", "mass", mass, "kg", "given")
@@ -372,7 +376,13 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
             raise ConfigError(f"expected numbers in column {key!r} of the motor table, got {error}") from error
         if array.ndim != 1 or not len(array) or not np.all(np.isfinite(array)) or np.any(array < 0):
             raise ConfigError(f"expected finite numbers of at least 0 in column {key!r}, got {shown(array.tolist())}")
-        found[quantity] = array
+        same = found.setdefault(quantity, array)
+        if same.shape == array.shape and np.any(np.abs(same - array) > TABLE_ERROR * np.max(same)):
+            k = int(np.argmax(np.abs(same - array)))
+            raise ConfigError(
+                f"expected columns of the motor table that agree on the {quantity}, got {same[k]:.4g} and "
+                f"{array[k]:.4g} in row {k + 1}, in SI units. Remove the column that is wrong."
+            )
     if "thrust" not in found or not np.max(found["thrust"]) > 0:
         raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {shown(list(columns))}")
     if len({len(array) for array in found.values()}) != 1:
@@ -381,7 +391,17 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
         running = found["rpm"] > 0
         if not np.any(running):
             raise ConfigError("expected a speed above 0 in column 'rpm' of the motor table, got none")
-        found = {quantity: array[running] for quantity, array in found.items()}
+        order = np.argsort(found["rpm"][running], kind="stable")
+        found = {quantity: array[running][order] for quantity, array in found.items()}
+        for quantity in ("thrust", "torque"):
+            values = found.get(quantity, np.zeros(1))
+            fall = np.maximum.accumulate(values) - values
+            if np.max(fall) > TABLE_ERROR * np.max(values):
+                k = int(np.argmax(fall))
+                raise ConfigError(
+                    f"expected a motor table whose {quantity} grows with the speed, got {values[k]:.4g} at "
+                    f"{found['rpm'][k]:.6g} rpm, and {np.max(values[:k]):.4g} below that. Check the columns."
+                )
     return found
 
 

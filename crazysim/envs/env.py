@@ -26,7 +26,7 @@ from crazysim.envs.hooks import Hooks
 from crazysim.envs.phases import Phases, all_worlds
 from crazysim.envs.state import EnvState, state_of_data, validate_action
 from crazysim.envs.task import Task
-from crazysim.envs.task_check import check_task, require_installed
+from crazysim.envs.task_check import check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_batch_axes, n_world_axes, numbered, scopes, select_worlds
 from crazysim.sim.sim import Sim
@@ -91,13 +91,19 @@ class Env(ABC):
 
         Args:
             key: Random key, as ``jax.random.key`` makes. ()
+
+        Raises:
+            ConfigError: If the task begins in a state that is not finite.
         """
         key = commit(key, self.sim.device) if self.sim.mesh is None else key
         with beside(key):
             data = self.base.initial_data(key)
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
-            return self.begin(state_of_data(data))
+            state = self.begin(state_of_data(data))
+        if not is_traced([state.data.states.pos]):
+            require_finite_start(self.task, state)
+        return state
 
     def restart(self, state: EnvState, mask: Array | None) -> EnvState:
         """Return the state with new episodes in some worlds.
@@ -220,6 +226,11 @@ class DroneEnv(Env):
             self.measured = over_worlds(of_world) if task.batched else of_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
+        if self._max_steps < 1:
+            raise ConfigError(
+                f"expected an episode of at least one environment step, got seconds={task.seconds} at {freq} Hz. Use "
+                f"seconds={1 / freq:g} or more."
+            )
         sim.plugins.check()
         self._step = sim.build_step_fn().without(sim.plugins.reset_stages)  # every episode begins by a reset
         self._foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))

@@ -16,6 +16,7 @@ from crazysim.cache import keep_programs
 from crazysim.core.stage import with_leaves
 from crazysim.envs.fused_step import FusedEnvStep, PackedState
 from crazysim.envs.state import EnvState, bare
+from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers.autoreset import AutoReset
 from crazysim.errors import ConfigError
 
@@ -45,6 +46,8 @@ class EnvStepper:
     def _hold(self, state: EnvState) -> None:
         leaves, treedef = jax.tree.flatten(state)
         structure = (treedef, [(x.shape, x.dtype) for x in leaves])
+        if self._steps is None:
+            require_finite_start(self._env.task, state)
         if self._steps is None or structure != self._structure:
             fused = self._env.fused_step(state, state.action, packed=True)
             packed = fused is not None

@@ -10,11 +10,14 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, Placement
+from crazysim.core.settings import check_settings, setting
 from crazysim.envs.state import Obs
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.sim.sim import Sim
 
+MAX_SECONDS = 1e5
+"""Longest episode, s: its steps are counted in 32 bits, at any rate of physics up to 10,000 Hz."""
 NAME = "task"
 """Name of a task's record in ``data.plugins``."""
 
@@ -39,11 +42,11 @@ class Task:
     unit: ClassVar[str] = "m"
     """Unit of ``error``."""
 
-    seconds: float = 5.0
+    seconds: float = setting(default=5.0, positive=True, high=MAX_SECONDS)
     """Length of an episode, s."""
-    tolerance: float = 0.05
+    tolerance: float = setting(default=0.05, positive=True)
     """Error below which the task counts as done, in ``unit``."""
-    hold: float = 1.0
+    hold: float = setting(default=1.0, low=0.0)
     """Time at the end of an episode during which the error must stay below the tolerance, s."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -59,6 +62,14 @@ class Task:
                 "Write a frozen dataclass with methods for one world: docs/guides/tasks.md"
             )
         return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        """Check the settings that do not depend on a simulation.
+
+        Raises:
+            ConfigError: If one has another type than its field, or a number is not finite or out of its range.
+        """
+        check_settings(self)
 
     def install(self, sim: Sim) -> None:
         """Put into a simulation what the task needs: objects, a record, stages. Call it once, before ``DroneEnv``."""

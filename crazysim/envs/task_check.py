@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.settings import check_flags
+from crazysim.core.settings import check_settings
+from crazysim.envs.state import EnvState
 from crazysim.envs.task import NAME, Task
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_world_axes, scopes
@@ -28,12 +31,29 @@ def require_installed(sim: Sim, task: object) -> None:
     """
     if not isinstance(task, Task):
         raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
-    check_flags(task)
+    check_settings(task)
     if task.Record is not None and not isinstance(sim.data.plugins.get(NAME), task.Record):
         raise ConfigError(
             f"expected a simulation in which task {task.name!r} is installed, got one without its record. Call "
             f"task.install(sim) first, or use crazysim.envs.make."
         )
+
+
+def require_finite_start(task: Task, state: EnvState) -> None:
+    """Check that episodes begin in finite states.
+
+    Raises:
+        ConfigError: If one does not, with the state and the world.
+    """
+    states = state.data.states
+    for field in dataclasses.fields(states):  # type: ignore[arg-type]
+        value = np.asarray(getattr(states, field.name))
+        if not np.all(np.isfinite(value)):
+            world = int(np.argwhere(~np.isfinite(value))[0, 0])
+            raise ConfigError(
+                f"task {task.name!r}: expected spawn to return finite states, got {field.name} with NaN or infinity in "
+                f"world {world}. Check its settings and random numbers."
+            )
 
 
 def check_task(task: Task, data: SimData, action_size: int) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import as_rgba, check_flags, positive
+from crazysim.core.settings import check_settings, color, positive, setting
 from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.media.trail import Trail, colors_of
@@ -51,13 +51,13 @@ class View:
     hold: Callable[[Sim, int], ArrayLike] | None = None
     """Function that returns points of a world, ``hold(sim, world)``, world frame, m (n, 3): the free camera holds them
     and all drones in view, from a distance that fits; None for none."""
-    lag: float = 0.3
+    lag: float = setting(default=0.3, low=0.0)
     """Time constant with which the camera follows what ``follow`` or ``hold`` names, s."""
-    trail: float = 0.0
+    trail: float = setting(default=0.0, low=0.0)
     """Duration of the drones' trails, s; 0 for none."""
     setpoints: bool = False
     """True to draw the positions of state commands, as spheres."""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color(n=True)
     """Colour of trails and setpoints, one or one per drone; None for default colours."""
     text: str | None = None
     """ASCII text at the top left of each world, with the fields ``{world}`` and ``{time}``; None for none."""
@@ -65,7 +65,7 @@ class View:
     """Function that draws further overlays of a world, ``draw(sim, world)``; None for none."""
     columns: int | None = None
     """Worlds per row; None for as many rows as columns."""
-    border: int = 2
+    border: int = setting(default=2, low=0)
     """Width of the lines between worlds, pixels."""
     _trail: Trail | None = field(default=None, init=False, repr=False)
     _aim: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
@@ -76,17 +76,11 @@ class View:
         Raises:
             ConfigError: If a setting is invalid.
         """
-        check_flags(self)
+        check_settings(self)
         self.width, self.height = (positive(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height"))
-        if self.rgba is not None:
-            as_rgba(np.atleast_2d(self.rgba)[0])
         self.worlds = [self.worlds] if isinstance(self.worlds, (int, np.integer)) else list(self.worlds)
-        if not self.worlds:
-            raise ConfigError("expected at least one world, got none")
         if self.columns is not None:
             positive("columns", self.columns)
-        if isinstance(self.border, bool) or not isinstance(self.border, (int, np.integer)) or self.border < 0:
-            raise ConfigError(f"expected a border of 0 or more whole pixels, got {self.border!r}")
         if min(self.tile_size) < 1:
             raise ConfigError(
                 f"expected an image that {len(self.worlds)} worlds fit into, got {self.width} x {self.height} pixels. "
@@ -99,8 +93,6 @@ class View:
                 f"expected camera=-1, the free camera, to follow a drone or hold points in view, got "
                 f"{self.camera!r}. Drones carry the cameras track_cam:i and fpv_cam:i."
             )
-        if not np.isfinite(self.lag) or self.lag < 0:
-            raise ConfigError(f"expected a lag of 0 s or more, got {self.lag!r}")
         if self.trail != 0:
             self._trail = Trail(self.trail)
         _fill(self.text, 0, 0.0)

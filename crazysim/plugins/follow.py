@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.core.stages import tick
 from crazysim.errors import ConfigError
@@ -68,21 +69,26 @@ class Follow(Plugin):
 
     trajectories: Trajectory | Sequence[Trajectory]
     """Trajectories in the first slots: one, a sequence, or one record with a leading axis."""
-    index: ArrayLike | None = parameter(default=None)
+    index: ArrayLike | None = parameter(default=None, low=0, dtype=np.int32)
     """Slot that a drone follows; None for drone i the trajectory i modulo their number. (), (n_drones,) or (n_worlds,
     n_drones)"""
     start: ArrayLike = parameter(default=0.0)
     """Time since the reset of the world at which a drone starts, s. A drone with a negative start is in the middle of
     its trajectory at the reset: with -2 and a rate of 1, at 2 s. (), (n_drones,) or (n_worlds, n_drones)"""
-    rate: ArrayLike = parameter(default=1.0)
+    rate: ArrayLike = parameter(default=1.0, positive=True)
     """Speed at which a drone goes through its trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
-    n_slots: int | None = None
+    n_slots: int | None = setting(default=None, low=1)
     """Number of slots; None for one of each trajectory. The others hold the first trajectory until ``upload``."""
-    max_pieces: int | None = None
+    max_pieces: int | None = setting(default=None, low=1)
     """Most pieces of a trajectory in a slot; None for the most of the given ones."""
     visible: bool = True
     """True to draw the path ahead and the setpoint of every drone."""
     name: str = "follow"
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The state commands of all drones."""
+        return ("state commands",)
 
     def record(self, sim: Simulation) -> FollowData:
         """Return the trajectories in their slots."""

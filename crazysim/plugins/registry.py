@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -17,7 +17,7 @@ from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
-from crazysim.core.settings import check_flags
+from crazysim.core.settings import settings_of
 from crazysim.core.stage import Axes, Stage, at_the_start, over_drones, over_worlds
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
@@ -79,7 +79,6 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Add a plugin; see ``Sim.add``."""
         if not isinstance(plugin, Plugin):
             raise ConfigError(f"expected a plugin, got {plugin!r}. Use sim.add(Wind(...)), or a Plugin of your own.")
-        check_flags(plugin)
         plugin = plugin if name is None else dataclasses.replace(plugin, name=name)  # type: ignore[type-var]
         name, kind = plugin.name, type(plugin).__name__
         if not isinstance(name, str) or not name:
@@ -92,6 +91,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         if name in self._sim.data.plugins:
             raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
         self._require_names(plugin, self._sim.names)
+        self._require_terms(plugin, self.values())
         record, default = plugin.record(self._sim), plugin.default_record(self._sim)
         pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
         pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
@@ -124,9 +124,9 @@ class PluginRegistry(Mapping[str, Plugin]):
                 f"expected a {type(before).__name__} to replace {plugin.name!r}, got a {type(plugin).__name__}. Use "
                 f"sim.remove({plugin.name!r}) first, or another name=."
             )
-        check_flags(plugin)
         sim, name = self._sim, plugin.name
         self._require_names(plugin, [other for other in sim.names if other not in self.members_of(before)])
+        self._require_terms(plugin, [other for other in self.values() if other is not before])
         present, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
         if _same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
             self._put(name, _continued(record, present), default)
@@ -177,6 +177,21 @@ class PluginRegistry(Mapping[str, Plugin]):
                 f"expected names that nothing else has, got {twice[0]!r} again. Use "
                 f"{type(plugin).__name__}([...]) with other names."
             )
+
+    @staticmethod
+    def _require_terms(plugin: Plugin, others: Iterable[Plugin]) -> None:
+        """Check that no other plugin replaces the same term of the model.
+
+        Raises:
+            ConfigError: If one does.
+        """
+        for other in others:
+            if both := set(plugin.replaced_terms) & set(other.replaced_terms):
+                raise ConfigError(
+                    f"expected one plugin for {' and '.join(sorted(both))}, got {type(other).__name__} {other.name!r} "
+                    f"and {type(plugin).__name__} {plugin.name!r}, which would count it twice. Use one of the two: "
+                    f"sim.remove({other.name!r}) removes the first."
+                )
 
     def check(self) -> None:
         """Check that the plugins have each other as they need, if they have changed since the last check.
@@ -347,8 +362,7 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
 
 def _same_code(before: Plugin, after: Plugin) -> bool:
     """Return True if two plugins of one class differ in numbers of their records at most."""
-    fields = dataclasses.fields(before)  # type: ignore[arg-type]
-    fixed = [f.name for f in fields if not f.metadata.get("parameter")]
+    fixed = [name for name, setting in settings_of(type(before)).items() if not setting.is_parameter]
     return all(_equal(getattr(before, name), getattr(after, name)) for name in fixed)
 
 

@@ -18,7 +18,7 @@ from crazysim.core.controls import controller_layout, described_controller, requ
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.settings import (
-    check_flags,
+    check_settings,
     control_freqs,
     controller_at_rates,
     find_device,
@@ -132,7 +132,7 @@ class Configuration:
         controller = find_controller(controllers, switch)
         if controller is not None:
             for each in controller.members:
-                check_flags(each)
+                check_settings(each)
             controller = controller.adapted(control, None if dynamics == Dynamics.first_principles else dynamics)
         if controller is not None:
             require_controller(dynamics, control, controller)

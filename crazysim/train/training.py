@@ -24,6 +24,7 @@ from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.references import code_digest, is_reference, split
 from crazysim.envs.statistics import RunningStats
+from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.storage import replacing
@@ -117,6 +118,7 @@ def train(
             files = jax.device_put(files, base.sim.device)
             return files["learner"], files["kept"]
         learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
+        require_finite_start(base.task, learner.state)
         return learner, learner.as_policy()
 
     @keep_programs()

@@ -330,15 +330,15 @@ def test_names_are_those_given_or_numbers():
 @pytest.mark.parametrize(
     ("plugin", "message"),
     [
-        (Springs(0), "a positive number or a list of names, got 0"),
-        (Springs(True), "a positive number or a list of names, got True"),
-        (Springs("Mass_0"), "a positive number or a list of names, got 'Mass_0'"),
-        (Springs(["Mass_0", 1]), "a positive number or a list of names"),
-        (Springs(["Mass_0", "Mass_0"]), "distinct names of members, got 'Mass_0' twice"),
-        (Springs(name="drone"), "name of a population, got 'drone'"),
-        (Springs(name="shared"), "name of a population, got 'shared'"),
-        (Springs(rate=300), "to divide freq = 500 Hz, got 300 Hz. Use the nearest rate below, 250 Hz"),
-        (Springs(rate=-1), "control_freq of 'springs' is -1; it must be a positive whole number"),
+        (lambda: Springs(0), "a positive number or a list of names, got 0"),
+        (lambda: Springs(True), "a positive number or a list of names, got True"),
+        (lambda: Springs("Mass_0"), "a positive number or a list of names, got 'Mass_0'"),
+        (lambda: Springs(["Mass_0", 1]), "a positive number or a list of names"),
+        (lambda: Springs(["Mass_0", "Mass_0"]), "distinct names of members, got 'Mass_0' twice"),
+        (lambda: Springs(name="drone"), "name of a population, got 'drone'"),
+        (lambda: Springs(name="shared"), "name of a population, got 'shared'"),
+        (lambda: Springs(rate=300), "to divide freq = 500 Hz, got 300 Hz. Use the nearest rate below, 250 Hz"),
+        (lambda: Springs(rate=-1), "control_freq of 'springs' is -1; it must be a positive whole number"),
     ],
 )
 def test_wrong_settings_are_refused(plugin, message):
@@ -346,7 +346,7 @@ def test_wrong_settings_are_refused(plugin, message):
     sim = Sim(2, 2)
     pipeline = dict(sim.step_pipeline)
     with pytest.raises(ConfigError, match=message):
-        sim.add(plugin)
+        sim.add(plugin())
     assert sim.step_pipeline == pipeline
     assert not sim.data.plugins
 

@@ -127,6 +127,20 @@ def test_given_numbers_replace_estimates():
         ({"thrust_to_weight": None, "motor_table": {"rpm": [1e4]}}, "a column thrust_n or thrust_g"),
         ({"thrust_to_weight": None, "motor_table": TABLE | {"rpm": [1, 2]}}, "columns of equal lengths"),
         ({"thrust_to_weight": None, "motor_table": {"thrust_g": ["much"]}}, "numbers in column 'thrust_g'"),
+        (
+            {"thrust_to_weight": None, "motor_table": TABLE | {"rpm": [10e3, 24.5e3, 17.3e3]}},
+            "thrust grows with the speed, got 5.886 at 24500 rpm, and 11.77 below",
+        ),
+        (
+            {"thrust_to_weight": None, "motor_table": TABLE | {"torque_nm": [0.1, 0.3, 0.1]}},
+            "torque grows with the speed, got 0.1 at 24500 rpm",
+        ),
+        (
+            {"thrust_to_weight": None, "motor_table": TABLE | {"thrust_n": [2.0, 60.0, 11.8]}},
+            "agree on the thrust, got 5.886 and 60 in row 2",
+        ),
+        ({"mass": "heavy"}, "mass as a number, got 'heavy'"),
+        ({"cells": np.nan}, "cells to be positive, got nan"),
     ],
 )
 def test_law_09_wrong_numbers_are_refused(change, message):

@@ -9,7 +9,7 @@ import pytest
 
 from crazysim import ConfigError, Sim, Wind
 from crazysim.core.stage import over_worlds
-from crazysim.envs import DroneEnv, Task, draw, make, uniform
+from crazysim.envs import DroneEnv, DroneVectorEnv, Task, draw, make, uniform
 from crazysim.envs.random import between, episode_key, within
 from crazysim.envs.task import total
 from crazysim.envs.tasks.hover import Hover
@@ -155,6 +155,31 @@ def test_law_09_wrong_shapes_of_a_task_are_refused_at_making(two_drones, case):
     DroneEnv(two_drones, Still())
     with pytest.raises(ConfigError, match=f"task 'still': expected {words}"):
         DroneEnv(two_drones, wrong)
+
+
+@pytest.mark.parametrize("state", ["pos", "quat", "ang_vel"])
+def test_law_09_a_start_that_is_not_finite_is_refused(two_drones, state):
+    class Lost(Still):
+        """Not a number in the second world."""
+
+        def spawn(self, data, key):
+            value = getattr(data.states, state)
+            wrong = jnp.where(data.core.world_id == 1, jnp.nan, value)
+            return data.replace(states=data.states.replace(**{state: wrong}))
+
+    env = DroneEnv(two_drones, Lost())
+    words = f"task 'still': expected spawn to return finite states, got {state} with NaN or infinity in world 1"
+    with pytest.raises(ConfigError, match=words):
+        env.reset(jax.random.key(0))
+    with pytest.raises(ConfigError, match=words):
+        DroneVectorEnv(env).reset(seed=0)
+
+
+def test_law_09_an_episode_without_a_step_is_refused(two_drones):
+    with pytest.raises(
+        ConfigError, match=r"at least one environment step, got seconds=0\.009 at 50 Hz. Use seconds=0\.02"
+    ):
+        DroneEnv(two_drones, Still(seconds=0.009))
 
 
 def test_law_09_a_start_with_other_leaves_is_refused(two_drones):

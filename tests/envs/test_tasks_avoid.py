@@ -125,5 +125,5 @@ def test_time_ends_an_episode(begun):
 
 @pytest.mark.parametrize("options", [{"n_poles": -1}, {"n_poles": 0, "n_boxes": 0}, {"n_seen": 0}, {"n_boxes": 1.5}])
 def test_what_cannot_be_a_field_is_refused(options):
-    with pytest.raises(ConfigError, match="whole numbers"):
+    with pytest.raises(ConfigError, match=r"n_poles|n_seen of Avoid|n_boxes of Avoid as a whole number"):
         make("avoid", 1, **options)

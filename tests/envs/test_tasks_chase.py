@@ -106,5 +106,5 @@ def test_the_roof_is_the_top_of_the_car(env, begun, place):
 
 @pytest.mark.parametrize("speed", [-1, 4.0, "x"])
 def test_a_speed_out_of_range_is_refused(speed):
-    with pytest.raises(ConfigError, match="expected speed from 0 to 3 m/s"):
+    with pytest.raises(ConfigError, match=r"expected speed of Chase (to be from 0 to 3|as a number), got"):
         make("chase", 1, speed=speed)

@@ -85,7 +85,7 @@ def test_too_low_is_a_crash(begun, step):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mass": 0.0}, "expected mass from 0.0001 to 1.0 kg, got 0.0"),
+        ({"mass": 0.0}, "mass of Deliver to be from 0.0001 to 1, got 0.0"),
         ({"length": "x"}, "got 'x'"),
         ({"speed": 5}, "speed"),
     ],

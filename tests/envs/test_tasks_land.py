@@ -140,8 +140,8 @@ def test_a_drone_that_follows_a_moving_pad_down_lands_and_one_that_falls_crashes
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"speed": -1}, "expected speed from 0.0 to 10.0 m/s, got -1"),
-        ({"radius": 2.0}, "expected radius from 0.05 to 0.5 m, got 2.0"),
+        ({"speed": -1}, "speed of Land to be from 0 to 10, got -1"),
+        ({"radius": 2.0}, "radius of Land to be from 0.05 to 0.5, got 2.0"),
         ({"speed": "x"}, "got 'x'"),
     ],
 )

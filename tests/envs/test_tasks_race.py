@@ -336,7 +336,7 @@ def test_a_given_track_is_flown_and_judged():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"level": 4}, "expected level 0, 1, 2 or 3, got 4"),
+        ({"level": 4}, "level of Race to be from 0 to 3, got 4"),
         ({"track": Track(gates_rpy=[(0, 0, 0)])}, "gates_rpy has shape"),
         ({"track": Track(start=(0.3, 0.25, 0.7))}, "gate 0 of the track is"),
         ({"track": Track(obstacles_pos=[(-1.5, 0.7, 1.5)])}, "obstacle 0 of the track is"),

@@ -123,7 +123,7 @@ def test_a_formation_is_what_drones_are_sent_to():
         ({"formation": [(0, 0, 1), (1, 0, 1), (0, 1, 1), (0, 0, 1.5)]}, r"places \[0, 3\]"),
         ({"formation": [(0, 0, 0.1), (1, 0, 1), (0, 1, 1), (2, 0, 1.5)]}, "at least 0.2 m over the floor, got 0.1 m"),
         ({"formation": "abc"}, "got 'abc'"),
-        ({"n_seen": 0}, "n_seen of at least 1, got 0"),
+        ({"n_seen": 0}, "n_seen of Swarm to be finite and at least 1, got 0"),
     ],
 )
 def test_what_cannot_be_a_swarm_is_refused(options, message):

@@ -12,6 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
@@ -91,11 +92,11 @@ class Avoid(Task):
     name = "avoid"
     Record = Crossing
 
-    n_poles: int = 8
+    n_poles: int = setting(default=8, low=0)
     """Number of poles."""
-    n_boxes: int = 4
+    n_boxes: int = setting(default=4, low=0)
     """Number of boxes."""
-    n_seen: int = 4
+    n_seen: int = setting(default=4, low=1)
     """Number of nearest obstacles that a drone observes."""
     seconds: float = 8.0
     """Length of an episode, s."""
@@ -106,12 +107,11 @@ class Avoid(Task):
         """Check the settings.
 
         Raises:
-            ConfigError: If a number is not a whole number, or zero where it may not be.
+            ConfigError: If a number is out of range, or there is no obstacle.
         """
-        counts = {"n_poles": self.n_poles, "n_boxes": self.n_boxes, "n_seen": self.n_seen}
-        whole = all(type(n) is int and n >= 0 for n in counts.values())
-        if not whole or self.n_poles + self.n_boxes == 0 or self.n_seen == 0:
-            raise ConfigError(f"expected whole numbers, at least one obstacle, and one observed, got {counts}")
+        super().__post_init__()
+        if self.n_poles + self.n_boxes == 0:
+            raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
 
     def field(self, n_drones: int) -> Field:
         """Return the size of the field: a third of the cells stay free, and all drones fit beside each other."""

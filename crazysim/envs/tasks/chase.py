@@ -13,11 +13,11 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.plugin import Placement
+from crazysim.core.settings import setting
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, not_yet
-from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
@@ -53,17 +53,8 @@ class Chase(TouchDown):
     progress = 6.0
     crash = 4.0
 
-    speed: float = 1.0
+    speed: float = setting(default=1.0, low=0.0, high=3.0)
     """Largest speed of a car, m/s; the smallest is 0.3 times that."""
-
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If the speed is out of range.
-        """
-        if not isinstance(self.speed, (int, float)) or not 0 <= self.speed <= 3:
-            raise ConfigError(f"expected speed from 0 to 3 m/s, got {self.speed!r}")
 
     def install(self, sim: Sim) -> None:
         """Add the cars and the check of contacts."""

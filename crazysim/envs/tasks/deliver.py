@@ -12,13 +12,13 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import between, draw, within
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
 from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
-from crazysim.errors import ConfigError
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
@@ -71,25 +71,14 @@ class Deliver(BringLoad):
     name = "deliver"
     Record = TrailerDelivery
 
-    mass: float = 0.008
+    mass: float = setting(default=0.008, low=1e-4, high=1.0)
     """Mass of the load, kg."""
-    length: float = 0.3
+    length: float = setting(default=0.3, low=0.2, high=1.0)
     """Length of the rod, m."""
-    speed: float = 0.5
+    speed: float = setting(default=0.5, low=0.0, high=2.0)
     """Largest speed of a car, m/s; the smallest is 0.3 times that."""
     seconds: float = 8.0
     """Length of an episode, s."""
-
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If a number is out of range.
-        """
-        for name, low, high, unit in (("mass", 1e-4, 1.0, "kg"), ("length", 0.2, 1.0, "m"), ("speed", 0.0, 2.0, "m/s")):
-            value = getattr(self, name)
-            if not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ConfigError(f"expected {name} from {low} to {high} {unit}, got {value!r}")
 
     def install(self, sim: Sim) -> None:
         """Add the cars with their trailers, the hooks with the loads on the trailers, and the rules."""

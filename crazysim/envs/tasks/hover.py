@@ -11,6 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
@@ -31,7 +32,7 @@ class Hover(GoalTask):
     name = "hover"
     half_width, height = 3.0, 3.0
 
-    reach: float = 1.0
+    reach: float = setting(default=1.0, low=0.0)
     """Half the width of the box of starts and goals, m; its half height is 0.7 of that."""
     seconds: float = 5.0
     """Length of an episode, s."""

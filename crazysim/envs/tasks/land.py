@@ -13,13 +13,13 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.plugin import Placement
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME
 from crazysim.envs.tasks.goals import pick, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, landing_of, not_yet
-from crazysim.errors import ConfigError
 from crazysim.pytree import leaf, on_device, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
@@ -60,21 +60,10 @@ class Land(TouchDown):
     Record = PadLanding
     what = "pad"
 
-    speed: float = 0.0
+    speed: float = setting(default=0.0, low=0.0, high=10.0)
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
-    radius: float = RADIUS
+    radius: float = setting(default=RADIUS, low=0.05, high=0.5)
     """Radius of a pad, m."""
-
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If speed or radius is out of range.
-        """
-        for name, low, high, unit in (("speed", 0.0, 10.0, "m/s"), ("radius", 0.05, 0.5, "m")):
-            value = getattr(self, name)
-            if not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ConfigError(f"expected {name} from {low} to {high} {unit}, got {value!r}")
 
     def install(self, sim: Sim) -> None:
         """Add the pads, their motion and the check of contacts."""

@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimParams
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
@@ -64,11 +65,11 @@ class Race(Task):
     name = "race"
     Record = rules.RaceRecord
 
-    level: int = 0
+    level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3."""
     track: Track = field(default_factory=Track)
     """The course. Level 3 takes numbers, heights and limits from it."""
-    sensor_range: float = SENSOR_RANGE
+    sensor_range: float = setting(default=SENSOR_RANGE, low=0.0)
     """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
     seconds: float = 12.0
     """Length of an episode, s."""
@@ -77,15 +78,6 @@ class Race(Task):
     practice: bool = False
     """True to start anywhere on the course, for learning: as often as at the start, a drone is behind a gate that
     counts as passed."""
-
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If there is no such level.
-        """
-        if self.level not in (0, 1, 2, 3):
-            raise ConfigError(f"expected level 0, 1, 2 or 3, got {self.level!r}")
 
     def install(self, sim: Sim) -> None:
         """Add gates, obstacles and the rules, and from level 1 on masses and inertias per drone.

@@ -10,6 +10,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw, within
 from crazysim.envs.spawn import flying
@@ -32,7 +33,7 @@ class ReachVel(Task):
     unit = "m/s"
     Record = Goal
 
-    speed: float = 1.0
+    speed: float = setting(default=1.0, low=0.0)
     """Largest component of the velocity, m/s; the vertical one is at most a quarter of it."""
     seconds: float = 4.0
     """Length of an episode, s."""

@@ -11,6 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import any_attitude, flying
@@ -27,9 +28,9 @@ class Recover(GoalTask):
     name = "recover"
     half_width, height = 8.0, 8.0
 
-    speed: float = 2.0
+    speed: float = setting(default=2.0, low=0.0)
     """Largest component of the velocity at the start, m/s."""
-    spin: float = 6.0
+    spin: float = setting(default=6.0, low=0.0)
     """Largest body rate at the start, rad/s."""
     seconds: float = 5.0
     """Length of an episode, s."""

@@ -13,6 +13,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import draw
@@ -61,7 +62,7 @@ class Swarm(Task):
 
     formation: Sequence[Sequence[float]] | None = None
     """Goals of the drones, in their order, m; None to change places. (n_drones, 3)"""
-    n_seen: int = 3
+    n_seen: int = setting(default=3, low=1)
     """Number of nearest other drones that a drone observes."""
     strict: bool = True
     """True to end an episode when two drones come too close; they are penalised in any case."""
@@ -69,15 +70,6 @@ class Swarm(Task):
     """Length of an episode, s."""
     tolerance: float = 0.1
     """Distance below which a drone counts as in its place, m."""
-
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If a drone is to observe none of the others.
-        """
-        if type(self.n_seen) is not int or self.n_seen < 1:
-            raise ConfigError(f"expected n_seen of at least 1, got {self.n_seen!r}")
 
     def install(self, sim: Sim) -> None:
         """Give every drone a goal, and check separation at every physics step.

@@ -14,18 +14,20 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.goals import on_floor, state_of, with_record
-from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, figure_eight
 
 TOO_FAR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
+MAX_SAMPLES = 1000
+"""Most samples of the time ahead: 3,000 numbers of an observation."""
 LATEST = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
@@ -50,11 +52,11 @@ class TrackTrajectory(Task):
 
     trajectory: Trajectory = field(default_factory=figure_eight)
     """The trajectory; by default a figure eight of 2 m by 1 m in 5 s, which repeats."""
-    n_samples: int = 5
+    n_samples: int = setting(default=5, low=1, high=MAX_SAMPLES)
     """Number of samples of the time ahead that a policy observes."""
-    spacing: float = 0.1
+    spacing: float = setting(default=0.1, positive=True)
     """Time between samples, s."""
-    spread: float = 0.2
+    spread: float = setting(default=0.2, low=0.0)
     """Largest component of the distance from the trajectory at the start, m."""
     seconds: float = 10.0
     """Length of an episode, s."""
@@ -62,18 +64,6 @@ class TrackTrajectory(Task):
     """Distance below which the drone counts as on the trajectory, m."""
     hold: float = 5.0
     """Time at the end of an episode during which it must stay there, s."""
-
-    def __post_init__(self) -> None:
-        """Check the trajectory.
-
-        Raises:
-            ConfigError: If it is none.
-        """
-        if not isinstance(self.trajectory, Trajectory):
-            raise ConfigError(
-                f"expected a crazysim.trajectories.Trajectory, got {self.trajectory!r}. Use figure_eight(), or another "
-                "of its shapes."
-            )
 
     def install(self, sim: Sim) -> None:
         """Give every drone its time on the trajectory."""

@@ -12,6 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms
 from crazysim.envs.random import between, draw, within
@@ -64,15 +65,15 @@ class Transport(BringLoad):
     name = "transport"
     Record = GateDelivery
 
-    mass: float = 0.01
+    mass: float = setting(default=0.01, positive=True)
     """Mass of the load, kg."""
-    length: float = 0.3
+    length: float = setting(default=0.3, positive=True)
     """Length of rod or cable, m."""
     cable: bool = False
     """True for a cable, False for a rigid rod."""
-    opening: float = 1.0
+    opening: float = setting(default=1.0, positive=True, high=1.6)
     """Width and height of the gate's opening, m."""
-    swing: float = 0.4
+    swing: float = setting(default=0.4, low=0.0, high=1.0)
     """Largest angle of the load from the vertical at the start along x and y, rad; its rate is up to 1.5 times that,
     rad/s."""
     seconds: float = 6.0
@@ -82,15 +83,14 @@ class Transport(BringLoad):
         """Check the settings.
 
         Raises:
-            ConfigError: If drone and load do not fit through the opening together, or the swing is out of range.
+            ConfigError: If drone and load do not fit through the opening together.
         """
+        super().__post_init__()
         if not self.length + ROOM <= self.opening <= 1.6:
             raise ConfigError(
                 f"expected opening from {self.length + ROOM:g} m, {ROOM} m above the length of the link, to 1.6 m, got "
                 f"{self.opening!r}"
             )
-        if not 0 <= self.swing <= 1:
-            raise ConfigError(f"expected swing from 0 to 1 rad, got {self.swing!r}")
 
     def install(self, sim: Sim) -> None:
         """Add the loads, the gates and the check of both."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.pytree import PyTree, leaf
+from crazysim.tables import NOT_NEGATIVE, number
 
 
 class Observe(Wrapper):
@@ -46,10 +47,13 @@ class ObservationNoise(Wrapper):
         """Take the environment, and the standard deviations by name of the observation, in its unit.
 
         Raises:
-            ConfigError: If there is no observation of that name, when the environment is first reset.
+            ConfigError: If a deviation is negative or not finite; if there is no observation of that name, when the
+                environment is first reset.
         """
         super().__init__(env)
-        self.std = dict(std)
+        if not isinstance(std, Mapping):
+            raise ConfigError(f"expected std as a dict of numbers by name, got {shown(std)}. Use {{'pos': 0.01}}, say.")
+        self.std = {name: number(f"std of {name!r}", value, NOT_NEGATIVE) for name, value in std.items()}
 
     def after_reset(self, state: EnvState) -> EnvState:
         """Return the state with noisy observations."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
@@ -41,7 +42,7 @@ class Playback(Plugin):
     """Positions, world frame, m. (n_samples, n_objects, 3)"""
     quat: ArrayLike
     """Attitudes, body to world, xyzw. (n_samples, n_objects, 4)"""
-    freq: float
+    freq: float = setting(positive=True)
     """Samples per second, Hz."""
     start: ArrayLike = 0.0
     """Time of the recording at the reset of a world, s. () or (n_worlds,)"""
@@ -58,10 +59,6 @@ class Playback(Plugin):
         if pos.ndim != 3 or pos.shape[1:] != (n, 3) or quat.shape != (*pos.shape[:2], 4) or len(pos) < 2:
             raise ConfigError(
                 f"expected at least two samples of {n} positions and attitudes, got shapes {pos.shape} and {quat.shape}"
-            )
-        if not all(np.isfinite(x).all() for x in (pos, quat, start)) or not 0 < self.freq < np.inf:
-            raise ConfigError(
-                "expected finite poses and starts, and a positive number of samples per second, got others"
             )
         if start.shape not in ((), (sim.n_worlds,)):
             raise ConfigError(f"expected start of shape () or ({sim.n_worlds},), got {start.shape}")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.core.settings import check_settings, setting
 from crazysim.errors import ConfigError
 from crazysim.live.mocap.frames import Frame
 from crazysim.live.mocap.source_events import Reports
@@ -24,20 +25,28 @@ CLOCK = 10.0
 class Rules:
     """Limits beyond which frames or bodies are reported or refused."""
 
-    max_speed: float = 10.0
+    max_speed: float = setting(default=10.0, low=0.0)
     """Largest speed of a body, m/s; a body that is faster has jumped."""
-    slack: float = 0.05
+    slack: float = setting(default=0.05, low=0.0)
     """Distance that is no jump, m."""
-    confirm: int = 3
+    confirm: int = setting(default=3, low=1)
     """Number of consecutive frames that agree on a new place after which a jump is accepted."""
-    late: float = 0.05
+    late: float = setting(default=0.05, low=0.0)
     """Delay of a frame over the least one seen that is reported, s."""
-    lost: float = 0.2
+    lost: float = setting(default=0.2, low=0.0)
     """Time without a valid pose after which a body counts as lost, s."""
-    stalled: float = 0.2
+    stalled: float = setting(default=0.2, low=0.0)
     """Time without a frame after which the source counts as stalled, s."""
-    restart: float = 1.0
+    restart: float = setting(default=1.0, low=0.0)
     """Step back of the source's clock that counts as its restart, s; a smaller one is an old frame."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: If one is not finite, or out of its range.
+        """
+        check_settings(self)
 
 
 class Tracker:

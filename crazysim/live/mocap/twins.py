@@ -14,6 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.closing import Closing
+from crazysim.core.settings import check_settings, setting
 from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.attitude import from_rpy, multiply, rotate, to_rpy
@@ -43,19 +44,27 @@ class Twin:
     """Name of a primitive, or an MJCF file, text, spec or body, as for ``sim.scene.add``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of the primitive, such as ``{"size": (0.1, 0.1, 0.2)}``."""
-    offset: Sequence[float] = (0.0, 0.0, 0.0)
+    offset: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Position of the body's frame in the turned tracked frame, m. (3,)"""
-    turn: Sequence[float] = (0.0, 0.0, 0.0)
+    turn: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Roll, pitch and yaw of the body in the tracked frame, rad. (3,)"""
     fixed: Sequence[float | None] = (None, None, None)
     """Roll, pitch and yaw of the body in the world frame that replace the measured ones, rad; None for measured."""
     parent: str | None = None
     """Name of the body in the stream that carries this one; None if it moves freely."""
-    at: Sequence[float] = (0.0, 0.0, 0.0)
+    at: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Position of the joint in the parent's tracked frame, m. (3,)"""
-    length: float = 0.0
+    length: float = setting(default=0.0, low=0.0)
     """Distance from the joint to the tracked frame, m, in the measured direction: zero for a hook or a hinge at the
     joint, the drawbar's length for a trailer."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: If one is not finite, or has another shape or sign.
+        """
+        check_settings(self)
 
     @staticmethod
     def drone(airframe: str = "crazyflie", **settings: Any) -> Twin:

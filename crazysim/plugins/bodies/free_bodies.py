@@ -15,17 +15,17 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.integration import Integrator, limit_ang_vel
 from crazysim.core.plugin import Placement, Simulation, parameter
 from crazysim.core.population import Population, Rates
-from crazysim.core.settings import as_rgba, check_contacts
+from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rigid_body import free_rotation
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
 from crazysim.plugins.contacts.rigid_bodies import Touching, require_few_contacts
 from crazysim.plugins.effects.ground import TerrainData
 from crazysim.plugins.payloads.body import shape_of
 from crazysim.pytree import Members, host_array, leaf
 from crazysim.scene.contact_report import ObjectSelection
-from crazysim.tables import MASS, as_numbers
+from crazysim.tables import MASS
 
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity, world frame, m/s^2, as the airframes have it."""
@@ -35,35 +35,39 @@ GAP = 0.5
 """Distance of neighbours that start in a row, m."""
 
 
+SURFACE = ("mass", "friction", "restitution")
+"""Settings with a number for each body."""
+
+
 class FreeBodiesData(Members):
     """States and parameters of free bodies."""
 
-    pos: Array = leaf("member", 1)
+    pos: Array = leaf("member", 1, (3,))
     """Position of the centre of mass, world frame, m. (n_worlds, n_members, 3)"""
-    quat: Array = leaf("member", 1)
+    quat: Array = leaf("member", 1, (4,))
     """Attitude, body to world, unit, xyzw. (n_worlds, n_members, 4)"""
-    vel: Array = leaf("member", 1)
+    vel: Array = leaf("member", 1, (3,))
     """Velocity of the centre of mass, world frame, m/s. (n_worlds, n_members, 3)"""
-    ang_vel: Array = leaf("member", 1)
+    ang_vel: Array = leaf("member", 1, (3,))
     """Angular velocity, body frame, rad/s. (n_worlds, n_members, 3)"""
-    force: Array = leaf("member", 1)
+    force: Array = leaf("member", 1, (3,))
     """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
-    torque: Array = leaf("member", 1)
+    torque: Array = leaf("member", 1, (3,))
     """External torque, world frame, N m; kept until it is changed. (n_worlds, n_members, 3)"""
-    impulse: Array = leaf("member", 1)
+    impulse: Array = leaf("member", 1, (3,))
     """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
     press: Array = leaf("world", 1)
     """Impulses of the last step along the normals of the contact points, N s, with which the next begins.
     (n_worlds, 1, n_contacts)"""
     drag: Array = leaf("world", 2)
     """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
-    mass: Array = leaf("member", 1)
+    mass: Array = leaf("member", 1, (1,))
     """Mass, kg. (n_worlds, n_members, 1)"""
-    inertia: Array = leaf("member", 1)
+    inertia: Array = leaf("member", 1, (3,))
     """Moments of inertia about the axes of the body, kg m^2. (n_worlds, n_members, 3)"""
-    friction: Array = leaf("member", 1)
+    friction: Array = leaf("member", 1, (1,))
     """Coulomb's coefficient of the surface, 1. (n_worlds, n_members, 1)"""
-    restitution: Array = leaf("member", 1)
+    restitution: Array = leaf("member", 1, (1,))
     """Ratio of the speeds after and before a bounce, 1. (n_worlds, n_members, 1)"""
 
 
@@ -78,7 +82,7 @@ class FreeBodies(Population):
     """Number of bodies in each world, or their names."""
     size: Any = (0.2, 0.2, 0.2)
     """Full lengths of a box, m (3,), or radius of a ball, m, for all; or a list of one for each body."""
-    mass: ArrayLike = parameter(default=0.1)
+    mass: ArrayLike = parameter(default=0.1, low=MASS.low, high=MASS.high)
     """Mass, kg. (), (n_members,) or (n_worlds, n_members)"""
     pos: ArrayLike | None = parameter(default=None)
     """Positions at the start, world frame, m; None for a row along x on the floor. (3,), (n_members, 3) or (n_worlds,
@@ -87,20 +91,20 @@ class FreeBodies(Population):
     """Attitudes at the start, xyzw, normalised here. (4,), (n_members, 4) or (n_worlds, n_members, 4)"""
     vel: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Velocities at the start, world frame, m/s. (3,), (n_members, 3) or (n_worlds, n_members, 3)"""
-    friction: ArrayLike = parameter(default=0.6)
+    friction: ArrayLike = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
     """Coulomb's coefficient; of two bodies the larger counts. (), (n_members,) or (n_worlds, n_members)"""
-    restitution: ArrayLike = parameter(default=0.0)
+    restitution: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Ratio of the speeds after and before a bounce, 0 to 1; of two bodies the larger counts. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectSelection = None
     """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground."""
     drones: bool = True
     """True for contact with drones."""
-    softness: float = 0.03
+    softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)
     """Time constant with which an overlap is pushed out, s; at least two steps."""
-    iterations: int = 30
+    iterations: int = setting(default=30, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver."""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color(n=True)
     """Colour, one or one for each body; None for the default. (4,) or (n_members, 4)"""
     name: str = "bodies"
     prefix: ClassVar[str] = "Box"
@@ -139,19 +143,12 @@ class FreeBodies(Population):
                 f"expected one FreeBodies in a simulation, got a second beside {others[0]!r}. Use "
                 f"FreeBodies(n, size=[...]) with a size for each body."
             )
-        check_contacts(sim.data.core.freq, self.friction, self.restitution, self.softness, self.iterations)
+        check_softness(sim.data.core.freq, self.softness)
         pos = row(shapes) if self.pos is None else self.pos
-        numbers = {}
-        for name in ("mass", "friction", "restitution"):
-            numbers[name] = as_numbers(f"plugin {self.name!r}", name, getattr(self, name))[..., None]
-        if not np.all((numbers["mass"] >= MASS.low) & (numbers["mass"] <= MASS.high)):
-            raise ConfigError(f"expected mass to be {MASS.text}, got {shown(self.mass)}")
+        numbers = {name: np.asarray(getattr(self, name), np.float64)[..., None] for name in SURFACE}
         quat = np.asarray(self.quat, np.float64)
         if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
             raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
-        for name, value in (("pos", pos), ("vel", self.vel)):
-            if not np.all(np.isfinite(np.asarray(value, np.float64))):
-                raise ConfigError(f"expected {name} to be finite, got {value!r}")
         self.check(sim)
         self._add_to_scene(sim, shapes)
         terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, TerrainData)]

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
-from crazysim.core.settings import check_contacts
+from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage, over_worlds
 from crazysim.errors import ConfigError
 from crazysim.geometry.manifold import N_OF_BOXES
@@ -50,13 +50,13 @@ class DroneCollisions(Plugin):
     All pairs are checked: it is for small swarms. Momentum and angular momentum are kept.
     """
 
-    friction: float = parameter(default=0.6)
+    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
     """Coulomb's coefficient between drones."""
-    restitution: float = parameter(default=0.2)
+    restitution: float = parameter(default=0.2, low=0.0, high=1.0)
     """Ratio of the speeds after and before a bounce, 0 to 1."""
-    softness: float = 0.03
+    softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)
     """Time constant with which an overlap is pushed out, s; at least two steps."""
-    iterations: int = 12
+    iterations: int = setting(default=12, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver."""
     name: str = "drone_collisions"
 
@@ -65,7 +65,7 @@ class DroneCollisions(Plugin):
         n = sim.n_drones
         if n < 2:
             raise ConfigError(f"expected at least two drones, which can collide, got {n}. Use Sim(n_drones=...).")
-        check_contacts(sim.data.core.freq, self.friction, self.restitution, self.softness, self.iterations)
+        check_softness(sim.data.core.freq, self.softness)
         n_contacts = require_few_contacts(N_OF_BOXES * n * (n - 1) // 2, f"{n} drones")
         return DroneCollisionsData(
             friction=on_device([self.friction]),

@@ -17,7 +17,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
-from crazysim.core.settings import check_contacts
+from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage
 from crazysim.plugins.contacts.contact_points import Surface, contact_points, is_ground, surfaces_of
 from crazysim.plugins.contacts.drone_boxes import Boxes, boxes_of, of_kind
@@ -58,19 +58,19 @@ class ContactResponse(Plugin):
 
     objects: ObjectSelection = None
     """Handles, or names of bodies; None for all at the time of adding, () for the floor alone."""
-    friction: float = parameter(default=0.6)
+    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
     """Coulomb's coefficient."""
-    restitution: float = parameter(default=0.2)
+    restitution: float = parameter(default=0.2, low=0.0, high=1.0)
     """Ratio of the speeds after and before a bounce, 0 to 1."""
-    softness: float = parameter(default=0.03)
+    softness: float = parameter(default=0.03, positive=True, high=MAX_SOFTNESS)
     """Time constant with which an overlap is pushed out, s; at least two steps."""
-    iterations: int = 8
+    iterations: int = setting(default=8, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver, for simultaneous contact points."""
     name: str = "contact_response"
 
     def record(self, sim: Simulation) -> ContactResponseData:
         """Return the parameters, and no impulse."""
-        check_contacts(sim.data.core.freq, self.friction, self.restitution, self.softness, self.iterations)
+        check_softness(sim.data.core.freq, self.softness)
         return ContactResponseData(
             friction=on_device([self.friction]),
             restitution=on_device([self.restitution]),

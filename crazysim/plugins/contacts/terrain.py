@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
-from crazysim.core.settings import as_rgba
+from crazysim.core.settings import as_rgba, color, setting
 from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR, stopped_at
 from crazysim.errors import ConfigError
@@ -42,17 +42,17 @@ class Terrain(Plugin):
     and for a ``ContactResponse`` that is added later.
     """
 
-    heights: Any = parameter()
+    heights: ArrayLike | str | Path = parameter()
     """Heights, m, rows along y and columns along x (n_rows, n_columns); or the path of a PNG image, whose brightness is
     the height, from its darkest to its brightest pixel, and whose upper edge lies at the largest y."""
-    size: ArrayLike
+    size: ArrayLike = setting(positive=True, shapes=((2,), (3,)))
     """Full lengths along x and y, m (2,); with an image also the height of the brightest over the darkest (3,)."""
-    pos: ArrayLike = (0.0, 0.0, 0.0)
+    pos: ArrayLike = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Middle of the terrain at height zero, world frame, m. (3,)"""
     floor: bool = True
     """True to keep the flat floor around it; False to remove it, which depressions below z = 0 need. The heights of the
     border then extend outwards without end."""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color()
     """Colour; None for that of the floor. (4,)"""
     name: str = "terrain"
 
@@ -84,21 +84,18 @@ class Terrain(Plugin):
 
     def _checked(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights, full lengths along x and y, and the middle, m."""
-        is_image = isinstance(self.heights, (str, Path))
+        given = self.heights
+        is_image = isinstance(given, (str, Path))
         size, pos = np.asarray(self.size, np.float64), np.asarray(self.pos, np.float64)
         n = 3 if is_image else 2
-        if size.shape != (n,) or not np.all(np.isfinite(size)) or not np.all(size > 0):
+        if size.shape != (n,):
             raise ConfigError(
                 f"expected size as {n} positive lengths, m, {'along x, y and z' if is_image else 'along x and y'}, "
                 f"got {self.size!r}"
             )
-        if pos.shape != (3,) or not np.all(np.isfinite(pos)):
-            raise ConfigError(f"expected pos as three finite numbers, m, got {self.pos!r}")
-        heights = size[2] * read_image(self.heights) if is_image else np.asarray(self.heights, np.float64)
-        if heights.ndim != 2 or min(heights.shape) < 2 or not np.all(np.isfinite(heights)):
-            raise ConfigError(
-                f"expected heights of two or more rows and columns, finite, m, got shape {np.shape(heights)}"
-            )
+        heights = size[2] * read_image(given) if isinstance(given, (str, Path)) else np.asarray(given, np.float64)
+        if heights.ndim != 2 or min(heights.shape) < 2:
+            raise ConfigError(f"expected heights of two or more rows and columns, m, got shape {np.shape(heights)}")
         if self.floor and heights.min() + pos[2] < 0:
             raise ConfigError(
                 f"expected heights of at least 0 m above the flat floor, got {heights.min() + pos[2]:.4g} m. Use "

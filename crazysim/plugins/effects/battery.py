@@ -22,6 +22,10 @@ NOMINAL_VOLTAGE = 3.7
 no table ``[battery]``."""
 
 
+MAX_CELLS = 100
+"""Most cells in series, as of airframes."""
+
+
 class BatteryData(PyTree):
     """State and parameters of the battery of every drone."""
 
@@ -57,25 +61,30 @@ class Battery(Plugin):
     (n_worlds, n_drones).
     """
 
-    capacity: ArrayLike | None = parameter(default=None)
+    capacity: ArrayLike | None = parameter(default=None, positive=True)
     """Charge of the full battery, A h; None for that of the airframe's table ``[battery]``."""
-    resistance: ArrayLike | None = parameter(default=None)
+    resistance: ArrayLike | None = parameter(default=None, positive=True)
     """Internal resistance of the whole battery, ohm; None for that of the airframe's table ``[battery]``."""
-    n_cells: ArrayLike | None = parameter(default=None)
+    n_cells: ArrayLike | None = parameter(default=None, low=1, high=MAX_CELLS, dtype=np.int32)
     """Number of lithium-polymer cells in series; None for that of the airframe's table ``[battery]``, or else 1."""
     efficiency: ArrayLike = parameter(default=1.0, high=1.0, positive=True)
     """Mechanical power of the propellers per electric power of the motors, above 0, up to 1."""
     base_power: ArrayLike = parameter(default=0.0, low=0.0)
     """Electric power of everything but the motors, W."""
-    full_speed_voltage: ArrayLike | None = parameter(default=None)
+    full_speed_voltage: ArrayLike | None = parameter(default=None, positive=True)
     """Least voltage at which the rotors reach the airframe's largest speed, V; None for that of the airframe's table
     ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
-    charge: ArrayLike = parameter(default=1.0)
+    charge: ArrayLike = parameter(default=1.0, low=0.0, high=1.0)
     """State of charge at the beginning of an episode, 0 to 1."""
     command_voltage: ArrayLike | None = parameter(default=None, positive=True)
     """Voltage at which rotors turn as commanded, V: their speeds are proportional to the voltage, as with firmware that
     does not compensate for it; None for firmware that does."""
     name: str = "battery"
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The voltage of the motors, which the model takes to be constant."""
+        return ("battery voltage",)
 
     def record(self, sim: Simulation) -> BatteryData:
         """Return batteries with the initial charge and no load."""

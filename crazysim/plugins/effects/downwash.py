@@ -45,11 +45,16 @@ class DownwashData(Air):
 class Downwash(Plugin):
     """Downwash of the other drones of a world, as drag of the velocity relative to the air; needs a model with drag."""
 
-    propeller_radius: ArrayLike | None = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
     air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
     name: str = "downwash"
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The downwash, which the model lacks."""
+        return ("downwash",)
 
     def record(self, sim: Simulation) -> DownwashData:
         """Return still air."""

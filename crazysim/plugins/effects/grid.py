@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim.errors import ConfigError
 from crazysim.rotation import safe_clip
 from crazysim.storage import read_text
-from crazysim.tables import LARGEST
+from crazysim.tables import ANY, LARGEST, POSITIVE, numbers
 
 LARGEST_FUSED = 400_000
 """Most numbers of a table that a fused kernel reads; compiling the step takes 8 µs for each."""
@@ -47,7 +47,10 @@ class Grid(NamedTuple):
         Raises:
             ConfigError: If a shape or a number is invalid.
         """
-        values = np.asarray(self.values, np.float64)
+        values, origin, spacing = (
+            numbers(f"{what} of {name}", getattr(self, what), POSITIVE if what == "spacing" else ANY)
+            for what in ("values", "origin", "spacing")
+        )
         core = () if k is None else (k,)
         if values.ndim != 3 + len(core) or values.shape[3:] != core or min(values.shape) < 1:
             what = "one number" if k is None else f"{k} numbers"
@@ -55,15 +58,10 @@ class Grid(NamedTuple):
             raise ConfigError(
                 f"expected {name} as values of shape {shape}, got {values.shape}. Give each node of the grid {what}."
             )
-        origin, spacing = np.asarray(self.origin, np.float64), np.asarray(self.spacing, np.float64)
-        if origin.shape != (3,) or spacing.shape not in ((), (3,)) or not np.all(spacing > 0):
+        if origin.shape != (3,) or spacing.shape not in ((), (3,)):
             raise ConfigError(
-                f"expected {name} with an origin of shape (3,) and a positive spacing of shape () or (3,), m, got "
+                f"expected {name} with an origin of shape (3,) and a spacing of shape () or (3,), m, got "
                 f"{self.origin!r} and {self.spacing!r}. Use origin=(0, 0, 0) and spacing=0.5, for example."
-            )
-        if not all(np.all(np.isfinite(x)) for x in (values, origin, spacing)):
-            raise ConfigError(
-                f"expected finite numbers in {name}, got NaN or infinity. Fill the gaps, with zeros for example."
             )
         return Grid(values, origin, np.broadcast_to(spacing, (3,)))
 

@@ -28,9 +28,14 @@ class GroundEffectData(PyTree):
 class GroundEffect(Plugin):
     """Thrust of every rotor that grows near the ground, flat floor or terrain; needs rotors."""
 
-    propeller_radius: ArrayLike | None = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
     name: str = "ground_effect"
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The ground effect, which the model lacks."""
+        return ("ground effect",)
 
     def record(self, sim: Simulation) -> GroundEffectData:
         """Return the parameters."""

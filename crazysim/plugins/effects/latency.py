@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, as_stages, stage
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
 
 MAX_DELAY = 100_000
@@ -40,9 +41,9 @@ class Latency(Plugin):
     plugin was added (after a reset, that of the default data) stays in force.
     """
 
-    delay: ArrayLike = parameter()
+    delay: ArrayLike = parameter(low=0, high=MAX_DELAY, dtype=np.int32)
     """Delay, steps, whole numbers. () or (n_worlds, n_drones)"""
-    max_delay: int | None = None
+    max_delay: int | None = setting(default=None, low=0, high=MAX_DELAY)
     """Largest delay that the record can take later on, steps; None for the largest of ``delay``."""
     name: str = "latency"
     order: ClassVar[int] = -1  # a late command is limited as any other
@@ -87,18 +88,7 @@ class Latency(Plugin):
 
     def _filled(self, sim: Simulation, data: SimData) -> LatencyData:
         delay, longest = np.asarray(self.delay), self.max_delay
-        if longest is None and delay.size and delay.dtype.kind in "iu":
-            longest = int(np.max(delay))
-        if (
-            isinstance(longest, bool)
-            or not isinstance(longest, (int, np.integer))
-            or not 0 <= longest <= MAX_DELAY
-            or delay.dtype.kind not in "iu"
-        ):
-            raise ConfigError(
-                f"expected delay and max_delay as whole numbers of steps from 0 to {MAX_DELAY}, got "
-                f"{shown(self.delay)} and {shown(self.max_delay)}"
-            )
+        longest = int(np.max(delay)) if longest is None else longest
         steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _sent(data)
         queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
         return LatencyData(steps, on_device(queue, command.dtype), command)

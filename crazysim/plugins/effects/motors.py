@@ -37,7 +37,7 @@ class MotorFailure(Plugin):
     no command and runs down. Controllers keep the airframe's parameters.
     """
 
-    effectiveness: ArrayLike = parameter(default=1.0)
+    effectiveness: ArrayLike = parameter(default=1.0, low=0.0, high=1.0)
     """Fraction of thrust and drag torque at the beginning of an episode, 0 to 1.
     (), (n_rotors,) or (n_worlds, n_drones, n_rotors)"""
     fail_step: ArrayLike | None = parameter(default=None, dtype=np.int32)
@@ -52,7 +52,7 @@ class MotorFailure(Plugin):
         """Return the rotors at their initial effectiveness."""
         require_rotors(sim, "motor failure")
         n = sim.data.states.rotor_vel.shape[-1]
-        effectiveness = check_parameter(sim, "effectiveness", self.effectiveness, (n,), 0.0, 1.0)
+        effectiveness = check_parameter(sim, "effectiveness", self.effectiveness, (n,))
         return self.filled(sim, MotorFailureData, effectiveness=per_drone(sim, effectiveness, n))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

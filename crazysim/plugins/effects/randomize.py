@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, parameter, per_drone
 from crazysim.core.random import drone_key, uniform
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
 from crazysim.plugins.effects.latency import LatencyData
 from crazysim.plugins.effects.moving_air import Air, has_drag, require_drag, require_rotors, with_moving_air
@@ -24,6 +24,8 @@ from crazysim.pytree import leaf
 
 FACTORS = ("mass", "inertia", "torque", "lag", "drag")
 """Settings that are factors of one number of a drone, in the order of ``RandomizeData.factors``."""
+RANGES = (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay")
+"""Settings that are ranges of numbers."""
 
 
 class RandomizeData(Air):
@@ -102,6 +104,19 @@ class Randomize(Plugin):
     name: str = "randomize"
     order: ClassVar[int] = -2  # before effects that change the same parameters
 
+    def __post_init__(self) -> None:
+        """Check the settings that do not depend on a simulation.
+
+        Raises:
+            ConfigError: If a number is out of its range, or a name of ``optional`` is none of the settings.
+        """
+        super().__post_init__()
+        if not isinstance(self.optional, (list, tuple)) or not all(name in RANGES for name in self.optional):
+            raise ConfigError(
+                f"expected optional as a list of {', '.join(RANGES)}, got {shown(self.optional)}. Use "
+                f"optional=('wind',), say."
+            )
+
     @classmethod
     def crazyflie(cls, **changes: ArrayLike | None) -> Randomize:
         """Return the spread between published identifications of Crazyflies 2.x, and between flights.
@@ -155,7 +170,7 @@ class Randomize(Plugin):
             thrust_factors=per_drone(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
             air_vel=per_drone(sim, 0.0, 3) if blows else None,
         )
-        for name in (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay"):
+        for name in RANGES:
             limits, given = getattr(record, name), getattr(self, name)
             if limits is not None and np.ndim(given) == 0:
                 raise ConfigError(

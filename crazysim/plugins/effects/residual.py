@@ -17,7 +17,6 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve, rotor_torque
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import require_rotors
-from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import PyTree, leaf, on_device
 
 N_INPUTS = 14
@@ -55,7 +54,7 @@ class Residual(Plugin):
 
     They depend on the velocity over ground, so that wind does not change them. Coefficients are for all drones, as
     given here, or for each, with (n_worlds, n_drones) in front; without them they are those of the airframe's table
-    ``[residual]``.
+    ``[residual]``, which were fitted beside the linear drag, and do not go with ``RotorAerodynamics``.
     """
 
     linear: ArrayLike | None = parameter(default=None)
@@ -66,17 +65,24 @@ class Residual(Plugin):
     """Force, N, and torque, N m, in the body frame, per activation; None as for ``hidden``. (6, n_hidden)"""
     name: str = "residual"
 
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The drag, where the coefficients are the airframe's, which were fitted beside its linear drag."""
+        return ("drag",) if self.linear is None else ()
+
     def record(self, sim: Simulation) -> ResidualData:
         """Return the coefficients."""
         require_rotors(sim, "a residual")
         given = {key: getattr(self, key) for key in ("linear", "hidden", "output")}
         if (self.hidden is None) != (self.output is None) or (self.linear is None and self.hidden is not None):
+            names = ", ".join(key for key, value in given.items() if value is not None)
             raise ConfigError(
-                "expected hidden and output together, and linear with them. Give zeros for no linear terms."
+                f"expected hidden and output together, and linear with them, got {names or 'none'}. Give zeros for no "
+                f"linear terms."
             )
         if self.linear is None:
             given = _of_airframes(sim)
-        n_hidden = 0 if given["hidden"] is None else np.shape(given["hidden"])[-2]
+        n_hidden = 0 if given["hidden"] is None else np.atleast_2d(given["hidden"]).shape[-2]
 
         def checked(key: str, shape: tuple[int, int]) -> Array | None:
             value = given[key]
@@ -84,18 +90,6 @@ class Residual(Plugin):
 
         linear = check_parameter(sim, "linear", given["linear"], (6, N_INPUTS))
         return ResidualData(linear, checked("hidden", (n_hidden, N_INPUTS)), checked("output", (6, n_hidden)))
-
-    def check_plugins(self, sim: Simulation) -> None:
-        """Check that nothing else models what the airframe's coefficients were fitted to.
-
-        Raises:
-            ConfigError: If there is a ``RotorAerodynamics`` too.
-        """
-        if self.linear is None and any(isinstance(x, RotorAerodynamicsData) for x in sim.data.plugins.values()):
-            raise ConfigError(
-                "expected RotorAerodynamics or the airframe's residual, which was fitted without it, got both. Use one "
-                "of the two, or Residual(linear=...) with coefficients that were fitted with both."
-            )
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force and torque added."""

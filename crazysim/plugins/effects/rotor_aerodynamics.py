@@ -52,10 +52,10 @@ class RotorAerodynamics(Plugin):
     the airframe's linear drag for small velocities around hover.
     """
 
-    drag: ArrayLike | None = parameter(default=None)
+    drag: ArrayLike | None = parameter(default=None, low=0.0)
     """Drag of a rotor per velocity across its axis and rotor speed (k_d of RotorPy), N s^2/(m rad) = kg/rad; None for
     that of the airframe's linear drag in hover, the mean of x and y; zero for none. () or (n_worlds, n_drones)"""
-    inflow: ArrayLike | None = parameter(default=None)
+    inflow: ArrayLike | None = parameter(default=None, low=0.0)
     """Loss of thrust of a hovering rotor per axial velocity and rotor speed (k_z of RotorPy), N s^2/(m rad) = kg/rad;
     None for that of the airframe's linear drag along z in hover; zero for the thrust of still air.
     () or (n_worlds, n_drones)"""
@@ -69,12 +69,17 @@ class RotorAerodynamics(Plugin):
     ceiling: ArrayLike | None = parameter(default=None, positive=True)
     """Height of a flat ceiling, below which rotors give more thrust, world frame, m; rotors above it give the thrust of
     free air. Needs ``inflow``; None for none. () or (n_worlds, n_drones)"""
-    propeller_radius: ArrayLike | None = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
     air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
     name: str = "rotor_aerodynamics"
     order: ClassVar[int] = 1  # after winds, whose drag it replaces, and after effects that change the thrust curves
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The linear drag."""
+        return ("drag",)
 
     def record(self, sim: Simulation) -> RotorAerodynamicsData:
         """Return the parameters."""

@@ -12,6 +12,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Simulation, per_drone
+from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.error_state import Estimate
@@ -64,9 +65,9 @@ class ESKF(ErrorStateFilter):
     """
 
     _: dataclasses.KW_ONLY
-    max_pos: float = 1e4
+    max_pos: float = setting(default=1e4, positive=True)
     """Coordinate beyond which the estimate has diverged, m."""
-    max_vel: float = 100.0
+    max_vel: float = setting(default=100.0, positive=True)
     """Velocity along an axis beyond which the estimate has diverged, m/s."""
     name: str = "eskf"
 

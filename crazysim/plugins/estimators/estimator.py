@@ -40,6 +40,7 @@ class Estimator(Plugin):
         Raises:
             ConfigError: If they are not.
         """
+        super().__post_init__()
         if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
             example = f"{type(self).__name__}([IMU(), MotionCapture()])"
             raise ConfigError(f"expected sensors as a list, got {shown(self.sensors)}. Use {example}, say.")
@@ -48,6 +49,11 @@ class Estimator(Plugin):
     def default(cls) -> Estimator:
         """Return the filter on the sensors that its name alone stands for."""
         raise NotImplementedError
+
+    @property
+    def replaced_terms(self) -> tuple[str, ...]:
+        """The state that controllers read."""
+        return ("the state that controllers read",) if self.control else ()
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:

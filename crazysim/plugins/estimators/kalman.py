@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
+from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state, updates
@@ -86,7 +87,7 @@ class Kalman(ErrorStateFilter):
     """Standard deviation of accelerations, body frame, m/s^2. (3,) or (n_worlds, n_drones, 3)"""
     gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
     """Standard deviation of angular velocities, body frame, rad/s. (3,) or (n_worlds, n_drones, 3)"""
-    deviations: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    deviations: Mapping[str, float] = setting(default_factory=dict, positive=True)
     """Standard deviations that differ from ``DEVIATIONS``, by its names."""
     name: str = "kalman"
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
-from crazysim.core.settings import as_mask
+from crazysim.core.settings import as_mask, color, setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, shown
 from crazysim.geometry import Shape
@@ -61,7 +61,7 @@ class Hook(Colliding, Plugin):
 
     mass: ArrayLike = parameter(low=0.0)
     """Mass of the load, kg; zero for none. () or (n_worlds, n_drones)"""
-    dof: int = 2
+    dof: int = setting(default=2, low=1, high=2)
     """Degrees of freedom of the rod, 1 or 2."""
     length: ArrayLike = parameter(default=0.4, positive=True)
     """Length of the rod, m. () or (n_worlds, n_drones)"""
@@ -79,14 +79,14 @@ class Hook(Colliding, Plugin):
     """Linear drag coefficient of the load, N s/m. () or (n_worlds, n_drones)"""
     friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
-    size: ArrayLike = (0.14, 0.14, 0.08)
+    size: ArrayLike = setting(default=(0.14, 0.14, 0.08), positive=True, shapes=((), (3,)))
     """Radius of a ball, or full lengths of a box, m: () or (3,)."""
-    ring: float = 0.1275
+    ring: float = setting(default=0.1275, low=0.0)
     """Height of the ring above the middle of the load, m."""
     load_at: ArrayLike | None = None
     """Initial position of the loads' rings, world frame, m; None for loads on the hooks. (3,) or (n_worlds, n_drones,
     3)"""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color()
     """Colour of the loads; None for the default. (4,)"""
     in_scene: bool = True
     """True to put loads and rods into the scene."""
@@ -109,8 +109,6 @@ class Hook(Colliding, Plugin):
 
     def record(self, sim: Simulation) -> HookData:
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
-        if self.dof not in (1, 2):
-            raise ConfigError(f"expected dof as 1 or 2, got {self.dof!r}. Use Hook(mass, dof=2).")
         grip = on_device(np.ones(sim.data.states.pos.shape[:2]), bool)
         load = load_record(self, sim, HookData, False, rest_height(self.size) + self.ring, self.ring, grip=grip)
         if self.load_at is None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
+from crazysim.tables import POSITIVE, numbers
 
 CENTIMETRE = 0.01
 """Edge of a voxel of AIMotionLab's tables, m."""
@@ -42,8 +43,8 @@ class JetTable(NamedTuple):
         Raises:
             ConfigError: If a shape or a number is invalid.
         """
-        speeds = np.asarray(self.speeds, np.float64)
-        if speeds.ndim != 1 or not len(speeds) or np.any(speeds <= 0) or np.any(np.diff(speeds) <= 0):
+        speeds = numbers("speeds", self.speeds, POSITIVE)
+        if speeds.ndim != 1 or np.any(np.diff(speeds) <= 0):
             raise ConfigError(f"expected positive rotor speeds in ascending order, rad/s, got {self.speeds!r}")
         if self.pressure is None and self.velocity is None:
             raise ConfigError(
@@ -54,7 +55,7 @@ class JetTable(NamedTuple):
             value = getattr(self, name)
             if value is None:
                 continue
-            value = np.asarray(value, np.float64)
+            value = numbers(name, value)
             if value.ndim != 4 + len(core) or len(value) != len(speeds) or value.shape[4:] != core:
                 shape = f"({len(speeds)}, n_x, n_y, n_z{', 3' if core else ''})"
                 raise ConfigError(f"expected {name} of shape {shape} for {len(speeds)} speeds, got {value.shape}")
@@ -64,14 +65,12 @@ class JetTable(NamedTuple):
                 f"expected pressure and velocity on the same grid, got {found['pressure'].shape} and "
                 f"{found['velocity'].shape}. Use two RotorJet with a name each for two grids."
             )
-        origin, spacing = np.asarray(self.origin, np.float64), np.asarray(self.spacing, np.float64)
-        if origin.shape != (3,) or spacing.shape not in ((), (3,)) or not np.all(spacing > 0):
+        origin, spacing = numbers("origin", self.origin), numbers("spacing", self.spacing, POSITIVE)
+        if origin.shape != (3,) or spacing.shape not in ((), (3,)):
             raise ConfigError(
-                f"expected an origin of shape (3,) and a positive spacing of shape () or (3,), m, got "
+                f"expected an origin of shape (3,) and a spacing of shape () or (3,), m, got "
                 f"{self.origin!r} and {self.spacing!r}"
             )
-        if not all(np.all(np.isfinite(x)) for x in (speeds, origin, spacing, *found.values())):
-            raise ConfigError("expected finite numbers in the table of a jet, got NaN or infinity")
         return JetTable(speeds, found.get("pressure"), found.get("velocity"), origin, np.broadcast_to(spacing, (3,)))
 
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
@@ -67,13 +68,13 @@ class RotorJet(Plugin):
     """Pressure or velocity around the drone; None for the analytic jet."""
     load: str = "load"
     """Name of the plugin of the loads, a ``SlungLoad`` or a ``Hook``."""
-    panel: float | None = None
+    panel: float | None = setting(default=None, positive=True)
     """Largest edge of a panel, m; None for half the longest edge of the load."""
     all_drones: bool = False
     """True for the jets of all drones of a world on each load; False for that of the load's own drone."""
     air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
-    propeller_radius: ArrayLike | None = parameter(default=None)
+    propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
     """Radius of a propeller, m, for the analytic jet; None for the airframe's. () or (n_worlds, n_drones)"""
     name: str = "rotor_jet"
 
@@ -81,12 +82,6 @@ class RotorJet(Plugin):
         """Return the table, and no wrench until the first step."""
         require_rotors(sim, "the jet of rotors")
         self._loads(sim)
-        if self.panel is not None and not self.panel > 0:
-            raise ConfigError(f"expected panel as a positive length, m, got {self.panel!r}")
-        if self.table is not None and not isinstance(self.table, JetTable):
-            raise ConfigError(
-                f"expected table as a JetTable or None, got {type(self.table).__name__}. Use load_jet_table(folder)."
-            )
         table = None if self.table is None else self.table.checked()
         radius = checked_propeller_radius(sim, self.propeller_radius)
         names = ("speeds", "pressure", "velocity", "origin", "spacing")

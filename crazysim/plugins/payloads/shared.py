@@ -14,6 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import Objects, SimData, SimState, SimStateDeriv
 from crazysim.core.integration import euler
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.settings import color, setting
 from crazysim.core.stage import Stage
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError
@@ -86,19 +87,19 @@ class SharedLoad(PointLoad, Plugin):
     """
 
     coupling: ClassVar[Literal["drone", "world"]] = "world"
-    mass: float = parameter()
+    mass: float = parameter(positive=True)
     """Mass of the load, kg."""
-    length: ArrayLike = parameter(default=1.0)
+    length: ArrayLike = parameter(default=1.0, positive=True)
     """Length of rods or cables, m. () or (n_worlds, n_drones)"""
     cable: bool = True
     """True for cables, False for rigid rods."""
     attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    friction: float = parameter(default=0.6)
+    friction: float = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor."""
-    size: ArrayLike = 0.05
+    size: ArrayLike = setting(default=0.05, positive=True, shapes=((), (3,)))
     """Radius of a ball, or full lengths of a box, m: () or (3,)."""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
     """True to put load and links into the scene."""
@@ -112,7 +113,7 @@ class SharedLoad(PointLoad, Plugin):
                 "expected an integrator that moves positions with new velocities, which a load between several drones "
                 "needs, got 'euler'. Use Sim(integrator='symplectic_euler') or 'rk4'."
             )
-        length = check_parameter(sim, "length", self.length, positive=True)
+        length = check_parameter(sim, "length", self.length)
         attach = check_parameter(sim, "attach", self.attach, (3,))
         scalars = {}
         for name, value in (("mass", self.mass), ("friction", self.friction), ("size", rest_height(self.size))):

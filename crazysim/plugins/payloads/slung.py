@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.integration import rk4
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
-from crazysim.core.settings import as_mask
+from crazysim.core.settings import as_mask, color, setting
 from crazysim.core.stage import Stage
 from crazysim.plugins.payloads.body import LoadBody, rest_height
 from crazysim.plugins.payloads.link import Link, couple, end_relative_motion, relative
@@ -60,9 +60,9 @@ class SlungLoad(PointLoad, Plugin):
     () or (n_worlds, n_drones)"""
     friction: ArrayLike = parameter(default=0.6, low=0.0)
     """Coulomb's coefficient between load and floor. () or (n_worlds, n_drones)"""
-    size: ArrayLike = 0.03
+    size: ArrayLike = setting(default=0.03, positive=True, shapes=((), (3,)))
     """Radius of a ball, or full lengths of a box, m: () or (3,). For contacts, the floor and images."""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
     """True to put loads and links into the scene, where they are drawn and reported as contacts of drones."""

@@ -14,6 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal
+from crazysim.core.settings import setting
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.battery import BatteryData
 from crazysim.plugins.effects.moving_air import require_rotors
@@ -60,7 +61,7 @@ class RotorSpeeds(Noisy):
     Telemetry counts electrical revolutions in steps of 100 rpm: with six pole pairs, ``resolution=100 / 6``.
     """
 
-    n_rotors: int = 4
+    n_rotors: int = setting(default=4, low=1)
     """Number of rotors."""
     _: dataclasses.KW_ONLY
     name: str = "rotor_speeds"
@@ -126,7 +127,7 @@ class MultiRanger(Noisy):
     A distance beyond the range is that of the range finder's ``max_range``, without noise.
     """
 
-    n_rays: int = 6
+    n_rays: int = setting(default=6, low=1)
     """Number of rays of the range finder."""
     range_finder: str = "range_finder"
     """Name of the plugin of the range finder."""

@@ -57,13 +57,13 @@ class Radar(Plugin):
 
     pos: ArrayLike = parameter()
     """Positions of the radars, world frame, m. (3,) or (n_radars, 3)"""
-    max_range: ArrayLike = parameter(default=10.0)
+    max_range: ArrayLike = parameter(default=10.0, positive=True)
     """Length of the lobe, m. () or (n_radars,)"""
-    exponent: ArrayLike = parameter(default=1.3)
+    exponent: ArrayLike = parameter(default=1.3, low=0.0)
     """Exponent of the lobe, 1: larger ones are thinner near the radar. () or (n_radars,)"""
-    height_scale: ArrayLike = parameter(default=1.0)
+    height_scale: ArrayLike = parameter(default=1.0, positive=True)
     """Factor of the thickness of the lobe, 1. () or (n_radars,)"""
-    tilt: ArrayLike = parameter(default=0.0)
+    tilt: ArrayLike = parameter(default=0.0, low=-math.pi / 2, high=math.pi / 2)
     """Elevation of the lobe, rad, positive upwards. () or (n_radars,)"""
     visible: bool = False
     """True to draw the lobes into images, in red where a drone is detected."""
@@ -73,22 +73,14 @@ class Radar(Plugin):
         """Return the radars, before any detection."""
         pos = np.asarray(self.pos, np.float64)
         pos = pos[None] if pos.ndim == 1 else pos
-        if pos.ndim != 2 or pos.shape[1] != 3 or not np.isfinite(pos).all() or not len(pos):
-            raise ConfigError(f"expected pos as finite positions (3,) or (n_radars, 3), m, got {self.pos!r}")
+        if pos.ndim != 2 or pos.shape[1] != 3 or not len(pos):
+            raise ConfigError(f"expected pos as positions (3,) or (n_radars, 3), m, got {self.pos!r}")
         dtype = sim.data.states.pos.dtype
         found = {}
-        for name, low, high in (
-            ("max_range", 1e-6, np.inf),
-            ("exponent", 0.0, np.inf),
-            ("height_scale", 1e-6, np.inf),
-            ("tilt", -math.pi / 2, math.pi / 2),
-        ):
+        for name in ("max_range", "exponent", "height_scale", "tilt"):
             value = np.asarray(getattr(self, name), np.float64)
             if value.shape not in ((), (len(pos),)):
                 raise ConfigError(f"expected {name} of shape () or ({len(pos)},) for each radar, got {value.shape}")
-            if not np.isfinite(value).all() or np.any(value < low) or np.any(value > high):
-                bounds = "positive" if low > 0 else f"from {low:.4g} to {high:.4g}"
-                raise ConfigError(f"expected {name} to be finite and {bounds}, got {getattr(self, name)!r}")
             found[name] = on_device(np.broadcast_to(value, len(pos)), dtype)
         return RadarData(pos=on_device(pos, dtype), **found, exposure=per_drone(sim, 0.0, len(pos)))
 

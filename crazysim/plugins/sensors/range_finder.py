@@ -55,9 +55,9 @@ class RangeFinder(Plugin):
     MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER
     """Directions of a multi-ranger deck by name, body frame."""
 
-    directions: ArrayLike = parameter(default=None)
+    directions: ArrayLike | None = parameter(default=None)
     """Directions, body frame, of any length; None for ``MULTI_RANGER``. (n_rays, 3)"""
-    max_range: float = parameter(default=4.0)
+    max_range: float = parameter(default=4.0, positive=True)
     """Largest distance measured, m."""
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
@@ -70,10 +70,8 @@ class RangeFinder(Plugin):
     def record(self, sim: Simulation) -> RangeFinderData:
         """Return rays that have measured nothing."""
         rays = np.asarray(list(MULTI_RANGER.values()) if self.directions is None else self.directions, np.float64)
-        if rays.ndim != 2 or rays.shape[1] != 3 or not np.isfinite(rays).all() or not rays.any(axis=-1).all():
+        if rays.ndim != 2 or rays.shape[1] != 3 or not rays.any(axis=-1).all():
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
-        if not self.max_range > 0:
-            raise ConfigError(f"expected max_range to be positive, in m, got {self.max_range}")
         steps_between(self, sim)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         far = float(self.max_range)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.plugin import Simulation, check_parameter, per_drone
+from crazysim.core.settings import check_settings, setting
 from crazysim.plugins.sensors.sensor import correlated, quantise
 from crazysim.pytree import PyTree, leaf
 
@@ -97,42 +98,50 @@ class Triad:
     0.62 ``instability``, at ``t = 1.89 correlation_time``, from the wandering bias.
     """
 
-    noise: ArrayLike = 0.0
+    noise: ArrayLike = setting(default=0.0, low=0.0)
     """Density of white noise as data sheets state it, one-sided, u/sqrt(Hz): the root mean square behind an ideal
     low-pass filter is ``noise sqrt(bandwidth)``."""
     bias: ArrayLike = 0.0
     """Mean of the bias at the beginning of an episode, u."""
-    bias_spread: ArrayLike = 0.0
+    bias_spread: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of the bias at the beginning of an episode, u."""
-    random_walk: ArrayLike = 0.0
+    random_walk: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation by which the bias changes in 1 s, u/sqrt(s)."""
-    instability: ArrayLike = 0.0
+    instability: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of a bias that wanders, a first-order Gauss-Markov process, u."""
-    correlation_time: ArrayLike = 100.0
+    correlation_time: ArrayLike = setting(default=100.0, positive=True)
     """Correlation time of the bias that wanders, s. () or (n_worlds, n_drones)"""
     scale: ArrayLike = 0.0
     """Mean relative error of the scale, 1."""
-    scale_spread: ArrayLike = 0.0
+    scale_spread: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of the relative error of the scale between episodes, 1."""
     misalignment: ArrayLike = 0.0
     """Small rotation of the axes against the mounting, rad."""
-    misalignment_spread: ArrayLike = 0.0
+    misalignment_spread: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of that rotation between episodes, rad."""
-    bandwidth: ArrayLike | None = None
+    bandwidth: ArrayLike | None = setting(default=None, positive=True)
     """Corner frequency of a first-order low-pass filter, Hz; None for none. () or (n_worlds, n_drones)"""
-    limit: ArrayLike | None = None
+    limit: ArrayLike | None = setting(default=None, positive=True)
     """Largest measurement of either sign, u; None for any."""
-    resolution: ArrayLike | None = None
+    resolution: ArrayLike | None = setting(default=None, positive=True)
     """Smallest difference of two measurements, u; None for none. Gradients pass as if there were none."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: If one is not finite, or out of its range.
+        """
+        check_settings(self)
 
     def record(self, sim: Simulation, name: str) -> TriadData:
         """Return the record before the first measurement; ``name`` is that of the sensor in messages."""
 
-        def vector(field: str, low: float = -np.inf) -> Array:
-            return check_parameter(sim, f"{field} of {name}", getattr(self, field), (3,), low, per_axis=True)
+        def vector(field: str) -> Array:
+            return check_parameter(sim, f"{field} of {name}", getattr(self, field), (3,), per_axis=True)
 
-        def joined(*fields: str, low: float = -np.inf) -> Array:
-            parts = [np.asarray(vector(field, low)) for field in fields]
+        def joined(*fields: str) -> Array:
+            parts = [np.asarray(vector(field)) for field in fields]
             batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
             parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
             return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
@@ -140,7 +149,7 @@ class Triad:
         def optional(field: str, n: int) -> Array | None:
             value = getattr(self, field)
             named = f"{field} of {name}"
-            return None if value is None else check_parameter(sim, named, value, (n,), positive=True, per_axis=True)
+            return None if value is None else check_parameter(sim, named, value, (n,), per_axis=True)
 
         mean = joined("bias", "scale", "misalignment")
         each = per_drone(sim, mean, 9)
@@ -150,14 +159,12 @@ class Triad:
             misalignment=each[..., 6:],
             wander=per_drone(sim, 0.0, 3),
             filtered=None if self.bandwidth is None else per_drone(sim, 0.0, 3),
-            noise=vector("noise", 0.0),
-            random_walk=vector("random_walk", 0.0),
-            instability=vector("instability", 0.0),
-            correlation_time=check_parameter(
-                sim, f"correlation_time of {name}", self.correlation_time, (1,), positive=True
-            ),
+            noise=vector("noise"),
+            random_walk=vector("random_walk"),
+            instability=vector("instability"),
+            correlation_time=check_parameter(sim, f"correlation_time of {name}", self.correlation_time, (1,)),
             mean=mean,
-            spread=joined("bias_spread", "scale_spread", "misalignment_spread", low=0.0),
+            spread=joined("bias_spread", "scale_spread", "misalignment_spread"),
             bandwidth=optional("bandwidth", 1),
             limit=optional("limit", 3),
             resolution=optional("resolution", 3),

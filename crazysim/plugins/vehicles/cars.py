@@ -16,7 +16,7 @@ from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Placement, Simulation, parameter
 from crazysim.core.population import Population
-from crazysim.core.settings import default_rates
+from crazysim.core.settings import color, default_rates
 from crazysim.core.stage import Stage, tick
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
@@ -75,7 +75,7 @@ class Cars(Population):
     """True for cars that tow a trailer."""
     rate: int | None = None
     """Rate of the controller, Hz, a divisor of the simulation's rate; None for the largest one up to 50 Hz."""
-    rgba: ArrayLike | None = None
+    rgba: ArrayLike | None = color()
     """Colour; None for the default. (4,)"""
     in_scene: bool = True
     """True to put the cars into the scene, where they are drawn and reported as contacts of drones."""
@@ -132,7 +132,7 @@ class Cars(Population):
         if self.pos is not None:
             pos = starts.per_member("pos", self.pos, counts, (2,))
         if self.yaw is not None:
-            yaw = starts.per_member("yaw", np.asarray(self.yaw, float)[..., None], counts, (1,))
+            yaw = starts.per_member("yaw", np.asarray(self.yaw)[..., None], counts, (1,))
         pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
         if arc is not None and self.pos is not None:
             arc = starts.projected(paths, index, pos, arc)
@@ -232,10 +232,9 @@ class Cars(Population):
         for name, allowed in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
             if getattr(self, name) not in allowed:
                 raise ConfigError(f"expected {name} of {self.name!r} as one of {allowed}, got {getattr(self, name)!r}")
-        if self.controller is not None and self.path is None:
-            raise ConfigError(f"expected a path for the controller of {self.name!r}, got none. Use Cars(path=...).")
-        if self.controller is not None and not isinstance(self.controller, PathController):
-            raise ConfigError(f"expected a PathController, got {self.controller!r}. Use controller=PurePursuit().")
+        for name in ("controller", "index", "start"):
+            if getattr(self, name) is not None and self.path is None:
+                raise ConfigError(f"expected a path for {name} of {self.name!r}, got none. Use Cars(path=...).")
         if self.trailer and not vehicle.has_trailer:
             raise ConfigError(f"expected a vehicle with a table [trailer], got {vehicle.name!r}. Use 'aiml_head'.")
 

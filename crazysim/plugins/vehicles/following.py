@@ -8,6 +8,7 @@ from typing import Any, ClassVar, NamedTuple, dataclass_transform
 import jax.numpy as jnp
 from jax import Array
 
+from crazysim.core.settings import check_settings, setting
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.plugins.vehicles.parameters import CarParams
@@ -121,6 +122,14 @@ class PathController:
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True, eq=False)(cls)
 
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If one has another type than its field, or a number is not finite or out of its range.
+        """
+        check_settings(self)
+
     def check(self, vehicle: VehicleModel, path: Path) -> None:
         """Check that the controller suits vehicle and path.
 
@@ -134,10 +143,6 @@ class PathController:
             )
         if not vehicle.number("steering.angle_max") > 0:
             raise ConfigError(f"expected a vehicle that steers for {name}, got {vehicle.name!r}, which cannot")
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if isinstance(value, (int, float)) and not 0 <= value < float("inf"):
-                raise ConfigError(f"expected {field.name} of {name} to be at least zero and finite, got {value!r}")
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> PyTree | None:
         """Return gains in a record of leaves of scope ``shared`` or ``parameter``, or None.
@@ -189,9 +194,9 @@ class PurePursuit(PathController):
     the look-ahead distance times the curvature over 6, and needs no gains.
     """
 
-    lookahead: float = 0.3
+    lookahead: float = setting(default=0.3, positive=True)
     """Look-ahead distance at standstill, m."""
-    lookahead_time: float = 0.25
+    lookahead_time: float = setting(default=0.25, low=0.0)
     """Growth of the look-ahead distance with speed, s."""
 
     def ahead(self, car: CarParams) -> Array:
@@ -218,9 +223,9 @@ class Stanley(PathController):
     """
 
     backwards: ClassVar[bool] = False
-    gain: float = 2.5
+    gain: float = setting(default=2.5, low=0.0)
     """Gain k, 1/s."""
-    soft_speed: float = 0.5
+    soft_speed: float = setting(default=0.5, positive=True)
     """Speed v_0 that is added, so that slow vehicles steer gently, m/s."""
 
     def ahead(self, car: CarParams) -> Array:

@@ -103,7 +103,7 @@ def test_resets_clear_the_impulses():
     ({"restitution": 2.0}, "restitution"),
     ({"softness": 0.0}, "softness"),
     ({"softness": np.nan}, "softness"),
-    ({"iterations": 0}, "iterations is 0"),
+    ({"iterations": 0}, "iterations of DroneCollisions to be from 1 to 1000, got 0"),
 ])  # fmt: skip
 def test_law_09_wrong_settings(kwargs, message):
     with pytest.raises(ConfigError, match=message):

@@ -261,14 +261,14 @@ def test_engines_agree_and_the_impulse_is_reported():
 def test_law_09_what_cannot_be_is_refused():
     sim = Sim()
     for settings, words in (
-        ({"friction": -1}, "expected friction to be from 0 to 1000, got -1"),
-        ({"friction": np.inf}, "expected friction to be from 0 to 1000, got inf"),
+        ({"friction": -1}, "expected friction of ContactResponse to be from 0 to 1000, got -1"),
+        ({"friction": np.inf}, "friction of ContactResponse to be from 0 to 1000, got inf"),
         ({"restitution": 1.5}, "from 0 to 1"),
         ({"softness": 1e-3}, "softness to be from two steps, 0.004 s, to 10, got 0.001"),
-        ({"softness": np.nan}, "softness to be from two steps"),
-        ({"iterations": 0}, "iterations is 0; it must be a positive whole number"),
-        ({"iterations": 2.5}, "iterations is 2.5"),
-        ({"iterations": 10**9}, "iterations is 1000000000; it must be at most 1000"),
+        ({"softness": np.nan}, "softness of ContactResponse to be positive, at most 10, got nan"),
+        ({"iterations": 0}, "iterations of ContactResponse to be from 1 to 1000, got 0"),
+        ({"iterations": 2.5}, "iterations of ContactResponse as a whole number, got 2.5"),
+        ({"iterations": 10**9}, "iterations of ContactResponse to be from 1 to 1000, got 1000000000"),
         ({"objects": "tree"}, "got 'tree'"),
     ):
         with pytest.raises(ConfigError, match=words):

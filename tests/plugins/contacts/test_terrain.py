@@ -248,8 +248,8 @@ def test_other_heights_replace_it():
     ((np.zeros(4), SIZE), {}, "two or more rows and columns"),
     ((np.full((3, 3), np.nan), SIZE), {}, "finite"),
     ((np.zeros((3, 3)), (1.0, 1.0, 1.0)), {}, "size as 2 positive lengths"),
-    ((np.zeros((3, 3)), (1.0, -1.0)), {}, "size as 2 positive lengths"),
-    ((np.zeros((3, 3)), SIZE), {"pos": (0, 0)}, "pos as three"),
+    ((np.zeros((3, 3)), (1.0, -1.0)), {}, "size of Terrain to be positive"),
+    ((np.zeros((3, 3)), SIZE), {"pos": (0, 0)}, r"pos of Terrain of shape \(3,\), got \(2,\)"),
     ((np.full((3, 3), -0.1), SIZE), {}, "floor=False"),
     ((np.ones((3, 3)), SIZE), {"name": "floor"}, "expected a new name"),
 ])  # fmt: skip

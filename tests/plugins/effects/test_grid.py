@@ -109,7 +109,7 @@ def test_law_09_files_that_are_no_wind_are_errors_before_memory_is_allocated(tmp
     (Grid(np.zeros((2, 2, 2))), r"values of shape \(n_x, n_y, n_z, 3\), got \(2, 2, 2\)"),
     (Grid(np.zeros((2, 2, 2, 2))), "values of shape"),
     (Grid(np.zeros((2, 2, 2, 3)), (0, 0)), "an origin of shape"),
-    (Grid(np.zeros((2, 2, 2, 3)), spacing=0.0), "a positive spacing"),
+    (Grid(np.zeros((2, 2, 2, 3)), spacing=0.0), "spacing of field to be positive"),
     (Grid(np.full((2, 2, 2, 3), np.nan)), "finite"),
 ])  # fmt: skip
 def test_law_09_wrong_grids(grid, message):

@@ -66,5 +66,5 @@ def test_law_07_gradients_are_finite_on_the_floor():
 def test_law_09_what_has_no_rotors_or_no_radius_is_told():
     with pytest.raises(ConfigError, match="first_principles"):
         Sim(dynamics="so_rpy").add(GroundEffect())
-    with pytest.raises(ConfigError, match="propeller_radius to be finite and positive, got -1"):
+    with pytest.raises(ConfigError, match="propeller_radius of GroundEffect to be positive, got -1"):
         Sim().add(GroundEffect(-1.0))

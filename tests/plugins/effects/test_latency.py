@@ -137,16 +137,16 @@ def test_a_late_rotor_command_does_not_turn_a_failed_rotor(first):
 
 
 @pytest.mark.parametrize("kwargs, message", [
-    ({"delay": -1}, "whole numbers of steps"),
-    ({"delay": np.nan}, "whole numbers of steps from 0 to 100000, got nan"),
+    ({"delay": -1}, "delay of Latency to be from 0 to 1e.05, got -1"),
+    ({"delay": np.nan}, "delay of Latency as a whole number or array, got nan"),
     ({"delay": np.inf}, "got inf"),
     ({"delay": "late"}, "got 'late'"),
     ({"delay": 10**9}, "got 1000000000"),
-    ({"delay": 1, "max_delay": 10**9}, "got 1 and 1000000000"),
-    ({"delay": 1.5}, "whole numbers"),
+    ({"delay": 1, "max_delay": 10**9}, "max_delay of Latency to be from 0 to 1e.05, got 1000000000"),
+    ({"delay": 1.5}, "delay of Latency as a whole number or array, got 1.5"),
     ({"delay": 6, "max_delay": 5}, "delay.*from 0 to 5"),
     ({"delay": [1, 2]}, r"delay as whole.*got shape \(2,\)"),
-    ({"delay": 1, "max_delay": 2.5}, "max_delay as whole.*got 1 and 2.5"),
+    ({"delay": 1, "max_delay": 2.5}, "max_delay of Latency as a whole number, got 2.5"),
 ])  # fmt: skip
 def test_law_09_a_delay_that_cannot_be_is_told(kwargs, message):
     sim = Sim(n_worlds=3, n_drones=3)

@@ -121,10 +121,10 @@ def test_the_gradient_with_respect_to_effectiveness_is_the_thrust(weak):
 
 
 @pytest.mark.parametrize("kwargs, message", [
-    ({"effectiveness": 1.1}, "effectiveness.*from 0.0 to 1.0"),
+    ({"effectiveness": 1.1}, "effectiveness of MotorFailure to be from 0 to 1, got 1.1"),
     ({"effectiveness": np.ones(3)}, r"shape \(4,\) for all drones, or \(2, 3, 4\)"),
-    ({"fail_step": 1.5}, "whole numbers"),
-    ({"rate": -1.0}, "rate.*from 0.0"),
+    ({"fail_step": 1.5}, "fail_step of MotorFailure as a whole number or array, got 1.5"),
+    ({"rate": -1.0}, "rate of MotorFailure to be finite and at least 0"),
 ])  # fmt: skip
 def test_law_09_motors_that_cannot_be_are_told(kwargs, message):
     with pytest.raises(ConfigError, match=message):

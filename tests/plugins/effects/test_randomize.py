@@ -174,8 +174,11 @@ def test_law_09_wrong_ranges_and_missing_plugins_are_errors():
         build(mass=(1.1, 0.9))
     with pytest.raises(ConfigError, match=r"mass as \(low, high\), got 0.1. Use \(0.1, 0.1\) for a fixed"):
         build(mass=0.1)
-    with pytest.raises(ConfigError, match="mass to be finite and positive"):
+    with pytest.raises(ConfigError, match="mass of Randomize to be positive"):
         build(mass=(-1.0, 0.9))
+    for optional in (("foo",), "wind", ("wind", 3)):
+        with pytest.raises(ConfigError, match=r"expected optional as a list of mass, inertia, .*, got"):
+            Randomize(optional=optional)
     with pytest.raises(ConfigError, match="mass as real numbers of shape"):
         build(mass=(0.9, 1.0, 1.1))
     with pytest.raises(ConfigError, match="first_principles"):

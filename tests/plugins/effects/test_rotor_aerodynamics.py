@@ -252,7 +252,7 @@ def test_law_09_what_is_missing_or_impossible_is_an_error():
         Sim().add(RotorAerodynamics(inflow=2e-5))
     Sim(drone="bumblebee").add(RotorAerodynamics(drag=1e-5, inflow=1e-5))
     for ceiling in (-1.0, 0.0):
-        with pytest.raises(ConfigError, match="ceiling to be finite and positive"):
+        with pytest.raises(ConfigError, match="ceiling of RotorAerodynamics to be positive"):
             Sim().add(RotorAerodynamics(ceiling=ceiling))
     with pytest.raises(ConfigError, match="expected inflow above zero with a ceiling"):
         Sim().add(RotorAerodynamics(inflow=0.0, ceiling=2.0))

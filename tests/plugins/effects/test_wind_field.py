@@ -129,7 +129,7 @@ def test_other_velocities_compile_nothing():
 
 
 @pytest.mark.parametrize("kwargs, message", [
-    ({"field": np.zeros((2, 2, 2, 3))}, "expected field as a Grid"),
+    ({"field": np.zeros((2, 2, 2, 3))}, "expected field of WindField as Grid"),
     ({"field": Grid(np.zeros((2, 2, 2)))}, "expected field as values of shape"),
     ({"field": SHEAR, "spread": -1.0}, "spread"),
     ({"field": SHEAR, "scale": np.nan}, "scale"),

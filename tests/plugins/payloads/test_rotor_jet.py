@@ -226,9 +226,9 @@ def test_law_09_wrong_files(tmp_path, files, message):
     (JetTable([500.0], np.zeros((2, 2, 2, 2))), r"pressure of shape \(1, n_x, n_y, n_z\)"),
     (JetTable([500.0], None, np.zeros((1, 2, 2, 2))), "velocity of shape"),
     (JetTable([500.0], np.zeros((1, 2, 2, 2)), np.zeros((1, 3, 2, 2, 3))), "on the same grid"),
-    (JetTable([500.0], np.zeros((1, 2, 2, 2)), spacing=-1.0), "positive spacing"),
+    (JetTable([500.0], np.zeros((1, 2, 2, 2)), spacing=-1.0), "expected spacing to be positive"),
     (JetTable([500.0], np.full((1, 2, 2, 2), np.inf)), "finite"),
-    (np.zeros(3), "expected table as a JetTable"),
+    (np.zeros(3), "expected table of RotorJet as JetTable"),
 ])  # fmt: skip
 def test_law_09_wrong_tables(table, message):
     sim = Sim(drone="bumblebee", control="rotor_vel")

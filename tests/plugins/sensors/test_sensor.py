@@ -107,9 +107,9 @@ def test_another_delay_compiles_nothing_with_room_for_it():
     ({"freq": 300}, "expected freq of 'clock' to divide"),
     ({"delay": -0.1, "max_delay": 0.1}, "expected delay"),
     ({"delay": 1.0}, "expected a delay of 'clock' of zero to 62 measurements"),
-    ({"delay": np.nan}, "expected a delay"),
+    ({"delay": np.nan}, "expected delay of Clock to be from 0 to 100, got nan"),
     ({"delay": 0.02, "max_delay": 0.01}, "expected delay"),
-    ({"max_delay": -1.0}, "expected a delay"),
+    ({"max_delay": -1.0}, "expected max_delay of Clock to be from 0 to 100, got -1"),
     ({"dropout": 1.5}, "expected dropout"),
 ])  # fmt: skip
 def test_law_09_wrong_settings(settings, message):

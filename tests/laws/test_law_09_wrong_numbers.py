@@ -1,0 +1,237 @@
+"""Law 9 for every number of every plugin, sensor, filter, path controller and task: what cannot be is an error at once.
+
+Fields are found by introspection, so that a new class is tested as soon as it is in the package.
+"""
+
+import dataclasses
+import importlib
+import pkgutil
+import re
+
+import numpy as np
+import pytest
+
+import crazysim.envs.tasks
+import crazysim.plugins
+from crazysim import Sim
+from crazysim.core.plugin import FunctionPlugin, Plugin
+from crazysim.core.population import Population
+from crazysim.core.settings import alternatives, settings_of
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.bring_load import BringLoad
+from crazysim.envs.tasks.goals import GoalTask
+from crazysim.envs.tasks.touch_down import TouchDown
+from crazysim.errors import ConfigError
+from crazysim.live.mocap.playback import Playback
+from crazysim.live.mocap.tracker import Rules
+from crazysim.live.mocap.twins import Twin
+from crazysim.live.sitl import Origin
+from crazysim.plugins.effects import Battery, Grid
+from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
+from crazysim.plugins.estimators.estimator import Estimator
+from crazysim.plugins.payloads import SlungLoad
+from crazysim.plugins.sensors import IMU, Barometer, MotionCapture, RangeFinder, Triad
+from crazysim.plugins.sensors.onboard import Noisy
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.plugins.vehicles import Path
+from crazysim.plugins.vehicles.following import PathController
+from crazysim.tables import LARGEST
+from crazysim.trajectories import circle
+
+ABSTRACT = {
+    FunctionPlugin, Population, Sensor, Noisy, Estimator, ErrorStateFilter, GoalTask, TouchDown, BringLoad,
+}  # fmt: skip
+"""Base classes, which are not added."""
+TABLES = {"heights"}
+"""Fields of two axes of any lengths."""
+FOUR = np.array([[0.0, 0, 2], [4, 0, 2], [0, 4, 2], [4, 4, 1]])
+EXAMPLES = {
+    "Cars": {"path": Path.of_points([(0, 0), (1, 0), (2, 1)])},
+    "Follow": {"trajectories": circle(1.0)},
+    "Hook": {"mass": 0.01},
+    "Latency": {"delay": 2},
+    "Lighthouse": {"stations": FOUR[:2], "rpy": np.zeros((2, 3))},
+    "Magnetometer": {"field": (0.0, 2e-5, -4.5e-5)},
+    "Origin": {"latitude": 47.0, "longitude": 8.0, "altitude": 500.0},
+    "Playback": {"handles": (), "pos": np.zeros((2, 1, 3)), "quat": np.zeros((2, 1, 4)), "freq": 10.0},
+    "Radar": {"pos": (0.0, 0.0, 1.0)},
+    "Residual": {"linear": np.zeros((6, 14)), "hidden": np.zeros((3, 14)), "output": np.zeros((6, 3))},
+    "SharedLoad": {"mass": 0.01},
+    "SlungLoad": {"mass": 0.01},
+    "Terrain": {"heights": np.zeros((3, 3)), "size": (4.0, 4.0)},
+    "UWB": {"anchors": FOUR},
+    "WindField": {"field": Grid(np.zeros((2, 2, 2, 3)))},
+}
+"""Settings of classes that cannot be made without."""
+NEEDS = {
+    "BatteryVoltage": [Battery()],
+    "MultiRanger": [RangeFinder()],
+    "RotorJet": [SlungLoad(0.01)],
+    "Complementary": [IMU(), Barometer()],
+    "ESKF": [IMU(), MotionCapture()],
+    "Kalman": [IMU(), MotionCapture()],
+}
+"""Plugins that others need."""
+NEVER_NEGATIVE = re.compile(
+    r"(?<!mis)(noise|spread|mass|inertia|density|radius|length|size|range|reach|resistance|capacity|efficiency|charge"
+    r"|voltage|friction|restitution|softness|damping|delay|jitter|dropout|time|iterations|resolution|bandwidth|limit"
+    r"|seconds|tolerance|hold|max_\w+|n_\w+|effectiveness|roughness|exponent|instability|random_walk|imbalance)"
+)
+"""Names of quantities that are at least zero."""
+
+
+UNCHECKED = ["Bicycles.members", "Cars.members", "FreeBodies.members", "Twin.fixed"]
+"""Settings whose annotation mixes numbers with others; their classes check them."""
+
+
+def classes(base, package=crazysim.plugins):
+    """Return the concrete classes of a package that derive from a base."""
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        importlib.import_module(module.name)
+
+    def below(kind):
+        return {kind, *[x for sub in kind.__subclasses__() for x in below(sub)]}
+
+    found = [kind for kind in below(base) - ABSTRACT - {base} if kind.__module__.startswith(package.__name__)]
+    return sorted(found, key=lambda kind: kind.__name__)
+
+
+PLUGINS, TASKS = classes(Plugin), classes(Task, crazysim.envs.tasks)
+OTHERS = [Origin, Playback, Rules, Triad, Twin, *classes(PathController)]
+
+
+def is_numeric(kind, name):
+    return {int, float, np.ndarray} & set(alternatives(kind)[name])
+
+
+def numeric_fields(kind):
+    """Return the fields of a class with numbers, and what they may be."""
+    return [(name, declared) for name, declared in settings_of(kind).items() if is_numeric(kind, name)]
+
+
+def example(kind, **changes):
+    """Return an instance of a class."""
+    settings = dict(EXAMPLES.get(kind.__name__, {}))
+    if issubclass(kind, Estimator):
+        settings["sensors"] = NEEDS[kind.__name__]
+    return kind(**(settings | changes))
+
+
+def impossible(kind, name, declared, rng):
+    """Yield values that no field of its kind may have: not finite ones, other types, and those out of its range."""
+    given, kinds = getattr(example(kind), name), alternatives(kind)[name]
+    is_whole = declared.dtype is not None or int in kinds
+    yield from () if str in kinds else ("1.0", "")
+    yield from (
+        np.nan,
+        [np.nan],
+        -np.inf,
+        np.inf,
+        b"1",
+        [],
+        {},
+        object(),
+        [[1.0], [1.0, 2.0]],
+        1j,
+        [None],
+        True,
+    )
+    if type(None) not in kinds and given is not None:
+        yield None
+    if is_whole:
+        yield 1.5
+    if np.ndarray in kinds and given is not None:
+        array = np.resize(
+            np.asarray(given, float), rng.integers(1, 4, rng.integers(1, 3)) if np.ndim(given) == 0 else np.shape(given)
+        )
+        array.flat[rng.integers(array.size)] = rng.choice([np.nan, -np.inf])
+        yield array
+    for bound, sign in ((declared.range.low, -1), (declared.range.high, 1)):
+        if abs(bound) < LARGEST:
+            beyond = bound + sign * max(1e-3 * abs(bound), 1e-3)
+            yield int(np.ceil(sign * beyond)) * sign if is_whole else float(beyond)
+
+
+def refused(call, what):
+    """Check that a call raises our error with expectation and value; return a description of what it did instead."""
+    try:
+        call()
+    except ConfigError as error:
+        return None if "got" in str(error) else f"{what}: {error}"
+    except Exception as error:
+        return f"{what}: {type(error).__name__}: {error}"
+    return f"{what}: accepted"
+
+
+@pytest.mark.parametrize("kind", [*PLUGINS, *OTHERS, *TASKS], ids=lambda kind: kind.__name__)
+def test_impossible_numbers_are_refused_where_they_are_given(kind):
+    rng, found = np.random.default_rng(len(kind.__name__)), []
+    fields = numeric_fields(kind)
+    for name, declared in fields:
+        for value in impossible(kind, name, declared, rng):
+            found.append(refused(lambda name=name, value=value: example(kind, **{name: value}), f"{name}={value!r}"))
+    for name in alternatives(kind):
+        if name not in dict(fields) and type(None) not in alternatives(kind)[name] and alternatives(kind)[name]:
+            found += [refused(lambda name=name: example(kind, **{name: None}), f"{name}=None")]
+            found += [refused(lambda name=name: example(kind, **{name: np.nan}), f"{name}=nan")]
+    assert not [text for text in found if text], "\n".join(text for text in found if text)
+
+
+@pytest.mark.parametrize("kind", [*PLUGINS, *OTHERS, *TASKS], ids=lambda kind: kind.__name__)
+def test_quantities_that_are_never_negative_are_declared_so(kind):
+    fields = numeric_fields(kind)
+    wrong = [name for name, declared in fields if NEVER_NEGATIVE.search(name) and declared.range.low < 0]
+    assert not wrong
+
+
+def test_every_setting_of_a_package_has_a_type_that_is_checked():
+    """Whatever has a number in its annotation is checked as one, whatever it is called."""
+    missed = []
+    for kind in [*PLUGINS, *OTHERS, *TASKS]:
+        for field in dataclasses.fields(kind):
+            is_number = re.search(r"\b(float|int|ArrayLike)\b", str(field.type))
+            if is_number and not alternatives(kind)[field.name]:
+                missed.append(f"{kind.__name__}.{field.name}")
+    assert sorted(missed) == UNCHECKED
+
+
+@pytest.fixture(scope="module")
+def sims():
+    """Simulations of two worlds of three drones, with the plugins that others need."""
+    found = {}
+
+    def of(kind):
+        needs = NEEDS.get(kind.__name__, [])
+        control = "state" if kind.__name__ == "Follow" else "attitude"
+        integrator = "symplectic_euler" if kind.__name__ == "SharedLoad" else "euler"
+        key = (control, integrator, *[type(plugin) for plugin in needs])
+        if key not in found:
+            found[key] = Sim(2, 3, control=control, integrator=integrator)
+            for plugin in needs:
+                found[key].add(plugin)
+        return found[key]
+
+    return of
+
+
+@pytest.mark.parametrize("kind", PLUGINS, ids=lambda kind: kind.__name__)
+def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added(kind, sims):
+    sim, found = sims(kind), []
+    sim.add(example(kind))
+    sim.remove(example(kind).name)
+    for name, declared in numeric_fields(kind):
+        if np.ndarray not in alternatives(kind)[name]:
+            continue
+        low, high = max(declared.range.low, -1.0), min(declared.range.high, 1.0)
+        fill = 1 if declared.dtype else 0.5 * (low + high)
+        for shape in ((2, 1, 5, 7), (11,), (7, 5), (1, 1, 1)):
+            if name in TABLES and len(shape) == 2:
+                continue
+
+            def add(name=name, shape=shape, fill=fill):
+                sim.add(example(kind, **{name: np.full(shape, fill)}))
+
+            found.append(refused(add, f"{name} of shape {shape}"))
+            if kind.__name__ in [type(x).__name__ for x in sim.plugins.values()]:
+                sim.remove(example(kind).name)
+    assert not [text for text in found if text], "\n".join(text for text in found if text)
