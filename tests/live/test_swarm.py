@@ -210,6 +210,28 @@ def test_streamed_setpoints_come_first_until_they_stop():
     assert tick(commander, 11.5)[0] == pytest.approx(5.0)
 
 
+def test_high_level_commands_begin_at_the_drone_while_setpoints_stream():
+    reports = []
+    commander = Commander(report=reports.append)
+    tick(commander, 10.0, pos=(2.0, -1.0, 1.0), yaw=0.3)
+    commander.position([5, 5, 5], 1.0)
+    commander.notify_setpoints_stop()
+    np.testing.assert_allclose(commander.goal()[0], [2, -1, 1, 0.3])  # the stream has set no setpoint yet
+    commander.land(0.0, 2.0)
+    np.testing.assert_allclose(tick(commander, 12.0, pos=(2.0, -1.0, 0.5))[:3], [2, -1, 0], atol=1e-9)
+    assert not reports
+
+    commander.position([5, 5, 5], 1.0)
+    tick(commander, 12.1, pos=(3.0, 0.0, 1.0))
+    commander.go_to([1, 0, 0], 0.0, 1.0, relative=True)
+    assert len(reports) == 1
+    assert "before go_to" in reports[0]
+    assert "notify_setpoints_stop" in reports[0]
+    np.testing.assert_allclose(tick(commander, 12.2)[:3], [5, 5, 5])
+    commander.notify_setpoints_stop()
+    np.testing.assert_allclose(tick(commander, 13.2)[:3], [4, 0, 1], atol=1e-9)
+
+
 def test_a_stream_that_ends_keeps_the_place_and_then_stops_the_motors():
     commander = flying(velocity=([1, 0, 0], 0.0))
     assert tick(commander, 10.4)[0] == pytest.approx(1.4)
@@ -300,6 +322,13 @@ def test_setpoints_stay_finite_whatever_is_commanded(sequence):
 @pytest.fixture(scope="module")
 def swarm():
     return Swarm(Sim(n_drones=2, control="state"), ["a", "b"])
+
+
+def test_a_swarm_reports_a_command_that_a_stream_keeps_from_taking_effect(swarm):
+    swarm["b"].position([0, 0, 1], 0.0)
+    swarm["b"].take_off(1.0, 1.0)
+    assert [(r.name, "before take_off" in r.text) for r in swarm.reports.latest] == [("b", True)]
+    swarm["b"].reset()
 
 
 def test_a_swarm_flies(swarm):

@@ -2,12 +2,16 @@
 
 High-level commands plan smooth moves. Streamed setpoints take precedence until they stop: after 0.5 s without one the
 drone stays in its place, after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
-commander.h of crazyflie-firmware). Until the first command, and after landing, the motors are off.
+commander.h of crazyflie-firmware). Each of them discards the plan of a high-level command, and a plan that is made
+while they are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
+``crtpCommanderHighLevelGetSetpoint`` in crtp_commander_high_level.c). Until the first command, and after landing, the
+motors are off.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,13 +42,15 @@ N_TRAJECTORIES = 256
 class Commander:
     """Setpoints of one drone from commands; all times are simulated, s."""
 
-    def __init__(self, control: Control = Control.state):
+    def __init__(self, control: Control = Control.state, report: Callable[[str], None] | None = None):
         """Begin on the floor with motors off.
 
         Args:
             control: Command level of the simulation.
+            report: Called with a text where a command has no effect yet; None for nothing.
         """
         self.control = control
+        self._report = report
         self.group = 0
         self.trajectories: dict[int, Path] = {}
         self._compressed: set[int] = set()
@@ -84,7 +90,7 @@ class Commander:
             if self._plan.lands and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
                 point[:2, 2] += -min(SINK * (self.now - self._plan.end), DEEPEST), -SINK
             return point
-        return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
+        return self._motion()
 
     def in_group(self, mask: int) -> bool:
         """Return True if a command for a group of drones is for this one."""
@@ -106,8 +112,7 @@ class Commander:
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
         """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
         goal, (yaw,) = _numbers("goal", goal, 3), _numbers("yaw", [yaw], 1)
-        self._require(Control.state)
-        begin = self.goal()
+        begin = self._begin("go_to")
         if relative:
             goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
         end = [*goal, nearest_yaw(begin[0, 3], yaw)]
@@ -165,9 +170,8 @@ class Commander:
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
-        self._require(Control.state)
         plan = Plan(self.trajectories[identity], self.now, timescale, bool(reversed))
-        begin, first = self.goal()[0], plan.at(self.now)[0]
+        begin, first = self._begin("start_trajectory")[0], plan.at(self.now)[0]
         shift = np.zeros(4)
         if relative:
             shift[:3] = begin[:3] - first[:3]
@@ -328,21 +332,39 @@ class Commander:
 
     def _put(self, kind: str, values: NDArray) -> None:
         if self._stream is None:
-            begin = self.goal()[0]
-            self._reference = begin.copy()
+            self._last = self.goal()
+            self._reference = self._last[0].copy()
         self._stream, self._stream_time, self._released, self._plan = (kind, values), self.now, math.inf, None
         self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
 
     def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
-        self._require(Control.state)
         (height,) = _numbers("height", [height], 1)
-        here = self.goal()[0]
+        here = self._begin("land" if lands else "take_off")[0]
         goal = here.copy()
         goal[2] = height
         if yaw is not None:
             goal[3] = nearest_yaw(here[3], _numbers("yaw", [yaw], 1)[0])
         begin = np.array([here, np.zeros(4), np.zeros(4)])
         self._plan = Plan(move(begin, goal, _duration(duration)), self.now, lands=lands)
+
+    def _motion(self) -> NDArray:
+        """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
+        return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
+
+    def _begin(self, command: str) -> NDArray:
+        """Return where a high-level command begins: at the setpoint in force, or at the drone while setpoints stream.
+
+        One that the stream keeps from taking effect is reported.
+        """
+        self._require(Control.state)
+        if self._stream is None:
+            return self.goal()
+        if math.isinf(self._released) and self._report is not None:
+            self._report(
+                f"expected streamed setpoints to have stopped before {command}, got some that are in force: it begins "
+                f"after notify_setpoints_stop, and the next streamed setpoint discards it. Call that first."
+            )
+        return self._motion()
 
     def _require(self, level: Control) -> None:
         if self.locked or not self.armed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -70,7 +71,7 @@ class Swarm(Closing):
         if len(names) != sim.n_drones or len(set(names)) < len(names):
             raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
         self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
-        self.commanders = [Commander(sim.control) for _ in names]
+        self.commanders = [Commander(sim.control, functools.partial(self._refused, name)) for name in names]
         ranged = "front" in ranges_of(sim, 0)
         self.parameters = [Parameters(parameters_of(airframe, ranged)) for airframe in sim.airframes]
         self.colors, self.reports = np.zeros((len(names), 3)), Reports()
@@ -245,6 +246,10 @@ class Swarm(Closing):
                 self.sim.step(self._period)
             due = max(due + dt, time.perf_counter() - 0.1)
             self._stopped.wait(max(due - time.perf_counter(), 0.0))
+
+    def _refused(self, name: str, text: str) -> None:
+        """Report a command to a drone that has no effect."""
+        self.reports.add("refused", name, self.time, text)
 
     # State and commands ---------------------------------------------------------------------------------------------
 
