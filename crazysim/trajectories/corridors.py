@@ -1,6 +1,8 @@
-"""Minimum-derivative polynomials that stay near the straight lines between their waypoints."""
+"""Minimum-derivative polynomials that stay near the straight lines between their waypoints, and between two heights."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -8,30 +10,41 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.interpolation import Floats
 
+Vectors = tuple[Floats, Floats, Floats]
+
 N_SAMPLES = 65
 """Number of times at which the deviation of each piece is sampled, and of those around each maximum."""
 MARGIN = 0.01
 """Part of the radius that is kept free, so that the iteration ends; half of it is left at the end."""
+CLOSE = 2e-5
+"""Distance by which a curve may be below the lowest height or above the largest one, m."""
 N_ROUNDS = 100
 """Largest number of rounds; a few are typical."""
 
 
-def fill_in_corridors(nodes: Floats, durations: Floats, radii: Floats) -> Floats:
-    """Return the derivatives at all waypoints that minimise the cost within corridors.
+class OutsideError(ConfigError):
+    """Waypoints and derivatives that lead out of their corridors or heights."""
+
+
+def fill_in_corridors(
+    nodes: Floats, durations: Floats, radii: Floats, heights: tuple[float, float] = (-np.inf, np.inf)
+) -> Floats:
+    """Return the derivatives at all waypoints that minimise the cost within corridors and between two heights.
 
     The corridor of a piece contains all points up to its radius from the line segment between its waypoints. Being
-    convex, it is the intersection of half-spaces. In each round, those that touch it where the curve is farthest
-    outside are added to a quadratic program over the free derivatives, until the curve stays inside (cutting planes,
-    Kelley 1960). The program is one of least distance in the metric of the cost, and thus of non-negative least squares
-    (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section 23.4).
+    convex, it is the intersection of half-spaces, as is the space between two heights. In each round, those that touch
+    it where the curve is farthest outside are added to a quadratic program over the free derivatives, until the curve
+    stays inside (cutting planes, Kelley 1960). The program is one of least distance in the metric of the cost, and thus
+    of non-negative least squares (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section 23.4).
 
     Args:
         nodes: Derivatives at each waypoint, NaN where free. (n_pieces + 1, k, 3)
         durations: Length of each piece, s. (n_pieces,)
         radii: Radius of each corridor, m; infinite for none. (n_pieces,)
+        heights: Smallest and largest height, m; infinite for none.
 
     Raises:
-        ConfigError: If fixed derivatives lead out of the corridor.
+        OutsideError: If fixed derivatives lead out of the corridor, or beyond a height.
     """
     unit = float(np.mean(durations))
     powers = unit ** np.arange(nodes.shape[1])[:, None]
@@ -41,22 +54,51 @@ def fill_in_corridors(nodes: Floats, durations: Floats, radii: Floats) -> Floats
     inner, limit = radii * (1 - MARGIN), radii * (1 - MARGIN / 2)
     for _ in range(N_ROUNDS):
         paths = interpolation.unit_coefficients(filled, lengths)
-        piece, u = _maxima(paths, nodes[:, 0], radii)
-        outside, nearest, distance = _deviation(paths[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
+
+        def deviation(piece: np.ndarray, u: Floats, paths: Floats = paths) -> Vectors:
+            return _deviation(paths[piece], nodes[piece, 0], nodes[piece + 1, 0], u)
+
+        piece, u = _maxima(lambda piece, u: deviation(piece, u)[2], 0.5 * radii)
+        outside, nearest, distance = deviation(piece, u)
         leaves = distance > limit[piece]
-        if not np.any(leaves):
-            return filled / powers
         piece, normal = piece[leaves], outside[leaves] / distance[leaves, None]
-        reach = np.sum(normal * nearest[leaves], axis=-1) + inner[piece]
-        program.add(piece, u[leaves], normal, reach)
+        cuts = [(piece, u[leaves], normal, np.sum(normal * nearest[leaves], axis=-1) + inner[piece])]
+        cuts += [_beyond(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)]
+        piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*cuts, strict=True))
+        if not len(piece):
+            return filled / powers
+        program.add(piece, u, normal, reach)
         filled = program.solve()
-    raise ConfigError(
-        f"expected a curve inside its corridors after {N_ROUNDS} rounds, got one that leaves the corridor of piece "
-        f"{piece[0]}. Make the corridor wider, or add a waypoint."
+    raise OutsideError(
+        f"expected a curve inside its corridors and heights after {N_ROUNDS} rounds, got one whose piece {piece[0]} is "
+        f"not. Make the corridor wider, or add a waypoint."
     )
 
 
-def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+def _beyond(heights: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
+    """Return the half-spaces that touch a height where curves are farthest beyond it.
+
+    Args:
+        heights: Coefficients of z. (n_pieces, degree + 1)
+        limit: Height, m.
+        sign: 1 for the largest height, -1 for the smallest.
+
+    Returns:
+        Pieces, times within them, normals and ``normal . pos`` of the limit. (n,), (n,), (n, 3), (n,)
+    """
+
+    def excess(piece: np.ndarray, u: Floats) -> Floats:
+        return sign * (
+            np.einsum("n...k,nk->n...", u[..., None] ** np.arange(heights.shape[-1]), heights[piece]) - limit
+        )
+
+    piece, u = _maxima(excess, np.full(len(heights), -np.inf if np.isfinite(limit) else np.inf))
+    beyond = excess(piece, u) > CLOSE
+    n = int(np.sum(beyond))
+    return piece[beyond], u[beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
+
+
+def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> Vectors:
     """Return the vectors from line segments to curves, their feet on the segments, and their lengths.
 
     Args:
@@ -78,17 +120,20 @@ def _deviation(paths: Floats, start: Floats, end: Floats, u: Floats) -> tuple[Fl
     return pos - nearest, nearest, np.linalg.norm(pos - nearest, axis=-1)
 
 
-def _maxima(paths: Floats, waypoints: Floats, radii: Floats) -> tuple[np.ndarray, Floats]:
-    """Return pieces, and times within them, at which the deviation is largest and comes near the radius. (n,) each"""
+def _maxima(value: Callable[[np.ndarray, Floats], Floats], least: Floats) -> tuple[np.ndarray, Floats]:
+    """Return pieces, and times within them, of the local maxima of a quantity along curves. (n,) each
+
+    Args:
+        value: Quantity at times within some pieces, (n, n_times) of (n,) and (n, n_times).
+        least: Value of each piece below which maxima do not count. (n_pieces,)
+    """
     samples = np.linspace(0.0, 1.0, N_SAMPLES)
-    u = np.broadcast_to(samples, (len(paths), N_SAMPLES))
-    distance = _deviation(paths, waypoints[:-1], waypoints[1:], u)[2]
-    padded = np.pad(distance, ((0, 0), (1, 1)))
-    is_peak = (distance >= padded[:, :-2]) & (distance >= padded[:, 2:]) & (distance > 0.5 * radii[:, None])
+    along = value(np.arange(len(least)), np.broadcast_to(samples, (len(least), N_SAMPLES)))
+    padded = np.pad(along, ((0, 0), (1, 1)), constant_values=-np.inf)
+    is_peak = (along >= padded[:, :-2]) & (along >= padded[:, 2:]) & (along > least[:, None])
     piece, at = np.nonzero(is_peak)
     around = np.clip(samples[at][:, None] + (2 * samples - 1) / (N_SAMPLES - 1), 0.0, 1.0)
-    distance = _deviation(paths[piece], waypoints[piece], waypoints[piece + 1], around)[2]
-    return piece, around[np.arange(len(piece)), np.argmax(distance, axis=-1)]
+    return piece, around[np.arange(len(piece)), np.argmax(value(piece, around), axis=-1)]
 
 
 class _Program:
@@ -147,8 +192,8 @@ class _Program:
         return filled
 
 
-def _infeasible() -> ConfigError:
-    return ConfigError(
-        "expected a curve inside its corridors, got fixed derivatives that lead out of them. Leave them free, or make "
-        "the corridors wider."
+def _infeasible() -> OutsideError:
+    return OutsideError(
+        "expected a curve inside its corridors and heights, got fixed derivatives that lead out of them. Leave them "
+        "free, or make the corridors wider."
     )

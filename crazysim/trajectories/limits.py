@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
 from crazysim.errors import ConfigError
 from crazysim.trajectories.approaches import Approach, closest_approaches
@@ -17,46 +18,49 @@ from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
 ROUNDING = 1e-4
-"""Part of a limit by which a value may exceed it: derivatives of polynomials in float32 are that exact."""
+"""Part of a limit by which a value may exceed it, of 1 m for heights below that: derivatives of polynomials in float32
+are that exact."""
 
 
 @dataclass(frozen=True)
 class Limits:
     """Limits of a trajectory and of a table; None for no limit."""
 
-    speed: float | None = None
+    speed: float | None = setting(default=None, positive=True)
     """Largest speed, m/s."""
-    horizontal_speed: float | None = None
+    horizontal_speed: float | None = setting(default=None, positive=True)
     """Largest speed in the horizontal plane, m/s."""
-    vertical_speed: float | None = None
+    vertical_speed: float | None = setting(default=None, positive=True)
     """Largest speed of climb and descent, m/s."""
-    acceleration: float | None = None
+    acceleration: float | None = setting(default=None, positive=True)
     """Largest acceleration, m/s^2."""
-    jerk: float | None = None
+    jerk: float | None = setting(default=None, positive=True)
     """Largest third derivative of the position, m/s^3."""
-    thrust: float | None = None
+    thrust: float | None = setting(default=None, positive=True)
     """Largest collective thrust over the weight, more than 1."""
-    min_thrust: float | None = None
+    min_thrust: float | None = setting(default=None, low=0.0)
     """Smallest collective thrust over the weight, less than 1."""
-    body_rate: float | None = None
+    body_rate: float | None = setting(default=None, positive=True)
     """Largest angular velocity, rad/s."""
-    yaw_rate: float | None = None
+    yaw_rate: float | None = setting(default=None, positive=True)
     """Largest rate of the yaw, rad/s."""
-    height: float | None = None
+    height: float | None = setting(default=None, positive=True)
     """Largest height, m."""
-    separation: float | None = None
+    separation: float | None = setting(default=None, positive=True)
     """Smallest distance between the positions of two drones, m."""
+    floor: float | None = 0.0
+    """Smallest height, m, negative in a pit."""
 
     def __post_init__(self) -> None:
         """Check the limits.
 
         Raises:
-            ConfigError: If a limit is not positive, or the weight is not within those of the thrust.
+            ConfigError: If a limit is not positive, the weight is not within those of the thrust, or the floor is not
+                below the largest height.
         """
-        for name, value in self.given().items():
-            is_number = isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool)
-            if not is_number or not np.isfinite(value) or value < 0 or (value == 0 and name != "min_thrust"):
-                raise ConfigError(f"expected a positive, finite limit {name}, got {value!r}. Use None for no limit.")
+        check_settings(self)
+        if self.floor is not None and self.height is not None and self.floor >= self.height:
+            raise ConfigError(f"expected a floor below the height of {self.height} m, got {self.floor} m. Set floor=.")
         if self.thrust is not None and self.thrust <= 1:
             raise ConfigError(
                 f"expected a largest thrust of more than 1 weight, got {self.thrust}. A drone with less cannot hover."
@@ -109,7 +113,7 @@ class Violation:
     def __str__(self) -> str:
         """Return the violation in one line."""
         unit = "m" if self.limit == "separation" else QUANTITIES[self.limit].unit
-        relation = "below" if self.limit in ("separation", "min_thrust") else "above"
+        relation = "below" if self.limit == "separation" or QUANTITIES[self.limit].sign < 0 else "above"
         return (
             f"{' and '.join(self.names)}: {self.limit} {self.value:.4g} {unit} at {self.time:.2f} s, {relation} the "
             f"limit of {self.allowed:.4g}"
@@ -150,6 +154,11 @@ class Report:
             lines.append(f"separation: {pair.distance:.4g} m ({who} at {pair.time:.2f} s)")
         lines += [f"{len(self.violations) or 'no'} violation{'s' * (len(self.violations) != 1)}"]
         return "\n".join([*lines, *map(str, self.violations)])
+
+
+def size_of(name: str, limit: float) -> float:
+    """Return the size of a limit that its tolerances are parts of: that of a height is at least 1 m."""
+    return max(abs(limit), 1.0) if QUANTITIES[name].orders == (0,) else abs(limit)
 
 
 def check(
@@ -199,7 +208,7 @@ def check(
         if name not in allowed:
             continue
         limit, sign = allowed[name], QUANTITIES[name].sign
-        for k in np.flatnonzero(sign * (peak.value - limit) > ROUNDING * limit):
+        for k in np.flatnonzero(sign * (peak.value - limit) > ROUNDING * size_of(name, limit)):
             violations.append(
                 Violation(name, (int(k),), float(peak.time[k]), float(peak.value[k]), limit, (labels[k],))
             )

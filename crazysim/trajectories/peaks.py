@@ -78,6 +78,7 @@ QUANTITIES: dict[str, Quantity] = {
     "body_rate": Quantity("rad/s", (0, 1, 2, 3), _body_rate),
     "yaw_rate": Quantity("rad/s", (1,), lambda vel: np.abs(vel[..., 3])),
     "height": Quantity("m", (0,), lambda pos: pos[..., 2]),
+    "floor": Quantity("m", (0,), lambda pos: pos[..., 2], -1),
 }
 """Quantities by name."""
 

@@ -8,13 +8,15 @@ import numpy as np
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
+from crazysim.trajectories.corridors import OutsideError
 from crazysim.trajectories.interpolation import Floats
-from crazysim.trajectories.limits import Limits
+from crazysim.trajectories.limits import Limits, size_of
 from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 MARGIN = 1e-4
-"""Part of a limit that is left unused, for the rounding of trajectories in float32."""
+"""Part of a limit that is left unused, for the rounding of trajectories in float32. Of heights, which waypoints may be
+at, half of it may be exceeded instead."""
 PRECISION = 1e-5
 """Relative precision of the factor of time."""
 STEP = 1.25
@@ -78,10 +80,9 @@ def violated(durations: Floats, coefficients: Floats, limits: Limits) -> list[st
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
     found = peaks(table, tuple(given))
-    signs = {name: QUANTITIES[name].sign for name in given}
-    return [
-        name for name, limit in given.items() if signs[name] * (found[name].value[0] - limit) > -MARGIN * abs(limit)
-    ]
+    excess = {name: QUANTITIES[name].sign * (found[name].value[0] - limit) for name, limit in given.items()}
+    margins = {name: -MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * MARGIN for name in given}
+    return [name for name, limit in given.items() if excess[name] > margins[name] * size_of(name, limit)]
 
 
 def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
@@ -100,7 +101,10 @@ def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limit
     """
 
     def excess(factor: float) -> list[str]:
-        return violated(durations * factor, solve(durations * factor), limits)
+        try:
+            return violated(durations * factor, solve(durations * factor), limits)
+        except OutsideError:  # fixed velocities lead out at this speed
+            return ["corridors or heights"]
 
     high = 1.0
     for _ in range(N_STEPS):

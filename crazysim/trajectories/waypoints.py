@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation, timing
-from crazysim.trajectories.corridors import fill_in_corridors
+from crazysim.trajectories.corridors import CLOSE, fill_in_corridors
 from crazysim.trajectories.interpolation import Floats
 from crazysim.trajectories.limits import Limits
 from crazysim.trajectories.splines import finite, of_unit_pieces, unwrapped
@@ -40,8 +40,8 @@ def minimum_snap(
         waypoints: Positions, world frame, m. (n, 3)
         durations: Time from each waypoint to the next, s. None for the shortest in ratios of least snap that meet the
             limits. (n - 1,)
-        limits: Limits, needed without durations. With durations they are checked. The separation is that of a fleet,
-            which ``check`` compares.
+        limits: Limits, needed without durations. The path stays between floor and height; with durations the others are
+            checked. The separation is that of a fleet, which ``check`` compares.
         yaw: Yaw at the waypoints, rad: one for all, or one for each, between which the drone turns the shorter way with
             the smallest integral of the squared angular acceleration. () or (n,)
         corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one for all
@@ -100,13 +100,13 @@ def _plan(
     n_pieces = len(nodes) - 1
     angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
     angles[:, 0, 0], angles[[0, -1], 1:] = unwrapped(yaw, n_pieces + 1), 0.0
-    radii = _radii(corridors, n_pieces)
+    radii, heights = _radii(corridors, n_pieces), _heights(limits, nodes[:, 0, 2])
 
     def solve(lengths: Floats) -> Floats:
         try:
             filled = interpolation.fill(nodes, lengths)
-            if np.any(np.isfinite(radii)):
-                filled = fill_in_corridors(nodes, lengths, radii)
+            if np.any(np.isfinite([*radii, *heights])):
+                filled = fill_in_corridors(nodes, lengths, radii, heights)
         except np.linalg.LinAlgError as error:
             raise ConfigError(
                 f"expected a unique trajectory, got {n_pieces + 1} waypoints with too few fixed derivatives. Add "
@@ -173,6 +173,19 @@ def _radii(corridors: ArrayLike | None, n_pieces: int) -> Floats:
     if radii.shape not in ((), (n_pieces,)) or not np.all(radii > 0):
         raise ConfigError(f"expected positive corridors, one or {n_pieces}, got {corridors!r}. Use inf for no bound.")
     return np.broadcast_to(radii, (n_pieces,))
+
+
+def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
+    """Return the smallest and the largest height, m, between which waypoints are; infinite for no limit."""
+    low, high = (None, None) if limits is None else (limits.floor, limits.height)
+    bounds = -np.inf if low is None else low, np.inf if high is None else high
+    for k, z in enumerate(heights):
+        if not bounds[0] - CLOSE <= z <= bounds[1] + CLOSE:
+            raise ConfigError(
+                f"expected waypoints from the floor of {low} m to the height of {high} m, got number {k} at {z:g} m. "
+                f"Move it, or set floor= and height= of the limits."
+            )
+    return bounds
 
 
 def _given(durations: ArrayLike, n_pieces: int) -> Floats:

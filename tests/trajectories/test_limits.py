@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazysim import ConfigError, load_airframe
-from crazysim.trajectories import Limits, Trajectory, check, circle, spline
+from crazysim.trajectories import Limits, Trajectory, check, circle, line, spline
 from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
@@ -108,7 +108,7 @@ def test_a_trajectory_at_its_limit_is_fine_and_one_above_is_not():
 
 def test_every_limit_can_be_exceeded():
     wild = [taylor([0, 0, 1, 0], [2, 2, 2, 2], [5, 5, -8, 1], [9, 9, 9, 1]), straight([0, 0, 1], [1, 0, 1], 1.0)]
-    tight = Limits(0.1, 0.1, 0.1, 0.1, 0.1, 1.01, 0.99, 0.1, 0.1, 0.1, 0.5)
+    tight = Limits(0.1, 0.1, 0.1, 0.1, 0.1, 1.01, 0.99, 0.1, 0.1, 0.7, 0.5, floor=0.6)
     found = {violation.limit for violation in check(wild, tight).violations}
     assert found == set(tight.given())
     loose = Limits(*[1000.0] * 6, 1e-3, 1000.0, 1000.0, 1000.0, 1e-9)
@@ -135,15 +135,27 @@ def test_a_stack_is_a_fleet():
     assert len(stacked.closest) == 3
 
 
+def test_the_floor_is_at_zero_unless_it_is_set():
+    descent = line([0, 0, 1], [1, 0, -1], duration=4.0)
+    (violation,) = check(descent, Limits(height=2.0), "cf21B_500").violations
+    assert str(violation) == "drone 0: floor -1 m at 4.00 s, below the limit of 0"
+    assert not check(descent, Limits(floor=-0.9)).ok
+    assert check(descent, Limits(floor=-1.0)).ok
+    assert check(descent, Limits(floor=None)).ok
+    assert check(line([0, 0, 0], [1, 0, 0], duration=1.0), Limits()).ok
+
+
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: Limits(speed=0.0), "limit speed"),
-        (lambda: Limits(acceleration=-1.0), "limit acceleration"),
-        (lambda: Limits(jerk=np.nan), "limit jerk"),
-        (lambda: Limits(body_rate="fast"), "limit body_rate"),
+        (lambda: Limits(speed=0.0), "expected speed of Limits"),
+        (lambda: Limits(acceleration=-1.0), "expected acceleration of Limits"),
+        (lambda: Limits(jerk=np.nan), "expected jerk of Limits"),
+        (lambda: Limits(body_rate="fast"), "expected body_rate of Limits"),
         (lambda: Limits(thrust=1.0), "cannot hover"),
         (lambda: Limits(min_thrust=1.0), "less than 1 weight"),
+        (lambda: Limits(floor=np.nan), "expected floor of Limits to be finite"),
+        (lambda: Limits(floor=1.0, height=1.0), "a floor below the height of 1.0 m"),
         (lambda: check([], Limits()), "at least one"),
         (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), names=["a", "b"]), "1 names"),
         (lambda: check(straight([0, 0, 0], [1, 0, 0], 1.0), Limits(), tolerance=0.0), "tolerance"),

@@ -107,7 +107,11 @@ def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, 
     rng = np.random.default_rng(seed)
     waypoints = rng.uniform(-3, 3, (n, 3))
     limits = Limits(
-        speed=rng.uniform(0.5, 5), acceleration=rng.uniform(1, 10), jerk=rng.uniform(5, 100), thrust=rng.uniform(1.1, 2)
+        speed=rng.uniform(0.5, 5),
+        acceleration=rng.uniform(1, 10),
+        jerk=rng.uniform(5, 100),
+        thrust=rng.uniform(1.1, 2),
+        floor=None,
     )
     trajectory = method(waypoints, limits=limits, yaw=rng.uniform(-3, 3, n))
     report = check(trajectory, limits)
@@ -252,6 +256,34 @@ def test_coincident_waypoints_are_fine_with_durations():
 
 
 BENT = [[0, 0, 1], [1, 0, 1], [1, 1, 1]]
+
+
+@settings(max_examples=5)
+@pytest.mark.parametrize("method", METHODS)
+@given(seed=st.integers(0, 10_000), n=st.integers(2, 8), passes=st.booleans())
+def test_planned_flights_stay_between_floor_and_height(method, seed, n, passes):
+    """Through waypoints of which many are on the floor or at the height, with free and with fixed velocities."""
+    rng = np.random.default_rng(seed)
+    waypoints = rng.uniform(-3, 3, (n, 3))
+    waypoints[:, 2] = rng.choice([0.5, 0.6, 1.5, 2.0], n)
+    velocities = np.full((n, 3), np.nan)
+    velocities[[0, -1]] = 0.0
+    if passes and n > 2:
+        velocities[1] = [1.0, -1.0, 0.0]
+    limits = Limits(speed=3.0, acceleration=8.0, floor=0.5, height=2.0)
+    report = check(method(waypoints, limits=limits, velocities=velocities), limits)
+    assert report.ok, str(report)
+
+
+def test_a_plan_through_high_gates_does_not_dip_below_the_floor():
+    gates = [[0, 0, 1], [0, 0, 3], [1, 0, 0.8], [6, 0, 0.8], [7, 0, 3], [7, 0, 1]]
+    free = minimum_snap(gates, limits=Limits(speed=3.0, floor=None))
+    assert check(free, Limits(floor=None)).peaks["floor"].value < -0.1
+    bound = minimum_snap(gates, limits=Limits(speed=3.0))
+    assert check(bound, Limits()).ok
+    assert check(bound, Limits()).peaks["floor"].value < 1e-3  # it is used
+
+
 NAN = np.full((3, 3), np.nan)
 
 
@@ -267,7 +299,11 @@ NAN = np.full((3, 3), np.nan)
         (lambda: minimum_snap(BENT, [1.0, np.inf]), "positive, finite durations"),
         (lambda: minimum_snap([*BENT, BENT[-1]], limits=LIMITS), "number 2 and 3"),
         (lambda: minimum_snap(BENT, [0.5, 0.5], limits=LIMITS), "exceeds speed and acceleration. Multiply"),
-        (lambda: minimum_snap(BENT, limits=Limits(height=0.5)), "exceed height however slow"),
+        (
+            lambda: minimum_snap(BENT, limits=Limits(height=0.5)),
+            "from the floor of 0.0 m to the height of 0.5",
+        ),
+        (lambda: minimum_snap([[0, 0, 1], [1, 0, -0.1]], limits=LIMITS), "got number 1 at -0.1 m. Move it"),
         (lambda: minimum_snap(BENT, limits=Limits(height=5.0)), "bound the speed"),
         (lambda: minimum_snap(BENT, limits=LIMITS, corridors=0.0), "positive corridors"),
         (lambda: minimum_snap(BENT, limits=LIMITS, corridors=[0.1] * 3), "positive corridors, one or 2"),
@@ -289,5 +325,5 @@ def test_the_factor_of_the_error_is_the_remedy():
         minimum_snap(BENT, [0.5, 0.5], limits=LIMITS)
     factor = float(str(caught.value).split("durations by ")[1].split(",")[0])
     report = check(minimum_snap(BENT, [0.5 * factor, 0.5 * factor], limits=LIMITS), LIMITS)
-    assert max(report.peaks[name].value[0] / limit for name, limit in LIMITS.given().items()) > 0.99
+    assert max(report.peaks[name].value[0] / LIMITS.given()[name] for name in ("speed", "acceleration")) > 0.99
     assert "separation" not in QUANTITIES
