@@ -41,10 +41,10 @@ class CommandQueue(Closing):
         self._queue: queue.Queue[Command] = queue.Queue(MAX_QUEUE)
 
     def commands(self) -> list[Command]:
-        """Return the commands that have arrived since the last call, in their order."""
+        """Return the commands that have arrived until this call, in their order; others wait for the next one."""
         found = []
         with contextlib.suppress(queue.Empty):
-            while True:
+            for _ in range(self._queue.qsize()):
                 found.append(self._queue.get_nowait())
         return found
 

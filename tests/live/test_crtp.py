@@ -350,6 +350,12 @@ def test_log_blocks_have_limits(device):
     assert send(device, 5, 1, bytes([6, 17]) + one) == [bytes([0x5D, 6, 17, errno.ENOMEM])]
 
 
+def test_the_answer_to_setting_a_parameter_by_name_repeats_the_name(device):
+    head = b"\x00no\x00thing\x00"
+    for rest in (b"", b"\x08\x01"):
+        assert send(device, 2, 3, head + rest) == [bytes([0x2F]) + head + bytes([errno.ENOENT])]
+
+
 def test_refused_commands_have_a_code_and_a_report(device):
     wrong = struct.pack("<BBff?f", 7, 0, float("nan"), 0.0, False, 1.0)
     assert send(device, 8, 0, wrong)[0][-1] == errno.ENOEXEC

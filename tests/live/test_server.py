@@ -25,6 +25,7 @@ from crazysim.live import (
     TakeOff,
     Upload,
 )
+from crazysim.live.server import CommandQueue
 from crazysim.trajectories import Trajectory, figure_eight
 from crazysim.trajectories.files import Lights, Show, save_show
 
@@ -180,6 +181,22 @@ def test_waiting_commands_are_bounded(monkeypatch):
             stream.command(1, "land")
         assert len(server.commands()) == 3
         stream.command(1, "land")
+
+
+def test_commands_that_arrive_while_others_are_taken_wait_for_the_next_call():
+    """A producer as fast as the consumer: each command that is taken is followed by another."""
+    queue = CommandQueue()
+    queue._put(Land(1))
+    take = queue._queue.get_nowait
+
+    def take_and_refill():
+        command = take()
+        queue._put(Land(command.drone + 1))
+        return command
+
+    queue._queue.get_nowait = take_and_refill
+    assert [command.drone for command in queue.commands()] == [1]
+    assert [command.drone for command in queue.commands()] == [2]
 
 
 def test_many_clients_at_once(server):

@@ -304,7 +304,9 @@ def test_wrong_settings_are_refused():
         for message, sim, settings in (
             ("expected control='rotor_vel', got 'attitude'", Sim(control="attitude"), {}),
             ("expected a link for each of 2 drones, got 1", Sim(n_drones=2, control="rotor_vel"), {}),
-            ("expected freq as a divisor of sim.freq=500, got 300", Sim(control="rotor_vel"), {"freq": 300}),
+            ("expected freq to divide freq = 500 Hz, got 300 Hz", Sim(control="rotor_vel"), {"freq": 300}),
+            ("timeout to be positive, at most 1e[+]06, got nan", Sim(control="rotor_vel"), {"timeout": np.nan}),
+            ("timeout to be positive, at most 1e[+]06, got -1", Sim(control="rotor_vel"), {"timeout": -1.0}),
             ("expected motors as 'speed' or 'thrust', got 'volt'", Sim(control="rotor_vel"), {"motors": "volt"}),
         ):
             with pytest.raises(ConfigError, match=message):
@@ -315,6 +317,96 @@ def test_wrong_settings_are_refused():
             ArduPilot(port=link._link._socket.getsockname()[1])
     with Px4(port=0, connect_timeout=0.1) as px4, pytest.raises(ConfigError, match=r"within 0\.1 s, got no connection"):
         px4.send(SoftwareInTheLoop(Sim(control="rotor_vel"), px4).measure()[0])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ArduPilot(port=-1), "port to be from 0 to 6.*, got -1"),
+        (lambda: ArduPilot(port=70000), "port to be from 0 to 6.*, got 70000"),
+        (lambda: ArduPilot(port=9002.5), "port as a whole number, got 9002.5"),
+        (lambda: ArduPilot(host=5), "host as text, got 5"),
+        (lambda: Px4(port=99999), "port to be from 0 to 6.*, got 99999"),
+        (lambda: Px4(port=0, connect_timeout=np.inf), "connect_timeout to be positive, .*got inf"),
+        (lambda: Px4(port=0, origin=(47.0, 8.0, 500.0)), r"expected an Origin, got \(47.0"),
+        (lambda: Betaflight(ports=(0, 9003)), "expected ports of the motors, the state and the remote control"),
+        (lambda: Betaflight(ports=(0, 0, 9004)), "port to be from 1 to"),
+        (lambda: Betaflight(ports=(0, 9003, 9004), rc_freq=-5.0), "rc_freq to be positive, got -5"),
+        (lambda: Betaflight(ports=(0, 9003, 9004), rc_freq=np.nan), "rc_freq to be positive, got nan"),
+        (lambda: Origin(500.0, 0.0, 0.0), "latitude of Origin to be from -89 to 89, got 500"),
+        (lambda: Origin(47.0, 8.0, np.nan), "altitude of Origin to be from -1000 to 1.1e[+]04, got nan"),
+    ],
+)
+def test_law_09_arguments_of_links_are_checked(call, message):
+    with pytest.raises(ConfigError, match=message):
+        call()
+
+
+def test_law_09_channels_times_and_links_are_checked():
+    with Betaflight(ports=(0, 9003, 9004)) as link:
+        link.channels = [1500] * 15 + [2000]
+        assert link.channels[15] == 2000
+        for values, message in (
+            ([1500.5] * 16, "channels as whole numbers, us, got"),
+            ([1500] * 3, r"channels of shape \(16,\), got \(3,\)"),
+            ([-1] * 16, "channels to be from 0 to 6"),
+        ):
+            with pytest.raises(ConfigError, match=message):
+                link.channels = values
+        link.channels[4] = 70000
+        with pytest.raises(ConfigError, match="channels to be from 0 to 6"):
+            link.send(SoftwareInTheLoop(Sim(control="rotor_vel"), link).measure()[0])
+        with pytest.raises(ConfigError, match="a link of its own for each of 2 drones, got one twice"):
+            SoftwareInTheLoop(Sim(n_drones=2, control="rotor_vel"), [link, link])
+        with pytest.raises(ConfigError, match="a link to firmware or a list of them, got 'ardupilot'"):
+            SoftwareInTheLoop(Sim(control="rotor_vel"), "ardupilot")
+        loop = SoftwareInTheLoop(Sim(control="rotor_vel"), link)
+        for seconds in (-1.0, np.inf, np.nan, "1"):
+            with pytest.raises(ConfigError, match="expected seconds"):
+                loop.run(seconds)
+
+
+GARBAGE = [b"", b"\x01", b"\xff" * 15, b"\x00" * 17, np.float32([np.nan, 0, 0, 0]).tobytes(), bytes(range(200))]
+"""Packets that no firmware sends."""
+
+
+@pytest.mark.parametrize("kind", [ArduPilot, Betaflight])
+def test_packets_of_another_format_are_skipped_and_extend_no_deadline(kind):
+    """The sender stops long after the deadline, and not before ``receive`` has returned."""
+    wait = threading.Event()
+    settings = {"port": 0} if kind is ArduPilot else {"ports": (0, 9003, 9004)}
+    with kind(**settings) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        address = link._link._socket.getsockname()
+
+        def serve():
+            for k in range(6000):
+                peer.sendto(GARBAGE[k % len(GARBAGE)], address)
+                if wait.wait(0.005):
+                    return
+            raise AssertionError("receive did not return while garbage arrived")
+
+        thread = Thread(serve)
+        assert link.receive(0.1) is None
+        wait.set()
+        thread.end()
+        good = (
+            struct.pack("<HHI16H", 18458, 400, 0, *[1250] * 16)
+            if kind is ArduPilot
+            else struct.pack("<4f", *[0.25] * 4)
+        )
+        for packet in [good, *GARBAGE]:
+            peer.sendto(packet, address)
+        np.testing.assert_allclose(link.receive(2.0), 0.25)
+
+
+def test_px4_skips_bytes_that_are_no_message():
+    mav, mode = common.MAVLink(None, srcSystem=1, srcComponent=1), common.MAV_MODE_FLAG_SAFETY_ARMED
+    with Px4(port=0) as link, socket.create_connection(link.address) as client:
+        controls = [0.5, 0.25, np.nan, 1.0, *[0.0] * 12]
+        message = common.MAVLink_hil_actuator_controls_message(0, controls, mode, 1).pack(mav)
+        damaged = message[:20] + bytes([message[20] ^ 0xFF]) + message[21:]
+        client.sendall(b"".join(GARBAGE) + damaged + b"\xfd\xfe" + 20 * message)  # a false start takes some with it
+        wait_for(lambda: np.array_equal(link.receive(0.1), [0.5, 0.25, 0.0, 1.0]))
 
 
 def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():

@@ -322,7 +322,7 @@ class CrtpDevice:
             if full in self.values and rest[0] in formats:
                 self._set(full, struct.unpack(formats[rest[0]], rest[1:])[0])
                 code = 0
-            return [(PARAM, 3, data[: -len(rest)] + bytes([code]))]
+            return [(PARAM, 3, data[: len(data) - len(rest)] + bytes([code]))]
         (k,) = struct.unpack("<H", data[1:3])
         if command == 8 and k < len(self.params.variables):
             value = self.values.kinds[self.params.variables[k].name].value

@@ -43,7 +43,7 @@ class ArduPilot(FirmwareLink):
             port: Port.
 
         Raises:
-            ConfigError: If the port is in use.
+            ConfigError: If the port is none, or in use.
         """
         self._link = Datagrams(host, port)
 
@@ -60,15 +60,17 @@ class ArduPilot(FirmwareLink):
 
     def receive(self, timeout: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived in time. (4,)"""
-        packet = self._link.newest(timeout, struct.calcsize("<H"))
-        if packet is None:
-            return None
-        form = FORMATS.get(struct.unpack_from("<H", packet)[0])
-        if form is None or len(packet) != struct.calcsize(form):
-            return None
-        pulses = np.array(struct.unpack(form, packet)[3:7], float)
-        return np.clip((pulses - PULSE_MIN) / (PULSE_MAX - PULSE_MIN), 0, 1)
+        return self._link.newest(timeout, _commands)
 
     def close(self) -> None:
         """Close the port."""
         self._link.close()
+
+
+def _commands(packet: bytes) -> NDArray | None:
+    """Return the motor commands of a packet, None of one of another format. (4,)"""
+    form = FORMATS.get(int.from_bytes(packet[:2], "little"))
+    if form is None or len(packet) != struct.calcsize(form):
+        return None
+    pulses = np.array(struct.unpack(form, packet)[3:7], float)
+    return np.clip((pulses - PULSE_MIN) / (PULSE_MAX - PULSE_MIN), 0, 1)

@@ -5,14 +5,19 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from crazysim.live.sitl.link import Datagrams, FirmwareLink, Rate
-from crazysim.live.sitl.measured import TURN, ZURICH, Measured, Origin, frd
+from crazysim.core.settings import flag
+from crazysim.errors import ConfigError, shown
+from crazysim.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
+from crazysim.live.sitl.measured import TURN, ZURICH, Measured, Origin, as_origin, frd
+from crazysim.tables import bounds, numbers
 
 PORTS = (9002, 9003, 9004)
 """Ports of the motors, which Betaflight sends, and of the state and the remote control, which it receives."""
 N_CHANNELS = 16
+LARGEST_PULSE = 65535
+"""Largest pulse that a packet of the remote control holds, us."""
 
 
 class Betaflight(FirmwareLink):
@@ -51,14 +56,32 @@ class Betaflight(FirmwareLink):
             rc_freq: Packets of the remote control per second, Hz.
 
         Raises:
-            ConfigError: If the port of the motors is in use.
+            ConfigError: If an argument is out of range, or the port of the motors is in use.
         """
-        self.gazebo, self.origin, self._rc_rate = gazebo, origin, Rate(rc_freq)
+        self.gazebo, self.origin, self._rc_rate = flag("gazebo", gazebo), as_origin(origin), Rate("rc_freq", rc_freq)
         self._start: tuple[float, float] | None = None
-        self._link = Datagrams(host, ports[0])
-        _, self._state, self._rc = ports
-        self.channels: NDArray = np.array([1500, 1500, 1000, 1500, *[1000] * (N_CHANNELS - 4)], np.uint16)
-        """Remote control, us: roll, pitch, throttle, yaw, and the switches, 1,000 to 2,000. (16,)"""
+        if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
+            raise ConfigError(f"expected ports of the motors, the state and the remote control, got {shown(ports)}")
+        motors, self._state, self._rc = ports
+        for port in (self._state, self._rc):
+            check_address(host, port, least=1)
+        self._channels = np.array([1500.0, 1500.0, 1000.0, 1500.0, *[1000.0] * (N_CHANNELS - 4)])
+        self._link = Datagrams(host, motors)
+
+    @property
+    def channels(self) -> NDArray[np.float64]:
+        """Remote control, us: roll, pitch, throttle, yaw, and the switches, 1,000 to 2,000. (16,)
+
+        Set all of them, or single ones, which are checked when they are sent.
+
+        Raises:
+            ConfigError: If they are not 16 whole numbers that fit into a packet.
+        """
+        return self._channels
+
+    @channels.setter
+    def channels(self, values: ArrayLike) -> None:
+        self._channels = _pulses(values).astype(np.float64)
 
     def send(self, measured: Measured) -> None:
         """Send the state, and the remote control when it is due."""
@@ -75,13 +98,28 @@ class Betaflight(FirmwareLink):
         state = (*gyro, *frd(measured.accel), *quat, *measured.gps_vel, *place, self.origin.pressure(measured.height))
         self._link.send(struct.pack("<18d", measured.time, *state), self._state)
         if self._rc_rate.is_due(measured.time):
-            self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *self.channels), self._rc)
+            self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *_pulses(self._channels)), self._rc)
 
     def receive(self, timeout: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived in time. (4,)"""
-        packet = self._link.newest(timeout, struct.calcsize("<4f"))
-        return None if packet is None else np.clip(np.frombuffer(packet, "<f4"), 0, 1)
+        return self._link.newest(timeout, _commands)
 
     def close(self) -> None:
         """Close the ports."""
         self._link.close()
+
+
+def _pulses(channels: ArrayLike) -> NDArray[np.int64]:
+    """Return the pulses of a packet of the remote control, us. (16,)"""
+    pulses = numbers("channels", channels, bounds(0, LARGEST_PULSE), ((N_CHANNELS,),))
+    if np.any(pulses % 1):
+        raise ConfigError(f"expected channels as whole numbers, us, got {shown(pulses.tolist())}. Round them.")
+    return pulses.astype(np.int64)
+
+
+def _commands(packet: bytes) -> NDArray | None:
+    """Return the motor commands of a packet, None of one of another format. (4,)"""
+    if len(packet) != struct.calcsize("<4f"):
+        return None
+    commands = np.frombuffer(packet, "<f4")
+    return np.clip(commands, 0, 1) if np.isfinite(commands).all() else None

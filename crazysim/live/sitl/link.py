@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import time
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 from numpy.typing import NDArray
 
 from crazysim.closing import Closing
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.live.sitl.measured import Measured
+from crazysim.tables import POSITIVE, bounds, number, numbers
 
 ROUNDING = 1e-6
 """Tolerance of times for the rounding of sums of periods, s."""
 LARGEST = 65535
 """Longest datagram, bytes."""
+LAST_PORT = 65535
+"""Largest number of a port."""
+DRAINING = 0.1
+"""Longest time for packets that are there after the time to wait for one, s, however fast others arrive."""
+TIMEOUT = bounds(high=1e6, positive=True)
+"""Range of a time to wait, s."""
 
 
 class FirmwareLink(Closing):
@@ -49,9 +58,17 @@ class FirmwareLink(Closing):
 class Rate:
     """Times at which something is due, at a rate in simulated time."""
 
-    def __init__(self, freq: float):
-        """Begin at once; ``freq`` is the rate, Hz."""
-        self._period, self._next = 1 / freq, 0.0
+    def __init__(self, name: str, freq: float):
+        """Begin at once.
+
+        Args:
+            name: Name of the rate, for messages.
+            freq: Rate, Hz.
+
+        Raises:
+            ConfigError: If the rate is not positive.
+        """
+        self._period, self._next = 1 / number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
         """Return True if it is due at a simulated time, s, and schedule the next one."""
@@ -61,6 +78,22 @@ class Rate:
         return True
 
 
+def check_address(host: str, port: int, least: int = 0) -> None:
+    """Check an address.
+
+    Args:
+        host: Name or address of a host.
+        port: Port.
+        least: Least port; 0 allows any free one.
+
+    Raises:
+        ConfigError: If the host is no text, or the port no whole number up to 65535.
+    """
+    if not isinstance(host, str):
+        raise ConfigError(f"expected host as text, got {shown(host)}. Use '127.0.0.1'.")
+    numbers("port", port, bounds(least, LAST_PORT), ((),), whole=True)
+
+
 class Datagrams(Closing):
     """UDP socket that sends to one address, and receives the newest packet."""
 
@@ -68,8 +101,9 @@ class Datagrams(Closing):
         """Bind the socket to a port of this machine.
 
         Raises:
-            ConfigError: If the port is in use.
+            ConfigError: If the port is none, or in use.
         """
+        check_address(host, port)
         self._host = host
         self._sender: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -90,21 +124,26 @@ class Datagrams(Closing):
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(packet, self._sender)
 
-    def newest(self, timeout: float, size: int) -> bytes | None:
-        """Return the newest packet of at least a size, or None if none arrived in time.
+    def newest(self, timeout: float, read: Callable[[bytes], NDArray | None]) -> NDArray | None:
+        """Return the contents of the newest packet that has any, or None if none arrived in time.
 
         Args:
             timeout: Time to wait for one, s; 0 for those that are there.
-            size: Size, bytes.
+            read: Returns the contents of a packet, None of one of another format, which is skipped.
         """
-        found = None
-        self._socket.settimeout(timeout)
-        with contextlib.suppress(TimeoutError, BlockingIOError, ConnectionRefusedError):
-            while True:
+        found, now = None, time.monotonic()
+        deadline, end = now + timeout, now + timeout + DRAINING
+        while now < end:
+            self._socket.settimeout(max(deadline - now, 0.0) if found is None else 0.0)
+            try:
                 packet, sender = self._socket.recvfrom(LARGEST)
-                if len(packet) >= size:
-                    found, self._sender = packet, sender
-                    self._socket.settimeout(0)
+            except (TimeoutError, BlockingIOError):
+                break
+            except ConnectionRefusedError:  # of a packet that was sent to a program that does not listen
+                packet, sender = b"", self._sender
+            contents, now = read(packet), time.monotonic()
+            if contents is not None:
+                found, self._sender = contents, sender
         return found
 
     def close(self) -> None:

@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.core.airframes import as_airframes
+from crazysim.core.settings import dividing_rate, flag
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.live.attitude import rotate
 from crazysim.live.pace import Pace, Speed
-from crazysim.live.sitl.link import ROUNDING, FirmwareLink
+from crazysim.live.sitl.link import ROUNDING, TIMEOUT, FirmwareLink
 from crazysim.live.sitl.measured import Measured
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.sim import Sim
+from crazysim.tables import NOT_NEGATIVE, number
 
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field where there is no ``Magnetometer``, world frame, T: about that of central Europe."""
@@ -64,11 +66,11 @@ class SoftwareInTheLoop(Closing):
             timeout: Time to wait for the motor commands of a firmware in lockstep, s.
 
         Raises:
-            ConfigError: If the level, the number of links, the rate or the rotors of an airframe do not fit.
+            ConfigError: If the level, the links, the rate, the timeout or the rotors of an airframe do not fit.
         """
-        self.sim, self.timeout, self.motors = sim, timeout, motors
-        self.links = (links,) if isinstance(links, FirmwareLink) else tuple(links)
-        freq = sim.freq if freq is None else freq
+        self.sim, self.timeout, self.motors = sim, number("timeout", timeout, TIMEOUT), motors
+        self.links = _as_links(links)
+        freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
         if sim.control != Control.rotor_vel:
             raise ConfigError(
                 f"expected control='rotor_vel', got {sim.control.value!r}. Use Sim(control='rotor_vel'), as a firmware "
@@ -81,8 +83,7 @@ class SoftwareInTheLoop(Closing):
             )
         if motors not in ("speed", "thrust"):
             raise ConfigError(f"expected motors as 'speed' or 'thrust', got {motors!r}")
-        if freq < 1 or sim.freq % freq:
-            raise ConfigError(f"expected freq as a divisor of sim.freq={sim.freq}, got {freq}")
+        reversed = flag("reversed", reversed)
         self._n_steps = sim.freq // freq
         airframes = [*as_airframes(sim.airframes, sim.n_drones)] * sim.n_worlds
         self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]
@@ -106,8 +107,9 @@ class SoftwareInTheLoop(Closing):
                 of its own, and as fast as possible in lockstep.
 
         Raises:
-            ConfigError: If a firmware does not answer in time.
+            ConfigError: If the time or the speed is out of range, or a firmware does not answer in time.
         """
+        seconds = number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
         dt, began = self._n_steps / self.sim.freq, time.monotonic()
@@ -214,6 +216,23 @@ class SoftwareInTheLoop(Closing):
             return of_rotors * self._fastest[k]
         speeds = airframe.rotor_vel(of_rotors * float(airframe.value("rotors.thrust_max")))
         return np.where(of_rotors > 0, speeds, 0.0)
+
+
+def _as_links(links: object) -> tuple[FirmwareLink, ...]:
+    """Return links to firmware.
+
+    Raises:
+        ConfigError: If there is something else, or one is there twice.
+    """
+    found = (links,) if isinstance(links, FirmwareLink) else links
+    if not isinstance(found, Sequence) or not all(isinstance(link, FirmwareLink) for link in found):
+        raise ConfigError(f"expected a link to firmware or a list of them, got {shown(links)}. Use ArduPilot(), say.")
+    if len(set(map(id, found))) < len(found):
+        raise ConfigError(
+            f"expected a link of its own for each of {len(found)} drones, got one twice. Make one for each, with other "
+            f"ports."
+        )
+    return tuple(found)
 
 
 def _rows(values: Any) -> NDArray:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crazysim.core.settings import check_settings, setting
+from crazysim.errors import ConfigError, shown
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE
 from crazysim.plugins.sensors.sensor import Sensor
 
 METRES_PER_DEGREE = 6371000.0 * np.pi / 180
 """Length of a degree of latitude on a sphere with the mean radius of the earth (IUGG), m."""
+MOST_LATITUDE = 89.0
+"""Largest latitude, degrees: the plane that touches the earth has no longitudes at a pole."""
+LOWEST, HIGHEST = -1000.0, 11000.0
+"""Altitudes of the lowest layer of the standard atmosphere, m, whose pressures are sent: up to the tropopause."""
 TURN = np.sqrt(0.5)
 """Cosine and sine of half a quarter turn, 1."""
 
@@ -50,15 +57,24 @@ class Measured(NamedTuple):
     ``GPS``. All of them in the first."""
 
 
-class Origin(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Origin:
     """Place of the world's origin on the earth."""
 
-    latitude: float
+    latitude: float = setting(low=-MOST_LATITUDE, high=MOST_LATITUDE)
     """Latitude, degrees."""
-    longitude: float
+    longitude: float = setting(low=-180.0, high=180.0)
     """Longitude, degrees."""
-    altitude: float
+    altitude: float = setting(low=LOWEST, high=HIGHEST)
     """Altitude above sea level, m."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: If one is not finite or out of its range.
+        """
+        check_settings(self)
 
     def place(self, pos: NDArray) -> tuple[float, float, float]:
         """Return latitude and longitude, degrees, and altitude, m, on the plane that touches the earth here.
@@ -77,6 +93,17 @@ class Origin(NamedTuple):
         """Return the pressure of the standard atmosphere at a height above the origin, m, in Pa."""
         base = 1 - LAPSE / SEA_LEVEL_TEMPERATURE * (self.altitude + height)
         return SEA_LEVEL_PRESSURE * base**EXPONENT
+
+
+def as_origin(origin: object) -> Origin:
+    """Return an origin.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
+    if not isinstance(origin, Origin):
+        raise ConfigError(f"expected an Origin, got {shown(origin)}. Use Origin(latitude, longitude, altitude).")
+    return origin
 
 
 ZURICH = Origin(47.397742, 8.545594, 488.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import time
 from typing import Any
@@ -11,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.live.sitl.link import FirmwareLink
-from crazysim.live.sitl.measured import ZURICH, Measured, Origin, frd, ned, quat_ned
+from crazysim.live.sitl.link import DRAINING, TIMEOUT, FirmwareLink, check_address
+from crazysim.live.sitl.measured import ZURICH, Measured, Origin, as_origin, frd, ned, quat_ned
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.tables import number
 
 PORT = 4560
 """Port at which the first instance of PX4 looks for a simulation."""
@@ -61,14 +61,16 @@ class Px4(FirmwareLink):
             connect_timeout: Time to wait for PX4 when the first measurements are sent, s.
 
         Raises:
-            ConfigError: If pymavlink is not installed, or the port is in use.
+            ConfigError: If pymavlink is not installed, an argument is out of range, or the port is in use.
         """
         try:
             from pymavlink.dialects.v20 import common
         except ImportError as error:
             raise ConfigError("expected pymavlink, got none. Run pip install 'crazysim[mavlink]'.") from error
         self._mavlink: Any = common
-        self.origin, self.connect_timeout = origin, connect_timeout
+        check_address(host, port)
+        self.origin = as_origin(origin)
+        self.connect_timeout = number("connect_timeout", connect_timeout, TIMEOUT)
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -79,6 +81,7 @@ class Px4(FirmwareLink):
         self._server.listen(1)
         self._client: socket.socket | None = None
         self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        self._mav.robust_parsing = True  # bytes that are no message are skipped
         self._began: tuple[float, float] | None = None
         self._time = 0.0
         self._asked = self._answers = False
@@ -140,14 +143,14 @@ class Px4(FirmwareLink):
 
     def _newest(self, deadline: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
-        found = None
-        while found is None or self._readable(0.0):
-            if not self._readable(max(deadline - time.monotonic(), 0.0)):
-                break
+        found, now = None, time.monotonic()
+        end = max(deadline, now) + DRAINING
+        while now < end and self._readable(max(deadline - now, 0.0) if found is None else 0.0):
             for message in self._messages():
                 if message.get_type() == "HIL_ACTUATOR_CONTROLS":
                     self.armed = bool(message.mode & self._mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-                    found = np.clip(np.array(message.controls[:4]), 0, 1) * self.armed
+                    found = np.clip(np.nan_to_num(message.controls[:4]), 0, 1) * self.armed  # NaN: no command
+            now = time.monotonic()
         return found
 
     def _place(self, pos: NDArray) -> tuple[int, int, int]:
@@ -174,15 +177,18 @@ class Px4(FirmwareLink):
         client.settimeout(self.connect_timeout)
         try:
             client.sendall(message.pack(self._mav))
-        except (BrokenPipeError, ConnectionResetError, TimeoutError):
-            raise ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.") from None
+        except (ConnectionError, TimeoutError):
+            raise _closed() from None
 
     def _readable(self, timeout: float) -> bool:
         client = self._connected()
         client.settimeout(max(timeout, 1e-6))
-        with contextlib.suppress(TimeoutError, BlockingIOError):
+        try:
             return bool(client.recv(1, socket.MSG_PEEK))
-        return False
+        except ConnectionError:
+            raise _closed() from None
+        except (TimeoutError, BlockingIOError):
+            return False
 
     def _messages(self) -> list[Any]:
         client = self._connected()
@@ -191,3 +197,7 @@ class Px4(FirmwareLink):
             return self._mav.parse_buffer(client.recv(CHUNK)) or []
         except BlockingIOError:
             return []
+
+
+def _closed() -> ConfigError:
+    return ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.")
