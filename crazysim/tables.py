@@ -98,7 +98,9 @@ def numbers(
         raise ConfigError(f"{owner}expected {name} as a number or array, got an empty one{remedy}")
     if shapes is not None and not any(_fits(array.shape, shape) for shape in shapes):
         raise ConfigError(f"{owner}expected {name} of shape {' or '.join(map(str, shapes))}, got {array.shape}{remedy}")
-    if not np.all((array >= allowed.low) & (array <= allowed.high)):
+    # A float32 is compared with the bound in float32, which may be larger: pi / 2 is.
+    compared = np.asarray(value) if getattr(value, "dtype", None) == np.float32 else array
+    if not np.all((compared >= allowed.low) & (compared <= allowed.high)):
         raise ConfigError(f"{owner}expected {name} to be {allowed.text}, got {shown(array.tolist())}{remedy}")
     return array
 

@@ -178,7 +178,8 @@ def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
     """
     found = {}
     for base in reversed(kind.__mro__):
-        names = {**vars(sys.modules[base.__module__]), "ArrayLike": np.ndarray} if base is not object else {}
+        module = getattr(sys.modules.get(base.__module__), "__dict__", {})  # a file that was run may have none
+        names = module | {"ArrayLike": np.ndarray}
         for name, hint in inspect.get_annotations(base).items():
             found[name] = _types(hint, names)
     return {field.name: found.get(field.name, ()) for field in dataclasses.fields(kind)}

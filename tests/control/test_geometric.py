@@ -299,5 +299,8 @@ def test_an_integral_does_not_wind_up():
 
 @pytest.mark.parametrize("integral", [-0.1, np.inf, np.nan])
 def test_law_09_a_wrong_integral_is_refused(integral):
-    with pytest.raises(ConfigError, match="expected a finite integral of at least 0, 1/s, got"):
+    with pytest.raises(
+        ConfigError,
+        match=r"expected a finite integral of at least 0, 1/s, got|expected integral of Geometric to be finite",
+    ):
         Sim(control="state", controller=Geometric(integral=integral))
