@@ -11,7 +11,8 @@ import numpy as np
 
 from crazysim.control import Control
 from crazysim.core.data import SimData
-from crazysim.core.stage import Axes, as_stages
+from crazysim.core.functional import stage_command, staged_leaves
+from crazysim.core.stage import Axes, as_stages, stage
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program, Slot, UnfusedStage
 from crazysim.engine.lowering.stages import lower_stages
@@ -23,6 +24,9 @@ from crazysim.sim.sim import Sim
 
 STATES = ("states.pos", "states.quat", "states.vel", "states.ang_vel", "states.rotor_vel")
 """First fields of every state vector: m, unit xyzw, m/s, rad/s, rpm (in ``so_rpy_rotor*`` N)."""
+
+FEEDFORWARD = "controls.state.staged_feedforward"
+"""Field with the feedforward of setpoints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +70,8 @@ class CasadiStep:
     x: Vector
     """State: position, attitude, velocity, body rates, rotor speeds, internal states of controllers and effects."""
     u: Vector
-    """Command, in the order and units of the setter of the command level."""
+    """Command, in the order and units of the setter of the command level. The feedforward of a setpoint is its yaw rate
+    and zeros, unless ``"controls.state.staged_feedforward"`` is a parameter."""
     p: Vector
     """Requested parameters."""
     dt: float
@@ -107,6 +112,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
             f"expected a world from 0 to {data.core.n_worlds - 1} and a drone from 0 to {data.core.n_drones - 1}, got "
             f"world {world} and drone {drone}"
         )
+    if len(staged_leaves(data)) > 1 and FEEDFORWARD not in parameters:
+        stages = [stage("drone")(_with_feedforward), *stages]
     program = fuse(lower_stages(stages, data))
     leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
     command = _command_field(data)
@@ -173,6 +180,11 @@ def _step(program: Program, before: Callable[[Slot], Any]) -> dict[Slot, Any]:
 
 def _refusal(stage: str, why: str) -> ConfigError:
     return ConfigError(f"the step cannot be exported because of its stage {stage!r}: {why}")
+
+
+def _with_feedforward(data: SimData) -> SimData:
+    """Return the data with the feedforward that the setter of the staged setpoint gives it."""
+    return stage_command(data, staged_leaves(data)[0])
 
 
 def _command_field(data: SimData) -> str:

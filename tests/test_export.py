@@ -7,6 +7,7 @@ import pytest
 from cases import INTEGRATORS, PAIRS, by_stages, hover_command, hover_rotor_state
 
 from crazysim import Battery, Downwash, Sim
+from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import Axes, stage
 from crazysim.export import STATES, to_casadi
@@ -47,6 +48,7 @@ def anywhere(sim, step):
         new = sizes.get(name, 0.1) * rng.normal(size=old.shape)
         if name == "core.steps":
             new = rng.integers(0, 10, old.shape)
+            new[0] = 0  # a tick of every controller
         elif name == "states.quat":
             new /= np.linalg.norm(new, axis=-1, keepdims=True)
         elif name in step.u.sizes or name == f"controls.{sim.control.value}.cmd":
@@ -65,6 +67,7 @@ def on_host(data):
 
 def compare(sim, step, data):
     """Compare the exported step with the reference, drone by drone, each field to 1e-12 of its size."""
+    data = F.stage_command(data, F.staged_leaves(data)[0])
     after = on_host(jax.jit(by_stages(sim), static_argnums=1)(data, 1))
     for world in range(sim.n_worlds):
         for drone in range(sim.n_drones):
@@ -152,6 +155,16 @@ def test_parameters_are_an_input():
         "params.rpm2thrust": 1.1 * data.params.rpm2thrust,
     }
     compare(sim, step, with_fields(data, changes))
+
+
+def test_the_feedforward_of_a_setpoint_is_that_of_its_setter_or_a_parameter():
+    """A feedforward that was staged before is no constant of the step: the one of the command replaces it."""
+    sim, name = Sim(N_WORLDS, N_DRONES, control="state"), "controls.state.staged_feedforward"
+    feedforward = np.random.default_rng(3).normal(size=(N_WORLDS, N_DRONES, 8))
+    sim.state_control(pos=(0, 0, 1), feedforward=feedforward)
+    step = to_casadi(sim)
+    compare(sim, step, anywhere(sim, step))
+    assert to_casadi(sim, [name]).p.sizes == {name: 8}
 
 
 def test_constants_are_those_of_the_selected_drone():

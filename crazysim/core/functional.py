@@ -196,6 +196,13 @@ def staged_fields(data: SimData, command: Array, feedforward: Array | None = Non
     }
 
 
+def staged_leaves(data: SimData) -> list[Any]:
+    """Return the leaves that ``stage_command`` writes, in the order of ``staged_fields``."""
+    controls = data.controls
+    level: Any = controls if controls.mode == Control.rotor_vel else getattr(controls, controls.mode.value)
+    return [getattr(level, name) for name in staged_fields(data, level, level)]
+
+
 def feedforward_of(command: Any) -> Any:
     """Return the feedforward of a setpoint that is given without one: its yaw rate and zeros. (..., 8)"""
     if isinstance(command, np.ndarray):

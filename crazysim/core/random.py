@@ -90,34 +90,42 @@ def normal(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
 
     In float32 every hash of the key gives two of them.
     """
-    bits = _words(key, shape, dtype)
-    if bits is None:
+    fractions = _fractions(key, shape, dtype)
+    if fractions is None:
         return jax.random.normal(key, shape, dtype)
-    # All odd multiples of 2^-23 between -1 and 1.
-    return math.sqrt(2) * jax.lax.erf_inv(2 * (_one_to_two(bits) - 1.5) + 2.0**-23)
+    # All odd multiples of 2^-23 between -1 and 1, of 2^-52 in float64.
+    return math.sqrt(2) * jax.lax.erf_inv(2 * fractions + (float(jnp.finfo(dtype).eps) - 1))
 
 
 def uniform(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
     """Return numbers from zero to below one, (*shape), at half the cost of ``jax.random.uniform``; see ``normal``."""
-    bits = _words(key, shape, dtype)
-    return jax.random.uniform(key, shape, dtype) if bits is None else _one_to_two(bits) - 1
+    fractions = _fractions(key, shape, dtype)
+    return jax.random.uniform(key, shape, dtype) if fractions is None else fractions
 
 
-def _words(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
-    """Return random 32-bit words, (*shape); None for keys and types for which JAX's own functions are used."""
-    if dtype != jnp.float32 or bits_generator(key.dtype) != threefry_prng_impl.name:
+def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
+    """Return random multiples of 2^-23, in float64 of 2^-52, from zero to below one, (*shape).
+
+    None for keys and types for which JAX's own functions are used. In float64 those need 64-bit integers, which
+    kernels do not have.
+    """
+    if dtype not in (jnp.float32, jnp.float64) or bits_generator(key.dtype) != threefry_prng_impl.name:
         return None
+    if dtype == jnp.float64:
+        upper, lower = jnp.moveaxis(_words(key, (*shape, 2)), -1, 0)
+        return upper.astype(dtype) * 2.0**-32 + (lower >> 12).astype(dtype) * 2.0**-52
+    # The floats from one to below two whose fractions are the upper bits of the words, less one.
+    return jax.lax.bitcast_convert_type((_words(key, shape) >> 9) | np.uint32(0x3F800000), jnp.float32) - 1
+
+
+def _words(key: Array, shape: Sequence[int]) -> Array:
+    """Return random 32-bit words, (*shape)."""
     n = math.prod(shape)
     first, second = jax.random.key_data(key)
     counters = np.arange(-(-n // 2), dtype=np.uint32)
     zeros = np.zeros_like(counters)
     pairs = threefry2x32_p.bind(first + zeros, second + zeros, zeros, counters)
     return jnp.stack(pairs, axis=-1).reshape(-1)[:n].reshape(shape)
-
-
-def _one_to_two(bits: Array) -> Array:
-    """Return the floats from one to below two whose fractions are the upper bits of some words."""
-    return jax.lax.bitcast_convert_type((bits >> 9) | np.uint32(0x3F800000), jnp.float32)
 
 
 def _key(data: SimData, name: str, *members: Array) -> Array:

@@ -23,19 +23,18 @@ class PackCache:
     """
 
     def __init__(self) -> None:
-        self._arrays: Sequence[Any] = ()
-        self._packed: Any = None
+        self._last: tuple[Sequence[Any], Array | None] = (), None  # one attribute: other threads may replace it
 
     def __call__(self, arrays: list[Any]) -> Array:
         """Return the arrays as one."""
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return _concatenated(arrays)
-        if not _same(arrays, self._arrays):
+        before, packed = self._last
+        if packed is None or not _same(arrays, before):
             with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
-                is_first = self._packed is None
-                self._packed = _joined(arrays) if is_first and _on_one_cpu(arrays) else _compiled(arrays)
-                self._arrays = arrays
-        return self._packed
+                packed = _joined(arrays) if packed is None and _on_one_cpu(arrays) else _compiled(arrays)
+            self._last = _fixed(arrays), packed
+        return packed
 
 
 def _on_one_cpu(arrays: list[Any]) -> bool:
@@ -66,24 +65,27 @@ class ZerosCache:
     """
 
     def __init__(self) -> None:
-        self._arrays: Sequence[Any] = ()
-        self._found: Zeros = ()
+        self._last: tuple[Sequence[Any], Zeros] = (), ()  # one attribute: other threads may replace it
         self._shared: dict[Any, list[int]] = {}
 
-    def __call__(self, data: SimData, leaves: list[Any]) -> Zeros:
-        """Return the elements of a simulation's data."""
-        places = self._indices(data, leaves)
+    def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:
+        """Return the elements of a simulation's data, which is also passed flattened."""
+        places = self._indices(data, leaves, treedef)
         arrays = [leaves[i] for i in places]
-        if _same(arrays, self._arrays):
-            return self._found
+        before, zeros = self._last
+        if _same(arrays, before):
+            return zeros
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return ()
-        found = {i: frozenset(np.flatnonzero(np.asarray(x) == 0).tolist()) for i, x in zip(places, arrays, strict=True)}
-        self._arrays, self._found = arrays, tuple((i, zeros) for i, zeros in found.items() if zeros)
-        return self._found
+        found = [
+            (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(places, arrays, strict=True)
+        ]
+        zeros = tuple([(i, some) for i, some in found if some])
+        self._last = _fixed(arrays), zeros
+        return zeros
 
-    def _indices(self, data: SimData, leaves: list[Any]) -> list[int]:
-        key = tuple([x.ndim for x in leaves])
+    def _indices(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
+        key = (treedef, *[x.ndim for x in leaves])
         if key not in self._shared:
             numbers = numbered(data)
             parameters = set(jax.tree.leaves((numbers.params, numbers.controls)))
@@ -94,6 +96,11 @@ class ZerosCache:
                 if scope == "shared" and (is_sparse or i in parameters) and jnp.issubdtype(x.dtype, jnp.floating)
             ]
         return self._shared[key]
+
+
+def _fixed(arrays: list[Any]) -> list[Any]:
+    """Return the arrays, without those of NumPy: their owner may write into them, so they are never the same."""
+    return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 
 def _same(some: Sequence[Any], others: Sequence[Any]) -> bool:

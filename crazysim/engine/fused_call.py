@@ -12,7 +12,6 @@ from jax import Array
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, with_leaves
 from crazysim.engine.backends import fused, kernel
-from crazysim.engine.ir.program import Zeros
 from crazysim.engine.lowering.relative import on_data, viewed
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
@@ -30,7 +29,6 @@ class FusedCall:
         stages: Sequence[Stage],
         last: Sequence[Stage],
         data: Any,
-        zeros: Zeros,
         n_steps: int,
         platform: str,
         scratch: Collection[int] = (),
@@ -43,7 +41,6 @@ class FusedCall:
             stages: Stages of a step.
             last: Stages that run once, after the steps.
             data: Data of the structure, or its shapes and types.
-            zeros: Elements of shared leaves that are known to be zero.
             n_steps: Number of steps.
             platform: Platform it runs on, ``"cpu"`` or ``"gpu"``.
             scratch: Leaves that only pass values from one stage to another.
@@ -52,7 +49,7 @@ class FusedCall:
         Raises:
             UnsupportedError: If a stage cannot be lowered.
         """
-        lowered = lower_stages(stages, data, zeros, None, first, last, scratch)
+        lowered = lower_stages(stages, data, (), None, first, last, scratch)
         self.program = program = optimise(lowered, rows)
         if program.unfused_stages:
             raise program.unfused_stages[0].error

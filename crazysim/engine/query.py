@@ -55,7 +55,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         trees.append(treedef)
         stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}"))
     prepared = data.replace(plugins={NAME: Results(rows)})
-    rollout = FusedCall((), (), stages, prepared, (), 0, platform)
+    rollout = FusedCall((), (), stages, prepared, 0, platform)
     found = jax.tree.unflatten(jax.tree.structure(prepared), rollout(jax.tree.leaves(prepared))).plugins[NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])

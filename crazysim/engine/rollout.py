@@ -79,7 +79,7 @@ def rollout(
     command = COMMANDS[data.controls.mode]
     leaves, treedef = jax.tree.flatten(data)
     plan = step.plan(data, zeros)
-    changed = sorted({*plan.written, plan.synced, _staged(plan.numbers)})
+    changed = sorted({*plan.written, plan.synced, *F.staged_leaves(plan.numbers)})
 
     def control_step(carry: list[Any]) -> list[Any]:
         data = unpack(carry)
@@ -95,13 +95,6 @@ def rollout(
 
     carry, kept = jax.lax.scan(until_record, [leaves[i] for i in changed], length=n_control_steps // every)
     return unpack(carry), kept
-
-
-def _staged(data: SimData) -> Any:
-    """Return the leaf that a command is written to."""
-    if data.controls.mode == Control.rotor_vel:
-        return data.controls.rotor_vel
-    return getattr(data.controls, data.controls.mode.value).staged_cmd
 
 
 SETTINGS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")

@@ -13,9 +13,8 @@ from jax.sharding import Mesh
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.control import Control
 from crazysim.core.data import MAX_STEPS, SimData
-from crazysim.core.functional import placed, staged_fields
+from crazysim.core.functional import placed, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, locate
 from crazysim.core.stage import Axes, as_stages, with_leaves
@@ -24,7 +23,7 @@ from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.plan import ENGINES, Plan, Planner
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.pytree import check_axes, lazy
 
 
@@ -57,14 +56,11 @@ class FlatData:
             command: Command, which nothing writes into any more. (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for that of ``stage_command``.
         """
-        controls = self.plan.numbers.controls
-        level: Any = controls if controls.mode == Control.rotor_vel else getattr(controls, controls.mode.value)
-        fields = staged_fields(self.plan.numbers, command, feedforward)
-        numbers = [getattr(level, field) for field in fields]
+        numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
         if isinstance(self.leaves, HostLeaves):
-            leaves: Any = self.leaves.replaced(numbers, fields.values())
+            leaves: Any = self.leaves.replaced(numbers, values.values())
         else:
-            leaves = with_leaves(self.leaves, numbers, [placed(like, x) for x in fields.values()])
+            leaves = with_leaves(self.leaves, numbers, [placed(like, x) for x in values.values()])
         return FlatData(leaves, self.treedef, self.plan, self.packed)
 
     def inputs(self) -> list[Any]:
@@ -136,15 +132,15 @@ class Step:
 
         Args:
             data: The simulation.
-            n_steps: Number of steps.
+            n_steps: Number of steps, an integer of at least 0, or an array of one. ()
             zeros: Result of ``zeros`` for this data before it was traced. Under a trace the values of parameters are
                 unknown, and the step computes with zeros as with any other number.
 
         Raises:
-            ConfigError: If the number of steps is larger than ``MAX_STEPS``.
+            ConfigError: If the number of steps is not an integer, negative, or larger than ``MAX_STEPS``; of a traced
+                one only the type and shape are known.
         """
-        if isinstance(n_steps, (int, np.integer)) and n_steps > MAX_STEPS:
-            raise ConfigError(f"expected at most {MAX_STEPS} steps in a call, got {n_steps}. Use several calls.")
+        _check_steps(n_steps)
         after = self.advance(self.flatten(data, zeros, n_steps), n_steps)
         return after.treedef.unflatten(after.leaves)
 
@@ -191,10 +187,11 @@ class Step:
 
     def zeros(self, data: SimData) -> Zeros:
         """Return the elements of shared parameters that are zero, for ``__call__``."""
-        return self._zeros(data, jax.tree.leaves(data))
+        return self._zeros(data, *jax.tree.flatten(data))
 
     def lower(self, data: SimData, n_steps: int | Array = 1) -> Any:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to inspect, or to compile ahead."""
+        _check_steps(n_steps)
         flat = self.flatten(data, None, n_steps)
         step = flat.plan.static if isinstance(n_steps, int) else flat.plan.dynamic
         return step.lower(flat.inputs(), n_steps)
@@ -231,7 +228,7 @@ class Step:
     def _plan(
         self, data: SimData, leaves: list[Any], treedef: Any, zeros: Zeros | None, n_steps: int | Array | None = None
     ) -> Plan:
-        zeros = self._zeros(data, leaves) if zeros is None else zeros
+        zeros = self._zeros(data, leaves, treedef) if zeros is None else zeros
         elsewhere = self._elsewhere(data.states.pos)
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, elsewhere)
         plan = self._plans.get(key)
@@ -266,3 +263,21 @@ class Step:
         if at_home:
             self._at_home = sharding
         return None if at_home else here
+
+
+def _check_steps(n_steps: object) -> None:
+    """Check a number of steps.
+
+    Raises:
+        ConfigError: If it is no integer from 0 to ``MAX_STEPS``, nor an array of one.
+    """
+    is_array = isinstance(n_steps, (jax.Array, np.ndarray, np.generic))
+    is_integer = jnp.issubdtype(n_steps.dtype, jnp.integer) if is_array else isinstance(n_steps, int)
+    if not is_integer or isinstance(n_steps, bool) or np.shape(n_steps):
+        raise ConfigError(f"expected a number of steps as one integer, got {shown(n_steps)}. Use 5, or jnp.int32(5).")
+    if isinstance(n_steps, jax.core.Tracer):
+        return
+    if int(n_steps) < 0:
+        raise ConfigError(f"expected a number of steps of at least 0, got {n_steps}. Steps cannot be taken back.")
+    if int(n_steps) > MAX_STEPS:
+        raise ConfigError(f"expected at most {MAX_STEPS} steps in a call, got {n_steps}. Use several calls.")

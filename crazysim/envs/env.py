@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from operator import is_
 from typing import Any, ClassVar
 
 import jax
@@ -211,7 +212,7 @@ class DroneEnv(Env):
                 f"{freq} Hz: some actions would never reach the controller. Use a divisor."
             )
         self._sim, self._task, self.freq = sim, task, freq
-        self._actions = actions_of(sim.airframes, sim.data.params, sim.control) if actions is None else actions
+        self._actions = actions_of(sim.airframes, sim.default_data.params, sim.control) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
         self.measured: Callable[[SimData], SimData] | None = None
         """``measured(data)``: the data with measured states, of one world, or of all worlds for a task that is batched;
@@ -239,8 +240,7 @@ class DroneEnv(Env):
         """True if the reset pipeline has functions of all worlds, or a record of another library is reset."""
         self.reset_data = self._reset_all() if self.batched_reset else self._reset_world(others)
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
-        self._plugins = tuple(sim.plugins.values())
-        self.zeros = self._step.zeros(sim.data)
+        self._plugins, self._beginning = tuple(sim.plugins.values()), _beginning(sim)
         self._default = default = compact(sim.default_data)
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, numbered(default))), strict=True)
         world_id = numbered(default).core.world_id
@@ -300,7 +300,7 @@ class DroneEnv(Env):
 
     def physics(self, data: SimData) -> SimData:
         """Return the data of all worlds after the physics of an environment step."""
-        return self._step(data, self.n_substeps, self.zeros)
+        return self._step(data, self.n_substeps)
 
     @property
     def stages(self) -> list[Stage]:
@@ -337,7 +337,8 @@ class DroneEnv(Env):
         """Return the data of all worlds before their first episode. The key is that of ``reset``. ()
 
         Raises:
-            ConfigError: If the simulation has other plugins than those with which the environment was made.
+            ConfigError: If the simulation has other plugins or default data than those with which the environment was
+                made.
         """
         now = tuple(self._sim.plugins.values())
         if [*map(id, now)] != [*map(id, self._plugins)]:
@@ -346,6 +347,11 @@ class DroneEnv(Env):
                 f"expected the plugins with which the environment was made ({known or 'none'}), got "
                 f"{', '.join(plugin.name for plugin in now) or 'none'}: an environment does not follow its simulation. "
                 f"Use make(..., effects=[...]), or a new environment."
+            )
+        if len(now := _beginning(self._sim)) != len(self._beginning) or not all(map(is_, now, self._beginning)):
+            raise ConfigError(
+                "expected the default data with which the environment was made, got others: an environment does not "
+                "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
             )
         data, mesh = spread(self._default, self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=data.core.replace(rng_key=key))
@@ -365,6 +371,12 @@ class DroneEnv(Env):
             return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
 
         return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
+
+
+def _beginning(sim: Sim) -> list[Any]:
+    """Return the arrays that episodes begin from, besides those of the scene, which change when it is compiled."""
+    data = sim.default_data
+    return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))
 
 
 def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:

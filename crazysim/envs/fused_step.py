@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import Axes, Stage
+from crazysim.core.stage import Stage
 from crazysim.core.stages import nonfinite
 from crazysim.engine.errors import LimitError
 from crazysim.engine.fused_call import FusedCall
@@ -92,10 +92,6 @@ class FusedEnvStep:
         self._kinds = self._before.kinds | self._after.kinds | {ACTION: "drone", OVER: "world"}
         self._check_kinds()
         joined = jax.eval_shape(self._joined, state, action)
-        axes = Axes(joined)
-        places = _places(state.data, joined)
-        # A parameter that has become one per drone since is not certain to be zero for all of them.
-        zeros = tuple([(places[i], some) for i, some in base.zeros if axes.scopes[places[i]] == "shared"])
         first, last = [Stage(self._act, "world", name="actions")], [Stage(self._observe, "world", name="observations")]
         if policy is not None:
             last.append(Stage(self._begin, "world", lambda one: one.plugins[NAME].of_worlds[OVER][0], name="resets"))
@@ -104,7 +100,7 @@ class FusedEnvStep:
         outputs = {self._leaf[name] for name in self._after.shapes if name.startswith(OUTPUTS)}
         rows = (lambda written: [i for i in written if i not in outputs]) if packed else None
         settings = (base.n_substeps, base.sim.device.platform, scratch, rows)
-        self._run = FusedCall(first, base.stages, last, joined, zeros, *settings)
+        self._run = FusedCall(first, base.stages, last, joined, *settings)
         again = {name for name in self._after.shapes if self._leaf[name] in outputs & set(self._run.read)} - set(ENDS)
         if packed and again:
             raise LimitError(f"a step reads {', '.join(sorted(again))} of the step before")
@@ -286,9 +282,3 @@ def _leaves_of_rest(joined: SimData) -> dict[str, int]:
     """Return the numbers of the leaves that are not data, by name."""
     rest = numbered(joined).plugins[NAME]
     return rest.of_drones | rest.of_worlds
-
-
-def _places(data: SimData, joined: SimData) -> list[int]:
-    """Return the numbers that the leaves of the data have among those of the joined data."""
-    numbers = numbered(joined)
-    return jax.tree.leaves(numbers.replace(plugins={name: numbers.plugins[name] for name in data.plugins}))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crazysim.envs.state import EnvState
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.sim.sim import Sim
 
 RENDER_MODES = ("rgb_array", "human")
@@ -17,21 +17,30 @@ RENDER_MODES = ("rgb_array", "human")
 class Renderer:
     """Renders worlds of a simulation in a given state."""
 
-    def __init__(self, sim: Sim, mode: str | None, worlds: Sequence[int] = (0,), size: tuple[int, int] = (640, 480)):
+    def __init__(
+        self, sim: Sim, mode: str | None, worlds: Sequence[int] | None = (0,), size: tuple[int, int] = (640, 480)
+    ):
         """Take the simulation and the mode.
 
         Args:
             sim: The simulation of the states.
             mode: ``"rgb_array"`` for images, ``"human"`` for the first world in a window, None for no rendering.
-            worlds: Worlds to render.
+            worlds: Worlds to render; None for all.
             size: Width and height of an image, pixels.
 
         Raises:
-            ConfigError: If there is no such mode.
+            ConfigError: If there is no such mode, or no such world.
         """
         if mode not in (None, *RENDER_MODES):
             raise ConfigError(f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}")
-        self.sim, self.mode, self.worlds, self.size = sim, mode, tuple(worlds), size
+        chosen = np.arange(sim.n_worlds) if worlds is None else np.asarray(worlds)
+        is_index = chosen.ndim == 1 and chosen.size and np.issubdtype(chosen.dtype, np.integer)
+        if not is_index or not np.all((chosen >= 0) & (chosen < sim.n_worlds)):
+            raise ConfigError(
+                f"expected render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}, got {shown(worlds)}. Use "
+                f"[0], or None for all."
+            )
+        self.sim, self.mode, self.worlds, self.size = sim, mode, chosen.tolist(), size
 
     def __call__(self, state: EnvState | None) -> list[np.ndarray]:
         """Return an image of each world, (height, width, 3), or an empty list after drawing into the window.

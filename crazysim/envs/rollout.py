@@ -8,6 +8,7 @@ from typing import Any
 import jax
 from jax import Array
 
+from crazysim.core.settings import positive
 from crazysim.envs.env import Env
 from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.state import EnvState, bare
@@ -35,12 +36,16 @@ def rollout(
         act: ``act(state, key)``: actions of all drones, (n_worlds, n_drones, k). The state has data, observations and
             memory, but no reward and info.
         key: Random key; each step receives one of its own.
-        n_steps: Number of steps.
+        n_steps: Number of steps, a positive integer.
         keep: ``keep(state)``: the part of the state after each step to return; rewards and ends by default.
 
     Returns:
         The state, without reward and info, and what was kept, with time in front. (n_steps, ...)
+
+    Raises:
+        ConfigError: If the number of steps is not a positive integer.
     """
+    n_steps = positive("n_steps", n_steps)
     start = bare(state)
     keys = jax.random.split(key, n_steps)
     fused = env.fused_step(start, start.action, packed=True) if isinstance(env, AutoReset) else None

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.cache import announced
-from crazysim.core.settings import as_mask, member
+from crazysim.core.settings import as_mask, member, positive
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
@@ -37,7 +37,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         env: Env,
         autoreset_mode: GymnasiumMode | str = GymnasiumMode.NEXT_STEP,
         render_mode: str | None = None,
-        render_worlds: Sequence[int] = (0,),
+        render_worlds: Sequence[int] | None = None,
         render_size: tuple[int, int] = (640, 480),
         numpy: bool = False,
     ):
@@ -46,14 +46,14 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             env: The environment.
             autoreset_mode: Mode of automatic resets.
-            render_mode: Mode of ``render``: ``"rgb_array"`` returns images, ``"human"`` draws the first world into a
-                window.
-            render_worlds: Worlds to render.
+            render_mode: Mode of ``render``: ``"rgb_array"`` returns images, ``"human"`` draws the first of the worlds
+                into a window.
+            render_worlds: Worlds to render; None for all, as Gymnasium's wrapper ``RecordVideo`` needs.
             render_size: Width and height of an image, pixels.
             numpy: True to return NumPy arrays, copies that may be written to.
 
         Raises:
-            ConfigError: If there is no such mode, or the environment resets automatically.
+            ConfigError: If there is no such mode or world, or the environment resets automatically.
         """
         if isinstance(env, AutoReset):
             raise ConfigError(
@@ -89,7 +89,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Without a seed the random numbers continue those before; the first ones come from the system.
 
         Raises:
-            ConfigError: If the seed is not an integer, or an option does not exist.
+            ConfigError: If the seed is not an integer, an option does not exist, or there is a mask before the first
+                reset of all worlds.
         """
         options = dict(options or {})
         mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
@@ -99,18 +100,21 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise ConfigError(
                 f"expected one integer as seed of all worlds, each of which draws its own numbers, got {seed!r}"
             )
+        before = self.state
+        if mask is not None and seed is not None:
+            raise ConfigError("expected a seed or a reset_mask, got both. A seed is that of all worlds.")
+        if mask is not None and before is None:
+            raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
         super().reset(seed=None if seed is None else int(seed))
-        before = self.state if mask is not None else None
-        if before is not None:
-            if seed is not None:
-                raise ConfigError("expected a seed or a reset_mask, got both. A seed is that of all worlds.")
+        if mask is not None:
             state = self._again(before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             with announced("compiling the environment", "2 to 4 s"):
                 state = self._begin(jax.random.key(int(number)))
         self._stepper.state, self._outputs = state, self._output(state)
-        return self._handed((self._outputs[0], self._outputs[2]))
+        obs, _, info = self._outputs
+        return self._handed((obs, self._with_final_info(info)))
 
     @property
     def state(self) -> EnvState | None:
@@ -146,7 +150,15 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         obs, reward, info = self._outputs
         if self.render_mode == "human":
             self.render()
-        return self._handed((obs, reward, terminated, truncated, info))
+        return self._handed((obs, reward, terminated, truncated, self._with_final_info(info)))
+
+    def _with_final_info(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Return the info with that of episodes that are over beside their last observation, as Gymnasium has it."""
+        over = info.get("_final_obs")
+        if over is None:
+            return info
+        final = {k: v for k, v in info.items() if not k.endswith("final_obs")}
+        return info | {"final_info": final | {f"_{k}": over for k in final}, "_final_info": over}
 
     def _handed(self, results: Any) -> Any:
         """Return results as the caller gets them."""
@@ -172,7 +184,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return gymnasium.spaces.Box(-limit, limit, shape, x.dtype)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Render the chosen worlds: return an image (height, width, 3) of each, or draw into a window.
+        """Render all worlds, or those that were chosen: return an image (height, width, 3) of each, or draw the first.
 
         Raises:
             ConfigError: If the environment was made without ``render_mode``, or was not reset.
@@ -198,6 +210,8 @@ def make_vector(
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
     numpy: bool = False,
+    render_worlds: Sequence[int] | None = None,
+    render_size: tuple[int, int] = (640, 480),
     **options: Any,
 ) -> DroneVectorEnv:
     """Return a vector environment of a task, for ``gymnasium.make_vec``.
@@ -209,9 +223,11 @@ def make_vector(
         render_mode: Mode of ``render``.
         max_episode_steps: Length of an episode, steps; None for that of the task.
         numpy: True to return NumPy arrays, copies that may be written to.
+        render_worlds: Worlds to render; None for all.
+        render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.
     """
     if max_episode_steps is not None:
-        options["seconds"] = max_episode_steps / options.get("freq", 50)
+        options["seconds"] = positive("max_episode_steps", max_episode_steps) / options.get("freq", 50)
     env: DroneEnv = make(task, num_envs, **options)
-    return DroneVectorEnv(env, autoreset_mode, render_mode, numpy=numpy)
+    return DroneVectorEnv(env, autoreset_mode, render_mode, render_worlds, render_size, numpy)

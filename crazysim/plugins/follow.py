@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimData
+from crazysim.core.functional import stage_command
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
@@ -125,11 +126,8 @@ class Follow(Plugin):
 
     def stage_setpoint(self, data: SimData) -> SimData:
         """Stage the setpoint of one drone."""
-        state, s = data.controls.state, self.setpoint(data)
-        state = state.replace(staged_cmd=s.command())
-        if state.staged_feedforward is not None:
-            state = state.replace(staged_feedforward=s.feedforward())
-        return data.replace(controls=data.controls.replace(state=state))
+        s = self.setpoint(data)
+        return stage_command(data, s.command(), s.feedforward())
 
     def setpoint(self, data: SimData) -> Setpoint:
         """Return the setpoint of one drone now."""

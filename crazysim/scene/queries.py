@@ -45,8 +45,7 @@ class SceneQueries:
         self._reported: set[str] = set()
         self._platform = None if platform is None or fused.missing(platform) else platform
         scene.ray_kernels = RayKernels(self._platform, strict)
-        self._model: mujoco.MjModel | None = None
-        self._compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
+        self._compiled: tuple[mujoco.MjModel | None, dict[tuple[Any, ...], Callable[..., Any]]] = None, {}
 
     def contact_report(self, data: SimData, objects: ObjectSelection, floor: bool, drones: bool) -> ContactReport:
         """Return the contacts of every drone; see ``Sim.contact_report``."""
@@ -70,17 +69,18 @@ class SceneQueries:
         self, name: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
     ) -> Any:
         """Return the result of a query about poses, which is compiled once for its settings."""
-        if self._model is not self._scene.mj_model:
-            self._model, self._compiled = self._scene.mj_model, {}
-        first = (name, *settings) not in self._compiled
+        of_scene, compiled = self._compiled
+        if of_scene is not self._scene.mj_model:
+            _, compiled = self._compiled = self._scene.mj_model, {}
+        first = (name, *settings) not in compiled
         if first:
-            self._compiled[name, *settings] = jax.jit(_of_poses(build(), data))
+            compiled[name, *settings] = jax.jit(_of_poses(build(), data))
         states, objects = data.states, data.objects
         # Only what the query needs: a compiled call costs by the number of its arrays.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
         with keep_programs(when=first):
-            return self._compiled[name, *settings](*poses, mocap)
+            return compiled[name, *settings](*poses, mocap)
 
     def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""

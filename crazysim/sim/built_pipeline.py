@@ -23,8 +23,8 @@ class BuiltPipeline(Generic[F]):
             build: Returns the function that runs a pipeline.
         """
         self._name, self._stages, self._build = name, stages, build
-        self._fn: F = build(stages)
-        self._built: Sequence[Callable[..., Any]] = list(stages.values())
+        self._built: tuple[Sequence[Callable[..., Any]], F]
+        self.build()
 
     @property
     def stages(self) -> Pipeline:
@@ -41,11 +41,13 @@ class BuiltPipeline(Generic[F]):
 
     def fn(self) -> F:
         """Return the function of the pipeline as it is now. It is called in every step: 0.3 us without an edit."""
-        unedited = len(self._stages) == len(self._built) and all(map(is_, self._stages.values(), self._built))
-        return self._fn if unedited else self.build()
+        built, fn = self._built
+        unedited = len(self._stages) == len(built) and all(map(is_, self._stages.values(), built))
+        return fn if unedited else self.build()
 
     def build(self) -> F:
         """Return a new function of the pipeline as it is now, and keep it."""
-        self._fn = self._build(self._stages)
-        self._built = list(self._stages.values())
-        return self._fn
+        stages = dict(self._stages)
+        fn = self._build(stages)
+        self._built = list(stages.values()), fn
+        return fn

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState
+from crazysim.core.functional import stage_command
 from crazysim.core.settings import positive
 from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
@@ -273,13 +274,7 @@ class MPPI:
 
     def _command_stage(self, data: SimData) -> SimData:
         """Stage the command of the plan at this time."""
-        command = self._planned(data, data.core.steps)
-        controls = data.controls
-        if controls.mode == Control.rotor_vel:
-            return data.replace(controls=controls.replace(rotor_vel=command))
-        level = controls.mode.value
-        staged = getattr(controls, level).replace(staged_cmd=command)
-        return data.replace(controls=controls.replace(**{level: staged}))
+        return stage_command(data, self._planned(data, data.core.steps))
 
     def _cost_stage(self, data: SimData) -> SimData:
         """Add the cost of the control step that ends; the clock has moved on."""

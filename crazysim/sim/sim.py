@@ -285,7 +285,7 @@ class Sim:
     @default_data.setter
     def default_data(self, data: SimData) -> None:
         self.configuration.check(data, self._default_data)
-        self._default_data = data
+        self._default_data = self._stepper.to_device(data)
 
     def _adopt_scene(self) -> None:
         """Give the data the objects and mocap ids of an edited scene; the scene itself is not compiled."""
@@ -462,20 +462,24 @@ class Sim:
         self._resets.stages = pipeline
 
     @property
+    @locked
     def step_fn(self) -> Step:
         """The step of the pipeline as it is now, ``step(data, n_steps=1) -> data``, pure."""
         self.plugins.check()
         return self._steps.fn()
 
     @property
+    @locked
     def reset_fn(self) -> Reset:
         """The reset of the pipeline as it is now, ``reset(data, default_data, mask=None) -> data``, pure."""
         return self._resets.fn()
 
+    @locked
     def build_step_fn(self) -> Step:
         """Return a new step of the pipeline as it is now, and use it; ``step(data, n_steps=1) -> data``, pure."""
         return self._steps.build()
 
+    @locked
     def build_reset_fn(self) -> Reset:
         """Return a new reset of the pipeline as it is now, and use it; ``reset(data, default_data, mask=None)``."""
         return self._resets.build()

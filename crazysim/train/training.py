@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -152,7 +153,7 @@ def train(
         log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
 
     def record(learner: Learner, interrupted: bool = False) -> dict[str, Any]:
-        """Evaluate the policy, keep it if none was better, write policy, curve and checkpoint, and return the point."""
+        """Evaluate the policy, keep it if none was clearly better, write all files, and return the point."""
         nonlocal kept
         iteration, policy = int(learner.iteration), learner.as_policy()
         require_finite(finite, iteration)
@@ -161,7 +162,8 @@ def train(
         seconds = seconds_before + time.perf_counter() - started
         point = {"round": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
         point |= {"compile_seconds": compile_s, "check": check}
-        point["kept"] = not curve or check >= kept_point(curve)["check"]
+        best_check = max((earlier["check"] for earlier in curve if earlier["kept"]), default=0.0)
+        point["kept"] = check >= least_tied(best_check, evaluation_worlds)
         best = policy if point["kept"] else kept
         checkpoint.save(folder / POLICY, best, meta | description)
         with replacing(folder / CURVE) as file:
@@ -201,7 +203,10 @@ def train(
     last = record(learner)
     best = kept_point(curve)
     if best is not last:
-        log(f"kept the policy of iteration {best['round']}, which did best on {evaluation_worlds:,} other starts")
+        log(
+            f"kept the policy of iteration {best['round']}: later ones succeeded less often on {evaluation_worlds:,} "
+            f"other starts, by more than two standard errors"
+        )
     point = best | {name: last[name] for name in ("env_steps", "seconds", "compile_seconds")}
     log(
         f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
@@ -210,6 +215,21 @@ def train(
         f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
     )
     return TrainResult(folder, point, kept, eval_env)
+
+
+def least_tied(success: float, n_worlds: int) -> float:
+    """Return the success rate from which on a later policy is kept: two standard errors below the best.
+
+    The standard error is that of the rate after two more successes and two more failures (Agresti and Coull 1998,
+    "Approximate is better than exact"), which is not zero where all have succeeded.
+
+    Args:
+        success: Best success rate so far.
+        n_worlds: Number of starts that it was measured at.
+    """
+    n = n_worlds + 4
+    rate = (success * n_worlds + 2) / n
+    return success - 2 * math.sqrt(rate * (1 - rate) / n)
 
 
 def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:

@@ -54,6 +54,20 @@ def test_both_words_of_a_hash_give_independent_standard_numbers(data):
         assert abs(np.mean(a * b)) < 4 / np.sqrt(a.size)
 
 
+def test_numbers_in_float64_have_52_bits_and_a_kernel(x64):
+    """Moments of 400,000 of them; and no 64-bit integers, which kernels do not have."""
+    key = jax.random.key(3)
+    share, drawn = (np.asarray(draw(key, (400_000,), jnp.float64)) for draw in (uniform, normal))
+    assert share.dtype == drawn.dtype == np.float64
+    np.testing.assert_array_equal(share * 2**52 % 1, 0)
+    assert np.mean(share * 2**51 % 1 != 0) > 0.49, "the last bit is drawn"
+    assert 0 <= share.min() < 1e-5 < 1 - 1e-5 < share.max() < 1
+    for x, moments in ((share, (1 / 2, 1 / 3, 1 / 4)), (drawn, (0, 1, 0))):
+        np.testing.assert_allclose([np.mean(x**k) for k in (1, 2, 3)], moments, atol=0.02)
+    jaxpr = str(jax.make_jaxpr(lambda key: normal(key, (3,), jnp.float64))(key))
+    assert "u64" not in jaxpr
+
+
 def test_numbers_of_other_types_and_generators_are_those_of_jax():
     for key in (jax.random.key(1, impl="rbg"), jax.random.key(1)):
         dtype = jnp.float32 if key.dtype != jax.random.key(0).dtype else jnp.float16

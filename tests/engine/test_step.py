@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, by_stages, shared_sim, with_params, with_states
+from cases import FAST, by_stages, hover_command, send, shared_sim, to_all, with_params, with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.control import Control, command_size
@@ -144,6 +144,34 @@ def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes(engine):
     np.testing.assert_allclose(pitch_rate(step(coupled, jnp.int32(1))), 0.002 * 1e4 * 1e-5, rtol=1e-5)
     inside = jax.jit(lambda d: step(d, jnp.int32(1)))(coupled)
     np.testing.assert_allclose(pitch_rate(inside), 0.002 * 1e4 * 1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("engine", FAST)
+def test_a_parameter_that_a_stage_writes_is_not_taken_for_zero(engine):
+    """Gravity that turns in every step: its component along x is zero only where a call begins."""
+    sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
+
+    def turn(data):
+        return data.replace(params=data.params.replace(gravity_vec=data.params.gravity_vec.at[0].add(0.1)))
+
+    data = with_states(sim.data, pos=[0.0, 0.0, 9.0])
+    step = Step({"turn": turn, **sim.step_pipeline}, engine)
+    after = step(data, jnp.int32(5))
+    assert step.engines == [engine]
+    np.testing.assert_allclose(after.params.gravity_vec[0], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(after.states.vel[..., 0], 0.002 * (0.1 + 0.2 + 0.3 + 0.4 + 0.5), rtol=0.01)
+
+
+def test_arrays_of_numpy_are_read_again_in_every_call():
+    """Law 11: whoever holds them may write into them."""
+    sim = shared_sim(n_worlds=1, n_drones=1, control="rotor_vel")
+    gravity = np.zeros(3, np.float32)
+    data = with_states(sim.data, pos=[0.0, 0.0, 9.0])
+    data = data.replace(params=data.params.replace(gravity_vec=gravity))
+    step = Step(sim.step_pipeline, "auto")
+    assert np.all(step(data, jnp.int32(5)).states.vel == 0)
+    gravity[0] = 3.0
+    np.testing.assert_allclose(step(data, jnp.int32(5)).states.vel[..., 0], 0.03, rtol=0.01)
 
 
 def pitch_rate(data):
@@ -465,6 +493,28 @@ def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():
     data = sim.data.replace(controls=sim.data.controls.replace(attitude=attitude))
     after, _ = rollout(sim.step_fn, data, hold, jnp.float32(0.3), 1, 5)
     np.testing.assert_array_equal(after.controls.attitude.staged_cmd, hold(jnp.float32(0.3), data))
+
+
+@pytest.mark.parametrize("control", ["state", "rotor_vel"])
+def test_a_rollout_stages_what_the_setter_stages(control):
+    """Above all no jerk, snap and yaw rate of a command before."""
+    sim = shared_sim(n_worlds=2, n_drones=1, control=control)
+    before = send(sim.data, to_all(sim.data, hover_command(sim.data)))
+    if control == "state":
+        feedforward = np.random.default_rng(0).normal(size=(2, 1, 8))
+        before = F.state_control(before, pos=(0, 0, 1), feedforward=feedforward)
+    command = to_all(before, hover_command(before, (0.2, 0, 1))).copy()
+    command[..., -1] += 0.5  # for a setpoint, its yaw rate
+    command, n = jnp.asarray(command, jnp.float32), sim.freq // sim.control_freq
+    expected = before
+    for _ in range(2):
+        expected = sim.step_fn(send(expected, command), jnp.int32(n))
+    sim.data = before
+    sim.rollout(lambda command, _: command, command, 2)
+    found, sim.data = sim.data, sim.default_data
+    for x, y in zip(jax.tree.leaves(found.controls), jax.tree.leaves(expected.controls), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found.states.pos, expected.states.pos, rtol=1e-5)
 
 
 def test_a_rollout_has_a_gradient():

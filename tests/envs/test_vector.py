@@ -1,6 +1,8 @@
 """Tasks as Gymnasium's vector environments: modes of resets, seeds, wrong input, pictures, NumPy users."""
 
 import itertools
+import sys
+import types
 
 import gymnasium
 import jax
@@ -98,6 +100,12 @@ def test_same_step_tells_the_last_observation(envs):
     np.testing.assert_array_equal(reward, disabled[-1][1])
     assert not np.allclose(obs["pos"], info["final_obs"]["pos"])
     assert not results[N_STEPS][4]["_final_obs"].any()
+    final = info["final_info"]
+    np.testing.assert_array_equal(info["_final_info"], np.ones(3, bool))
+    assert trees_equal({k: x for k, x in final.items() if k[0] != "_"}, disabled[-1][4])
+    assert all(np.all(x) for k, x in final.items() if k[0] == "_")
+    assert not any(np.any(x) for k, x in results[N_STEPS][4]["final_info"].items() if k[0] == "_")
+    assert "final_info" not in disabled[-1][4]
 
 
 def test_disabled_resets_those_of_a_mask(envs):
@@ -192,6 +200,8 @@ def test_wrong_resets(next_step, kwargs, error, message):
     [
         ({"render_mode": "ascii"}, "expected render_mode None, rgb_array or human, got 'ascii'"),
         ({"autoreset_mode": "sometimes"}, "autoreset_mode is 'sometimes'; it must be one of 'NextStep'"),
+        ({"render_worlds": [2]}, r"expected render_worlds as a list of worlds from 0 to 1, got \[2\]"),
+        ({"render_worlds": 0}, "expected render_worlds as a list of worlds from 0 to 1, got 0"),
         ({"color": "red"}, "task 'hover' has no option 'color'"),
         ({"n_world": 2}, "did you mean n_worlds"),
         ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
@@ -209,6 +219,8 @@ def test_a_task_that_does_not_exist():
 
 def test_what_comes_before_a_reset_is_refused():
     env = make_vector("hover", 1)
+    with pytest.raises(ConfigError, match=r"expected a reset of all worlds before the first reset_mask, got none"):
+        env.reset(options={"reset_mask": [False]})
     with pytest.raises(ConfigError, match="reset"):
         env.step(np.zeros((1, 4)))
     with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
@@ -223,12 +235,13 @@ def test_pictures_show_the_drone_as_it_is():
     assert env.metadata["render_fps"] == 50
     assert env.unwrapped.env.max_steps == 7
     env.reset(seed=0)
-    (picture,) = env.render()
+    picture, *others = env.render()
+    assert len(others) == 2, "an image of each world"
     assert (picture.shape, picture.dtype) == ((480, 640, 3), np.uint8)
     assert picture.std() > 5
     for _ in range(6):
         env.step(np.ones(env.action_space.shape))
-    (later,) = env.render()
+    later = env.render()[0]
     assert (later != picture).any(), "the drone has moved"
     env.close()
     wide = DroneVectorEnv(env.unwrapped.env.env, render_mode="rgb_array", render_worlds=(2, 0), render_size=(64, 48))
@@ -237,6 +250,40 @@ def test_pictures_show_the_drone_as_it_is():
     assert [p.shape for p in pictures] == [(48, 64, 3)] * 2
     assert (pictures[0] != pictures[1]).any()
     wide.close()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_gymnasiums_recorder_films_every_world_or_the_env_renders_a_chosen_one(tmp_path, monkeypatch):
+    """It writes films with MoviePy, in whose place the test takes the frames."""
+    films = []
+
+    class Clip:
+        def __init__(self, frames, fps):
+            films.append((np.stack(frames), fps))
+
+        def write_videofile(self, path, logger):
+            pass
+
+    names = ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip")
+    for name in names:
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    sys.modules[names[-1]].ImageSequenceClip = Clip
+    env = gymnasium.make_vec(
+        ID, num_envs=4, render_mode="rgb_array", render_size=(64, 48), max_episode_steps=3, numpy=True
+    )
+    film = gymnasium.wrappers.vector.RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda k: k == 0)
+    film.reset(seed=0)
+    for _ in range(4):
+        film.step(zeros(film))
+    film.close()
+    ((frames, fps),) = films
+    assert (frames.shape, fps) == ((4, 2 * 48, 2 * 64, 3), 50)
+    assert len(np.unique(frames.reshape(4, 2, 48, 2, 64, 3)[0].swapaxes(1, 2).reshape(4, -1), axis=0)) == 4
+    env = gymnasium.make_vec(ID, num_envs=4, render_mode="rgb_array", render_worlds=[3], render_size=(64, 48))
+    env.reset(seed=0)
+    (picture,) = env.render()
+    assert picture.shape == (48, 64, 3)
+    env.close()
 
 
 def test_numpy_users_go_through_gymnasiums_wrappers(envs):

@@ -9,8 +9,9 @@ from crazysim import ConfigError, Sim
 from crazysim.core.data import MAX_STEPS
 from crazysim.engine import ENGINES
 from crazysim.engine.backends import fused
-from crazysim.envs import AutoReset, DroneEnv
+from crazysim.envs import AutoReset, DroneEnv, rollout
 from crazysim.envs.tasks.hover import Hover
+from crazysim.envs.vector import make_vector
 
 
 def counted(data, steps):
@@ -73,3 +74,38 @@ def test_a_call_of_more_steps_than_can_be_counted_is_refused(sim):
     for n_steps in (2**31, np.int64(2**31)):
         with pytest.raises(ConfigError, match="at most 2147483647 steps in a call, got 2147483648"):
             sim.step_fn(sim.data, n_steps)
+
+
+NO_COUNTS = (2.5, 2.0, True, np.bool_(True), np.float32(2), jnp.float32(2), "2", None, [2], np.array([2]))
+
+
+def test_law_09_a_number_of_steps_is_one_integer_of_at_least_zero(sim):
+    for call in (sim.step_fn, sim.step_fn.lower):
+        for n_steps in NO_COUNTS:
+            with pytest.raises(ConfigError, match="expected a number of steps as one integer, got"):
+                call(sim.data, n_steps)
+        for n_steps in (-5, np.int64(-5), jnp.int32(-5)):
+            with pytest.raises(ConfigError, match="expected a number of steps of at least 0, got -5"):
+                call(sim.data, n_steps)
+
+
+def test_any_integer_counts_steps_and_a_traced_one_is_checked_for_its_type(sim):
+    data = counted(sim.data, [0, 0])
+    for n_steps in (0, 3, np.int64(3), np.array(3), jnp.int32(3)):
+        assert sim.step_fn(data, n_steps).core.steps[0, 0] == int(n_steps)
+    traced = jax.jit(sim.step_fn)
+    assert traced(data, 3).core.steps[0, 0] == 3
+    with pytest.raises(ConfigError, match="expected a number of steps as one integer, got"):
+        traced(data, 3.0)
+
+
+def test_law_09_lengths_of_episodes_and_rollouts_are_positive_integers(sim):
+    task = Hover()
+    task.install(sim)
+    env = AutoReset(DroneEnv(sim, task))
+    state = env.reset(jax.random.key(0))
+    for n_steps in (0, -1, 2.0, True):
+        with pytest.raises(ConfigError, match=f"n_steps is {n_steps}; it must be a positive whole number"):
+            rollout(env, state, lambda state, key: state.action, jax.random.key(0), n_steps)
+        with pytest.raises(ConfigError, match=f"max_episode_steps is {n_steps}; it must be a positive whole number"):
+            make_vector("hover", max_episode_steps=n_steps)

@@ -1,23 +1,29 @@
 """One simulation in several threads: no step and no command is lost."""
 
+import os
 import threading
+import time
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import with_params, with_states
 
 from crazysim import Sim
+from crazysim.engine import Step
+from crazysim.sim.built_pipeline import BuiltPipeline
 
 N_CALLS = 200
 
 
-def run_together(*calls):
-    """Run functions in threads of their own, which begin at once."""
+def run_together(*calls, n_calls=N_CALLS):
+    """Run functions in threads of their own, which begin at once, with the numbers of their calls."""
     start, errors = threading.Barrier(len(calls)), []
 
     def run(call):
         start.wait()
         try:
-            for k in range(N_CALLS):
+            for k in range(n_calls):
                 call(k)
         except Exception as error:
             errors.append(error)
@@ -68,3 +74,60 @@ def test_steps_are_taken_while_others_command_read_and_sync(sim):
     np.testing.assert_array_equal(data.controls.attitude.staged_cmd, N_CALLS - 1)
     np.testing.assert_allclose(data.states.force[:, :, 2], [[0, 0.001 * (N_CALLS - 1)]] * 2)
     assert np.all(np.isfinite(sim.mj_data.mocap_pos))
+
+
+def taking_turns(frame, event, arg):
+    """Let other threads run between any two lines of the engine: a trace function of threads."""
+    if os.path.join("crazysim", "engine") not in frame.f_code.co_filename:
+        return None
+    time.sleep(1e-6)
+    return taking_turns
+
+
+@pytest.fixture
+def turns():
+    threading.settrace(taking_turns)
+    yield
+    threading.settrace(None)
+
+
+def test_a_pure_step_computes_with_the_parameters_of_its_own_thread(sim, turns):
+    """Packed numbers and zeros of parameters are kept from call to call: those of other threads are others."""
+    flying = with_states(sim.data, pos=[0.0, 0.0, 5.0], rotor_vel=15e3, ang_vel=[1.0, 2.0, 3.0])
+    lopsided = np.array(flying.params.J_inv)
+    lopsided[0, 1] = lopsided[1, 0] = 1e4
+    each = [flying, with_params(flying, mass=2 * flying.params.mass), with_params(flying, J_inv=lopsided)]
+    step, n_steps = Step(sim.step_pipeline), jnp.int32(1)
+
+    def speeds(data):
+        states = step(data, n_steps).states
+        return np.concatenate([states.vel, states.ang_vel])
+
+    expected = [speeds(data) for data in each]
+
+    def fly(which):
+        return lambda _: np.testing.assert_array_equal(speeds(each[which]), expected[which])
+
+    run_together(fly(0), fly(1), fly(2), n_calls=40)
+
+
+def test_a_pipeline_that_is_edited_while_it_is_built_is_built_again():
+    """The function of the stages before, which another thread was building, does not take the place of theirs."""
+    building, edited = threading.Event(), threading.Event()
+
+    def build(stages):
+        if "slow" in stages:
+            building.set()
+            edited.wait(10)
+        return list(stages)
+
+    def edit(_):
+        building.wait(10)
+        built.stages = {"quick": run_together}
+        built.fn()
+        edited.set()
+
+    built = BuiltPipeline("step_pipeline", {}, build)
+    built.stages = {"slow": edit}
+    run_together(lambda _: built.fn(), edit, n_calls=1)
+    assert built.fn() == ["quick"]

@@ -105,6 +105,14 @@ def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     assert [p["round"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
 
 
+def test_a_later_policy_within_two_standard_errors_is_kept():
+    """Of 1,000 starts 1.26% at 80%, by hand; 100% is not certain either."""
+    assert runs.least_tied(0.80, 1000) == pytest.approx(0.80 - 2 * 0.01262, abs=1e-4)
+    assert runs.least_tied(0.80, 1000) < 0.797
+    assert 0.996 < runs.least_tied(1.0, 1000) < 0.999
+    assert runs.least_tied(0.0, 1000) < 0.0
+
+
 def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch):
     """A learning rate that ruins the policy leaves a better one. An interrupt writes the best until then, but does not
     change what an uninterrupted run keeps, which evaluates less often."""
@@ -116,14 +124,15 @@ def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch
     result = train(config, tmp_path, evaluation_worlds=64, log=lines.append, progress=False)
     curve = read_curve(tmp_path)
     checks = [point["check"] for point in curve]
-    assert max(checks) > checks[-1]
-    best = max(i for i, check in enumerate(checks) if check == max(checks))
+    least = runs.least_tied(max(checks), 64)
+    best = max(i for i, check in enumerate(checks) if check >= least)
+    assert best < len(checks) - 1
     assert [i for i, point in enumerate(curve) if point["kept"]][-1] == best
-    assert f"kept the policy of iteration {best}, which did best on 64 other starts" in lines
+    assert any(f"kept the policy of iteration {best}: later ones succeeded less often on 64 " in x for x in lines)
     assert result.metrics["success"] == curve[best]["success"]
     assert result.metrics["env_steps"] == curve[-1]["env_steps"]
     for policy in (result.policy, load_policy(tmp_path)[0]):
-        assert evaluate(result.env, policy, jax.random.key(runs.CHECK))["success"] == max(checks)
+        assert evaluate(result.env, policy, jax.random.key(runs.CHECK))["success"] == checks[best]
         assert evaluate(result.env, policy)["success"] == result.metrics["success"]
     assert 0 < best < 8
     monkeypatch.setitem(configs.RECIPES, "hover", configs.Recipe(evaluate_every=8))
@@ -131,7 +140,7 @@ def test_the_policy_that_did_best_on_the_check_set_is_kept(tmp_path, monkeypatch
     train(config, whole, evaluation_worlds=64, log=quiet, progress=False)
     with interrupted_after(best, monkeypatch), pytest.raises(KeyboardInterrupt):
         train(config, cut, evaluation_worlds=64, log=quiet, progress=False)
-    assert evaluate(result.env, load_policy(cut)[0], jax.random.key(runs.CHECK))["success"] == max(checks)
+    assert evaluate(result.env, load_policy(cut)[0], jax.random.key(runs.CHECK))["success"] == checks[best]
     train(config, cut, resume=True, evaluation_worlds=64, log=quiet, progress=False)
     mine, others = arrays(cut), arrays(whole)
     for name, x in mine.items():

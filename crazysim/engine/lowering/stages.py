@@ -42,7 +42,8 @@ def lower_stages(
     Args:
         stages: Stages of a step, in order.
         data: Data of the simulation, or its shapes and types.
-        zeros: Leaves with the elements that are known to be zero: their terms are left out.
+        zeros: Leaves with the elements that are known to be zero: their terms are left out, unless a stage writes the
+            leaf.
         watched: Picks the leaves that are checked for NaN and infinity after the last step; called with a tree of the
             structure of the data.
         first: Stages that run once, before the first step.
@@ -66,6 +67,10 @@ def lower_stages(
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
     ])  # fmt: skip
     program = Program(described, n_drones, tuple(segments), None, frozenset(scratch), (), population, axes.views)
+    changed = known.keys() & set(program.written)
+    if changed:  # an element is only known to be zero while no stage writes it
+        zeros = tuple([(i, some) for i, some in zeros if i not in changed])
+        return lower_stages(stages, data, zeros, watched, first, last, scratch, population, tracer)
     if watched is None:
         return program
     own = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}

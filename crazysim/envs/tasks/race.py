@@ -232,13 +232,15 @@ class Race(Task):
 
 def _one_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
     """Give every drone parameters of its own, by name and number of dimensions."""
-    params, shape = sim.data.params, sim.data.states.pos.shape[:2]
-    each = {}
-    for name, ndim in names.items():  # they may be one per drone already
-        value = getattr(params, name)
-        each[name] = on_device(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
-    sim.data = sim.data.replace(params=params.replace(**each))
-    sim.build_default_data()
+
+    def spread(data: SimData) -> SimData:
+        params, shape, each = data.params, data.states.pos.shape[:2], {}
+        for name, ndim in names.items():  # they may be one per drone already
+            value = getattr(params, name)
+            each[name] = on_device(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
+        return data.replace(params=params.replace(**each))
+
+    sim.data, sim.default_data = spread(sim.data), spread(sim.default_data)
 
 
 def _drawn(params: SimParams, shares: Array) -> SimParams:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.random import world_key
+from crazysim.core.random import normal, world_key
 from crazysim.core.settings import positive
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs
@@ -75,7 +75,7 @@ class ObservationNoise(Wrapper):
 
 
 def _normal(key: Array, number: int, like: Array) -> Array:
-    return jax.random.normal(jax.random.fold_in(key, number), like.shape[1:], like.dtype)
+    return normal(jax.random.fold_in(key, number), like.shape[1:], like.dtype)
 
 
 class Normalize(Wrapper):

@@ -11,7 +11,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.control import Control
-from crazysim.core.data import SimData, controls_of
+from crazysim.core.data import SimData
+from crazysim.core.functional import stage_command, staged_leaves
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, as_stages, stage
@@ -107,22 +108,10 @@ def _controller(sim: Simulation) -> str:
 
 def _sent(data: SimData) -> Array:
     """Return the staged command of the simulation's own level, with the feedforward of a setpoint. (..., k)"""
-    controls = controls_of(data)
-    if controls.mode == Control.rotor_vel:
-        return controls.rotor_vel
-    level = getattr(controls, controls.mode)
-    feedforward = getattr(level, "staged_feedforward", None)
-    return level.staged_cmd if feedforward is None else jnp.concatenate([level.staged_cmd, feedforward], axis=-1)
+    return jnp.concatenate(staged_leaves(data), axis=-1)
 
 
 def _send(data: SimData, command: Array) -> SimData:
     """Return the data with another command of the simulation's own level."""
-    controls = controls_of(data)
-    if controls.mode == Control.rotor_vel:
-        return data.replace(controls=controls.replace(rotor_vel=command))
-    level = getattr(controls, controls.mode)
-    n = level.staged_cmd.shape[-1]
-    changes = {"staged_cmd": command[..., :n]}
-    if command.shape[-1] > n:
-        changes["staged_feedforward"] = command[..., n:]
-    return data.replace(controls=controls.replace(**{controls.mode.value: level.replace(**changes)}))
+    n = staged_leaves(data)[0].shape[-1]
+    return stage_command(data, command[..., :n], command[..., n:])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
-from crazysim.core.random import world_key
+from crazysim.core.random import uniform, world_key
 from crazysim.core.stage import Stage, at_the_start
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, Grid, interpolate
@@ -104,8 +104,8 @@ class WindField(Plugin):
     def displace(self, data: SimData) -> SimData:
         """Draw the displacement of the grid for an episode; of one drone."""
         record = self.read(data)
-        uniform = jax.random.uniform(world_key(data, self.name), (3,), record.shift.dtype, -1.0, 1.0)
-        return self.write(data, record.replace(shift=record.spread * uniform))
+        drawn = 2 * uniform(world_key(data, self.name), (3,), record.shift.dtype) - 1
+        return self.write(data, record.replace(shift=record.spread * drawn))
 
     def look_up(self, data: SimData) -> SimData:
         """Look up the velocity of the air at drones and loads."""

@@ -1,0 +1,148 @@
+"""Parameters that all drones share, changed after an environment was made: every path computes with their values."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import by_stages, with_params
+
+import crazysim.envs as envs
+from crazysim import ConfigError, SlungLoad
+from crazysim.core.functional import stage_command
+from crazysim.envs.tasks.hover import Hover
+from crazysim.pytree import scopes
+
+N_WORLDS, N_DRAWS = 3, 4
+TILTED = np.array([3.0, 0.0, -9.81], np.float32)
+"""Gravity with a component that is zero in every airframe's parameters, m/s^2."""
+
+
+@functools.cache
+def hovering(control):
+    """Return an environment; with rotor commands each drone carries a load, whose attachment has zeros too."""
+    effects = [SlungLoad(mass=0.003, length=0.3, attach=(0.0, 0.0, -0.01))] if control == "rotor_vel" else []
+    return envs.make("hover", N_WORLDS, control=control, effects=effects)
+
+
+CONSTANTS = {"rpm2thrust": 2e-3, "rpm2torque": 1e-5}
+"""Sizes of the constant terms of polynomials in the rotor speed, N and N m: no share of the largest coefficient."""
+
+
+def drawn(data, rng):
+    """Return the data with every element of every shared number changed, and none of them zero."""
+
+    def change(path, scope, x):
+        if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        x = np.asarray(x)
+        zero = CONSTANTS.get(path[-1].name, 0.03 * np.abs(x).max() or 1e-3)
+        by = rng.uniform(0.3, 1.0, x.shape) * rng.choice([-1, 1], x.shape)
+        return jnp.asarray(np.where(x == 0, zero * by, x * (1 + 0.03 * by)), x.dtype)
+
+    return jax.tree_util.tree_map_with_path(change, scopes(data), data)
+
+
+def numbers(data):
+    """Return the states of drones and plugins."""
+    states = data.states
+    return {"pos": states.pos, "vel": states.vel, "quat": states.quat, "ang_vel": states.ang_vel}
+
+
+def apart(found, expected):
+    """Return the largest difference, relative to the largest number of its kind."""
+    sizes = {name: max(np.abs(x).max(), 1e-3) for name, x in expected.items()}
+    return max(float(np.abs(np.asarray(found[name]) - x).max() / sizes[name]) for name, x in expected.items())
+
+
+@pytest.mark.parametrize("control", ["state", "rotor_vel"])
+def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_values(control):
+    """Environments as they are written and as one kernel, their rollouts, steps of simulations, traced and not."""
+    env = hovering(control)
+    auto, sim, n = envs.AutoReset(env), env.sim, env.n_substeps
+    key = jax.random.key(0)
+    start, before = env.reset(key), sim.data
+    plain = jax.jit(by_stages(sim), static_argnums=1)
+    step = sim.step_fn
+    paths = {
+        "env.step": jax.jit(env.step),
+        "AutoReset.step": jax.jit(auto.step),
+        "rollout": jax.jit(lambda s, a: envs.rollout(auto, s, lambda *_: a, key, 1)[0]),
+    }
+    rng = np.random.default_rng(0)
+    for _ in range(N_DRAWS):
+        action = jnp.asarray(rng.uniform(-0.5, 0.5, start.action.shape), start.action.dtype)
+        data = drawn(start.data, rng)
+        sent = stage_command(data, env.actions.command(action))
+        expected = numbers(plain(sent, n))
+        assert apart(numbers(plain(stage_command(start.data, env.actions.command(action)), n)), expected) > 1e-3
+        found = {name: fly(start.replace(data=data), action).data for name, fly in paths.items()}
+        found["step_fn"], found["traced"] = step(sent, jnp.int32(n)), jax.jit(step)(sent, jnp.int32(n))
+        sim.data = sent
+        sim.step(n)
+        found["sim.step"], sim.data = sim.data, before
+        differences = {name: apart(numbers(x), expected) for name, x in found.items()}
+        assert max(differences.values()) < 2e-5, differences
+
+
+def tilted(data):
+    return with_params(data, gravity_vec=TILTED)
+
+
+def test_gravity_that_is_tilted_pulls_the_drones_of_an_environment(hover_of_tilted):
+    """In ``sim.default_data`` alone before it is made, which episodes begin from; then in the data of a state."""
+    upright = hover_of_tilted.sim.data.params
+    for env in (hover_of_tilted, envs.AutoReset(hover_of_tilted)):
+        begun = jax.jit(env.reset)(jax.random.key(0))
+        np.testing.assert_array_equal(begun.data.params.gravity_vec, TILTED)
+        step, speeds = jax.jit(env.step), []
+        for params in (begun.data.params, upright):
+            state = begun.replace(data=begun.data.replace(params=params))
+            for _ in range(5):
+                state = step(state, jnp.zeros_like(state.action))
+            speeds.append(np.asarray(state.data.states.vel)[..., 0])
+        np.testing.assert_allclose(speeds[0] - speeds[1], 0.3, rtol=0.03)  # 3 m/s^2 for 0.1 s, less the drag
+
+
+@pytest.fixture(scope="module")
+def hover_of_tilted():
+    sim, task = envs.make("hover", N_WORLDS, control="rotor_vel").sim, Hover()
+    sim.default_data = tilted(sim.default_data)
+    return envs.DroneEnv(sim, task)
+
+
+def test_an_environment_refuses_to_begin_episodes_after_its_default_data_was_replaced(hover_of_tilted):
+    sim = hover_of_tilted.sim
+    before = sim.default_data
+    sim.default_data = with_params(before, mass=2 * before.params.mass)
+    with pytest.raises(ConfigError, match="expected the default data with which the environment was made, got others"):
+        hover_of_tilted.reset(jax.random.key(0))
+    sim.default_data = before
+    hover_of_tilted.reset(jax.random.key(0))
+
+
+def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
+    """Speeds by every component of gravity, rates by every element of the inverse inertia: those of the stages."""
+    env = hovering("rotor_vel")
+    auto, stages = envs.AutoReset(env), by_stages(env.sim)
+    start = env.reset(jax.random.key(0))
+    action = 0.3 * jnp.ones_like(start.action).at[..., 0].set(0.2)
+    of = {name: getattr(start.data.params, name) for name in ("gravity_vec", "J_inv")}
+
+    def slopes(step):
+        def total(values):
+            states = step(start.replace(data=with_params(start.data, **values))).data.states
+            return jnp.sum(states.vel) + jnp.sum(states.ang_vel)
+
+        return jax.jit(jax.grad(total))(of)
+
+    def as_written(state):
+        return state.replace(data=stages(stage_command(state.data, env.actions.command(action)), env.n_substeps))
+
+    expected = slopes(as_written)
+    assert all(np.all(x != 0) for x in expected.values())
+    for one in (env, auto):
+        found = slopes(lambda state, one=one: one.step(state, action))
+        for name, x in expected.items():
+            np.testing.assert_allclose(found[name], x, rtol=2e-4, atol=1e-6 * np.abs(x).max(), err_msg=name)
