@@ -265,7 +265,7 @@ class Step:
         return None if at_home else here
 
 
-def _check_steps(n_steps: object) -> None:
+def _check_steps(n_steps: Any) -> None:
     """Check a number of steps.
 
     Raises:
