@@ -157,6 +157,7 @@ def test_parameters_are_an_input():
     compare(sim, step, with_fields(data, changes))
 
 
+@pytest.mark.long("exports a step twice, and compiles its stages")
 def test_the_feedforward_of_a_setpoint_is_that_of_its_setter_or_a_parameter():
     """A feedforward that was staged before is no constant of the step: the one of the command replaces it."""
     sim, name = Sim(N_WORLDS, N_DRONES, control="state"), "controls.state.staged_feedforward"

@@ -56,6 +56,7 @@ def apart(found, expected):
     return max(float(np.abs(np.asarray(found[name]) - x).max() / sizes[name]) for name, x in expected.items())
 
 
+@pytest.mark.long("compiles every path of two environments")
 @pytest.mark.parametrize("control", ["state", "rotor_vel"])
 def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_values(control):
     """Environments as they are written and as one kernel, their rollouts, steps of simulations, traced and not."""
@@ -122,6 +123,7 @@ def test_an_environment_refuses_to_begin_episodes_after_its_default_data_was_rep
     hover_of_tilted.reset(jax.random.key(0))
 
 
+@pytest.mark.long("compiles gradients of the stages and of environment steps")
 def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
     """Speeds by every component of gravity, rates by every element of the inverse inertia: those of the stages."""
     env = hovering("rotor_vel")
