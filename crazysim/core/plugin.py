@@ -21,7 +21,7 @@ from crazysim.core.settings import Setting, check_settings, setting, settings_of
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import PyTree, on_device
-from crazysim.tables import bounds, numbers
+from crazysim.tables import Shapes, bounds, numbers
 
 P = TypeVar("P", bound="Plugin")
 R = TypeVar("R", bound=PyTree)
@@ -86,14 +86,15 @@ def parameter(
     positive: bool = False,
     per_axis: bool = False,
     dtype: DTypeLike | None = None,
+    shapes: Shapes | None = None,
 ) -> Any:
     """Declare a field of a plugin whose value only fills numbers of its record.
 
     ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
     ``derivative`` must read the number from the record, never from the field. Its range is checked as that of
-    ``setting`` is, its shape by ``Plugin.filled``.
+    ``setting`` is, its shape by ``Plugin.filled``, or as it is given here.
     """
-    declared = Setting(bounds(low, high, positive), True, per_axis, dtype)
+    declared = Setting(bounds(low, high, positive), True, per_axis, dtype, shapes)
     return dataclasses.field(default=default, metadata={"setting": declared})
 
 

@@ -140,7 +140,8 @@ def check_settings(settings: Any) -> None:
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
     finite numbers in the range of ``setting`` or ``parameter``; fields of classes, instances of them. None is a value
-    of fields whose annotation or default has it. Shapes that depend on the simulation are checked with it.
+    of fields whose annotation or default has it. Shapes that depend on the simulation, as those of parameters do, are
+    checked with it.
 
     Raises:
         ConfigError: If a field has anything else.
@@ -162,7 +163,7 @@ def check_settings(settings: Any) -> None:
             for key, item in value.items():
                 numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
         elif kinds & NUMERIC and not isinstance(value, classes):
-            shapes = declared.shapes if np.ndarray in kinds else ((),)
+            shapes = declared.shapes if np.ndarray in kinds or declared.is_parameter else ((),)
             whole = kinds & NUMERIC == {int} or declared.dtype is not None
             numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
         elif not isinstance(value, classes):

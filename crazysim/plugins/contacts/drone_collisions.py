@@ -50,9 +50,9 @@ class DroneCollisions(Plugin):
     All pairs are checked: it is for small swarms. Momentum and angular momentum are kept.
     """
 
-    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
+    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
     """Coulomb's coefficient between drones."""
-    restitution: float = parameter(default=0.2, low=0.0, high=1.0)
+    restitution: float = parameter(default=0.2, low=0.0, high=1.0, shapes=((),))
     """Ratio of the speeds after and before a bounce, 0 to 1."""
     softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)
     """Time constant with which an overlap is pushed out, s; at least two steps."""

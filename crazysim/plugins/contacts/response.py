@@ -58,11 +58,11 @@ class ContactResponse(Plugin):
 
     objects: ObjectSelection = None
     """Handles, or names of bodies; None for all at the time of adding, () for the floor alone."""
-    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
+    friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
     """Coulomb's coefficient."""
-    restitution: float = parameter(default=0.2, low=0.0, high=1.0)
+    restitution: float = parameter(default=0.2, low=0.0, high=1.0, shapes=((),))
     """Ratio of the speeds after and before a bounce, 0 to 1."""
-    softness: float = parameter(default=0.03, positive=True, high=MAX_SOFTNESS)
+    softness: float = parameter(default=0.03, positive=True, high=MAX_SOFTNESS, shapes=((),))
     """Time constant with which an overlap is pushed out, s; at least two steps."""
     iterations: int = setting(default=8, low=1, high=MAX_ITERATIONS)
     """Iterations of the solver, for simultaneous contact points."""

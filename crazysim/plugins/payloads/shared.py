@@ -87,7 +87,7 @@ class SharedLoad(PointLoad, Plugin):
     """
 
     coupling: ClassVar[Literal["drone", "world"]] = "world"
-    mass: float = parameter(positive=True)
+    mass: float = parameter(positive=True, shapes=((),))
     """Mass of the load, kg."""
     length: ArrayLike = parameter(default=1.0, positive=True)
     """Length of rods or cables, m. () or (n_worlds, n_drones)"""
@@ -95,7 +95,7 @@ class SharedLoad(PointLoad, Plugin):
     """True for cables, False for rigid rods."""
     attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
-    friction: float = parameter(default=0.6, low=0.0)
+    friction: float = parameter(default=0.6, low=0.0, shapes=((),))
     """Coulomb's coefficient between load and floor."""
     size: ArrayLike = setting(default=0.05, positive=True, shapes=((), (3,)))
     """Radius of a ball, or full lengths of a box, m: () or (3,)."""

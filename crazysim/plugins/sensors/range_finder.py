@@ -57,7 +57,7 @@ class RangeFinder(Plugin):
 
     directions: ArrayLike | None = parameter(default=None)
     """Directions, body frame, of any length; None for ``MULTI_RANGER``. (n_rays, 3)"""
-    max_range: float = parameter(default=4.0, positive=True)
+    max_range: float = parameter(default=4.0, positive=True, shapes=((),))
     """Largest distance measured, m."""
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
