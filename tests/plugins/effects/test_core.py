@@ -107,6 +107,7 @@ def signature(tree):
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]
 
 
+@pytest.mark.long("traces all effects for six sizes")
 def test_law_02_shapes_and_types_stay_for_any_number_of_worlds_drones_and_rotors():
     tables = dict(load_airframe("cf21B_500").tables)
     angle = np.arange(6) * np.pi / 3
@@ -217,6 +218,7 @@ def test_every_effect_is_fused(every):
     assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "first"), ("drone", "each")]
 
 
+@pytest.mark.long("compiles all effects in every engine")
 def test_effects_mean_the_same_on_every_engine(every, flown):
     """20 steps, rounding grown by the controller's gains; random numbers are the same bits everywhere."""
     expected = Step(every.step_pipeline, "plain")(flown, jnp.int32(20))

@@ -216,6 +216,7 @@ def test_a_drone_tips_back_in_forward_flight_and_is_lifted_below_a_ceiling():
     np.testing.assert_allclose(climb[2], 0.002 * expected / 0.0434, rtol=1e-3)
 
 
+@pytest.mark.long("compiles a gradient of RK4, in float64")
 def test_law_08_gradients_equal_central_differences(x64):
     """60 steps in wind below a ceiling: a relative step of 1e-6 leaves 1e-12 of curvature and 1e-9 of rounding."""
     sim = Sim(control="rotor_vel", engine="plain", integrator="rk4")
