@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import tomllib
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, DamagedFileError
 
+PICTURES = (".png", ".jpg", ".svg", ".pdf")
+"""Suffixes of pictures that are written."""
 MAX_TOML = 2**20
 """Largest TOML file, bytes; the built-in ones have up to 12,000."""
 MAX_ARRAYS = 10_000
@@ -92,7 +95,8 @@ def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
 def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
     """Raise the errors of a block that reads a file as errors of crazysim that name the file.
 
-    Damaged files raise errors of almost any type in the libraries that read them. A ``ConfigError`` is passed on.
+    Damaged files raise errors of almost any type in the libraries that read them. A ``ConfigError``, and the
+    ``ImportError`` of a missing library, are passed on.
 
     Args:
         path: The file.
@@ -105,7 +109,7 @@ def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
     """
     try:
         yield
-    except ConfigError:
+    except (ConfigError, ImportError):
         raise
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
         raise ConfigError(f"expected an existing file with {content}, got {str(path)!r}. {remedy}") from None
@@ -114,6 +118,11 @@ def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
         raise DamagedFileError(
             f"expected {content}, got {str(path)!r}, which is damaged or a file of another kind ({reason}). {remedy}"
         ) from error
+
+
+def unfinished_path(path: Path) -> Path:
+    """Return the path of a file that takes the place of another one when it is whole."""
+    return path.with_name(path.name + ".part")
 
 
 @contextmanager
@@ -128,7 +137,11 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     path = Path(path)
     if not path.parent.is_dir():
         raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
-    unfinished = path.with_name(path.name + ".part")
+    if path.is_dir():
+        raise ConfigError(
+            f"expected a file that can be written, got the folder {str(path)!r}. Give the name of a file."
+        )
+    unfinished = unfinished_path(path)
     try:
         with unfinished.open("wb") as file:
             yield file
@@ -140,6 +153,47 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
                 f"expected a file that can be written, got {str(path)!r}: {error}. Use another folder, or make room."
             ) from error
         raise
+
+
+def write_file(path: str | Path, content: bytes | str) -> None:
+    """Write a file as a whole or not at all, text in UTF-8.
+
+    Raises:
+        ConfigError: If the folder does not exist, or the file cannot be written.
+    """
+    with replacing(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def write_figure(figure: Any, path: str | Path, dpi: float) -> None:
+    """Write a figure of matplotlib as a whole or not at all; the suffix of the file is the format.
+
+    Raises:
+        ConfigError: If the suffix is not in ``PICTURES``, the folder does not exist, or the file cannot be written.
+    """
+    check_writable(path, PICTURES)
+    with replacing(path) as file:
+        figure.savefig(file, format=Path(path).suffix[1:].lower(), dpi=dpi)
+
+
+class _NothingToWriteError(Exception):
+    """Raised to leave a file as it is."""
+
+
+def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
+    """Check that a file can be written, before the work whose result it is for; it is left as it is.
+
+    Args:
+        path: The file.
+        suffixes: Accepted ends of its name; empty for any.
+
+    Raises:
+        ConfigError: If its name has another end, the folder does not exist, or it cannot be written.
+    """
+    if suffixes and Path(path).suffix.lower() not in suffixes:
+        raise ConfigError(f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}")
+    with suppress(_NothingToWriteError), replacing(path):
+        raise _NothingToWriteError
 
 
 class ZipReader:
@@ -200,7 +254,20 @@ def read_arrays(file: BinaryIO, place: str) -> dict[str, NDArray]:
     most = max(MAX_UNPACKED, MAX_RATIO * file.seek(0, os.SEEK_END))
     archive = ZipReader(file, place, MAX_ARRAYS, most, most)
     # A whole member is read before NumPy parses it: the checksum of a member is compared only at its end.
-    return {
-        name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
-        for name in archive.names
-    }
+    return {name.removesuffix(".npy"): _array(archive.read(name), f"{place}: {name}") for name in archive.names}
+
+
+def _array(content: bytes, place: str) -> NDArray:
+    """Return the array of a ``.npy`` file, whose header states no more bytes than follow it."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(file)
+    stated, left = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
+    if min(shape, default=0) < 0 or (stated > left and not dtype.hasobject):
+        raise ConfigError(
+            f"expected an array of {left} bytes, as they follow, got a header of shape {shape} in {place}. "
+            "Write the file again."
+        )
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)

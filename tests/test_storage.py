@@ -1,27 +1,15 @@
 """Files are written whole or not at all, and damaged ones are refused with their name."""
 
 import io
-import resource
 import tracemalloc
 import zipfile
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from disks import full_disk
 
 from crazysim.errors import ConfigError, DamagedFileError
-from crazysim.storage import read_arrays, reading, replacing
-
-
-@contextmanager
-def full_disk():
-    """Let every file end at 100 bytes, as the system does for a quota."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from crazysim.storage import check_writable, read_arrays, reading, replacing, write_figure, write_file
 
 
 def write_to_a_full_disk(path):
@@ -107,3 +95,31 @@ def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match=message) as error, reading(path, "some arrays", "Use another copy."):
         path.read_bytes()
     assert not isinstance(error.value, DamagedFileError)
+
+
+def test_writers_of_texts_and_figures_leave_nothing_on_a_full_disk(tmp_path):
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    for write in (
+        lambda: write_file(tmp_path / "a.txt", "x" * 1000),
+        lambda: write_figure(figure, tmp_path / "a.png", 50),
+    ):
+        with pytest.raises(ConfigError, match="expected a file that can be written"), full_disk():
+            write()
+        assert not list(tmp_path.iterdir())
+    write_file(tmp_path / "a.txt", "é")
+    assert (tmp_path / "a.txt").read_bytes() == "é".encode()
+    with pytest.raises(ConfigError, match=r"ends with \.png or \.jpg or \.svg or \.pdf, got .*a\.exe"):
+        write_figure(figure, tmp_path / "a.exe", 50)
+
+
+def test_a_file_is_tried_without_a_change(tmp_path):
+    check_writable(tmp_path / "a.md")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a.md").write_text("before")
+    check_writable(tmp_path / "a.md", (".md",))
+    assert (tmp_path / "a.md").read_text() == "before"
+    for path, message in ((tmp_path, "got the folder"), (tmp_path / "b" / "a.md", "expected an existing folder")):
+        with pytest.raises(ConfigError, match=message):
+            check_writable(path)
+    with pytest.raises(ConfigError, match=r"ends with \.md, got"):
+        check_writable(tmp_path / "a.txt", (".md",))

@@ -18,6 +18,7 @@ from crazysim.dynamics.models import Dynamics
 from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing
 from crazysim.dynamics.utils.identification import fit_rotation, fit_translation
 from crazysim.errors import ConfigError
+from crazysim.identify.checks import check_turning
 from crazysim.identify.logs import Log
 from crazysim.identify.prediction import PADDING, State, Windows
 from crazysim.pytree import PyTree
@@ -127,6 +128,7 @@ def identify_attitude(
     base = load_airframe(airframe)
     known = float(base.value("rigid_body.mass"))
     weight = known if mass is None else float(mass)
+    check_turning(logs)
     data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
     force, force_spread = fit_translation(dynamics, weight, data)
     turn, turn_spread = fit_rotation(data)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 import re
 from collections.abc import Callable, Sequence
 from operator import attrgetter
@@ -14,9 +16,10 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
-from crazysim.errors import ConfigError
-from crazysim.identify.columns import Columns
+from crazysim.errors import ConfigError, not_installed
+from crazysim.identify.columns import Columns, plausible
 from crazysim.identify.readers import Stream, at_equal_times
+from crazysim.storage import read_text
 
 XYZ, XYZW = "xyz", "xyzw"
 POSES = {
@@ -29,6 +32,33 @@ POSES = {
 """Fields of position and attitude by type of message, most informative first."""
 ROTORS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
 """Fields of rotor speeds, rad/s, by type of message."""
+
+MAX_METADATA = 2**24
+"""Largest ``metadata.yaml``, bytes."""
+
+
+class _BagFile(io.BufferedReader):
+    """File whose ``read`` makes no room for more bytes than are left, whatever size a damaged record states."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return bytes, at most so many."""
+        if size is None or size < 0:
+            return super().read()
+        return super().read(min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0)))
+
+
+class _BagPath(type(Path())):
+    """Path whose files are read within bounds."""
+
+    def open(self, *args: Any, **kwargs: Any) -> Any:
+        """Open the file for reading."""
+        del args, kwargs
+        return _BagFile(io.FileIO(self))
+
+    def read_text(self, *args: Any, **kwargs: Any) -> str:
+        """Return the text of ``metadata.yaml``, in UTF-8 whatever the locale."""
+        del args, kwargs
+        return read_text(self, MAX_METADATA)
 
 
 def is_bag(path: Path) -> bool:
@@ -55,29 +85,22 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
         ImportError: If rosbags is not installed.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise ImportError(
-            "expected rosbags, which ROS bags need, got none. Run pip install 'crazysim[logs]'."
-        ) from error
+        raise ImportError(not_installed("ROS bags need", "rosbags", "logs")) from error
     names = [] if wanted is None else [x for x in wanted.names if "/" in x]
     folder = path.parent if path.suffix in (".mcap", ".db3") and (path.parent / "metadata.yaml").is_file() else path
-    try:
-        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
-            topics = {c.topic: c.msgtype for c in bag.connections}
-            if names:
-                columns = {name: _split(path.name, name, topics) for name in names}
-            else:
-                columns = _default(path.name, topics)
-            streams: dict[str, Stream] = {}
-            for topic in {topic for topic, _ in columns.values()}:
-                fields = {name: field for name, (other, field) in columns.items() if other == topic}
-                streams[topic] = _stream(path.name, bag, topic, topics[topic], fields)
-    except AnyReaderError as error:
-        raise ConfigError(
-            f"{path.name}: expected a bag, got {error}. Record it again, or run ros2 bag reindex."
-        ) from error
+    with AnyReader([_BagPath(folder)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        topics = {c.topic: c.msgtype for c in bag.connections}
+        if names:
+            columns = {name: _split(path.name, name, topics) for name in names}
+        else:
+            columns = _default(path.name, topics)
+        streams: dict[str, Stream] = {}
+        for topic in {topic for topic, _ in columns.values()}:
+            fields = {name: field for name, (other, field) in columns.items() if other == topic}
+            streams[topic] = _stream(path.name, bag, topic, topics[topic], fields)
     if not names:
         streams = {topic: _turned(stream) for topic, stream in streams.items()}
     return at_equal_times(path.name, streams, repairs, wanted if names else None)
@@ -153,7 +176,7 @@ def _stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) 
         raise ConfigError(f"{name}: expected messages of {topic}, got none. Record it while the drone flies.")
     columns: dict[str, NDArray] = {}
     for column, values in zip(fields, zip(*rows, strict=True), strict=True):
-        x = np.array(values, np.float64)
+        x = plausible(np.array(values, np.float64))
         if column == "rpm":
             columns |= {f"rpm{k + 1}": np.abs(c) / RPM_TO_RAD_S for k, c in enumerate(x.T)}
         elif x.ndim == 1:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
+from crazysim.identify.columns import plausible
 from crazysim.identify.delimited import number, rows_of
 from crazysim.identify.readers import decimated
 
@@ -66,10 +67,14 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     wanted = [
         key for key in keys if key in ("time", "vbatLatest") or key.startswith(("gyroADC", "motor[", "eRPM[", "imuQua"))
     ]
-    missing = [key for key in ("time", *(f"gyroADC[{k}]" for k in range(3))) if key not in keys]
+    n_rotors = sum(key.startswith("motor[") for key in keys)
+    needed = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
+    if "imuQuaternion[0]" in keys:
+        needed += ["imuQuaternion[1]", "imuQuaternion[2]"]
+    missing = [key for key in needed if key not in keys]
     if missing:
         raise ConfigError(
-            f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)}. "
+            f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)[:300]}. "
             "Log gyro and motors in Betaflight."
         )
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -77,16 +82,15 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     cells = rows_of(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
     at = [keys.index(key) for key in wanted]
     rows = [[number(row[k]) for k in at] for row in cells]
-    data = dict(zip(wanted, np.array(rows).T, strict=True))
+    data = dict(zip(wanted, plausible(np.array(rows)).T, strict=True))
 
-    high = 10.0 if int(number(settings.get("blackbox_high_resolution", "0")) or 0) > 0 else 1.0
+    high = 10.0 if number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
     per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)
     poles = number(settings.get("motor_poles", str(POLES)))
-    if not poles >= 2:
+    if not 2 <= poles < math.inf:
         raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}
     table |= {f"w{axis}": per_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
-    n_rotors = sum(key.startswith("motor[") for key in keys)
     table |= {f"command{k + 1}": data[f"motor[{k}]"] for k in range(n_rotors)}
     rotors = [k for k in range(n_rotors) if f"eRPM[{k}]" in data]
     table |= {f"rpm{k + 1}": 200 / poles * data[f"eRPM[{k}]"] for k in rotors}

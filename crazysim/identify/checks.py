@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import permutations, product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +16,9 @@ from crazysim.errors import ConfigError
 from crazysim.identify.columns import Columns
 from crazysim.identify.motion import body_rates, integral
 
+if TYPE_CHECKING:
+    from crazysim.identify.logs import Log
+
 GRAVITY = 9.81
 RATIOS = (0.5, 2.0)
 """Ratios of measured to expected motion that count as agreement, on each axis that moves. Of the logs of two public
@@ -24,6 +27,9 @@ UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
 """Units of positions, and with /s of velocities, in m."""
 DIVERGED = 10.0
 """Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
+TURNING = 0.01
+"""Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
+(BMI088, 0.014 degrees/s over the root of Hz) gives 0.003 rad/s at 250 Hz."""
 STILL = 0.3
 """Span of the position below which a fault is that of a drone at rest, whose estimator drifts, m."""
 PIECE = 2.0
@@ -117,6 +123,20 @@ def check_motion(
         f"{name}: expected {fault}. Check units, signs and order of the columns: z up, quaternions xyzw and body to "
         "world, angular velocities in the body frame, rad/s."
     )
+
+
+def check_turning(logs: Sequence[Log]) -> None:
+    """Check that some log turns about the x and y axes, so that a rotation can be fitted to it.
+
+    Raises:
+        ConfigError: If none does.
+    """
+    rates = np.max([np.std(log.ang_vel[:, :2], axis=0) for log in logs], axis=0, initial=0.0)
+    if np.any(rates < TURNING):
+        raise ConfigError(
+            f"expected a flight that turns about x and y, got body rates whose standard deviations are "
+            f"{rates[0]:.2g} and {rates[1]:.2g} rad/s. Take a log of a flight with changes of direction."
+        )
 
 
 class Law(NamedTuple):

@@ -109,6 +109,8 @@ KNOWN = {
 }
 """Columns of known logs: the default names, IDSIA's benchmark, also as its repository's ``.csv`` files name them, and
 NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
+LARGEST = 1e20
+"""Largest number of a log; times in ns since 1970 are 2e18."""
 OPTIONAL = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
 """Fields whose columns a log may lack."""
 
@@ -148,7 +150,12 @@ def _numbers(name: str, key: str, values: NDArray) -> NDArray:
             f"{name}: expected one number a sample in column {key}, got {got}. "
             "Convert it to numbers, or name another column."
         )
-    return x.astype(np.float64)
+    return plausible(x.astype(np.float64))
+
+
+def plausible(x: NDArray) -> NDArray:
+    """Return the numbers, NaN in place of those above ``LARGEST``, whose squares and products would overflow."""
+    return np.where(np.abs(x) <= LARGEST, x, np.nan)
 
 
 def missing(table: Mapping[str, NDArray], columns: Columns) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -11,6 +12,11 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.identify.repairs import REPAIRABLE
+
+MAX_COLUMNS = 10_000
+"""Most columns of a file."""
+MAX_TEXT = 40
+"""Most characters that are kept of a cell without a number."""
 
 
 def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
@@ -25,6 +31,8 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     """
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         header, *lines = [*file] or [""]
+    if (width := header.count(",") + 1) > MAX_COLUMNS:
+        raise ConfigError(f"{path.name}: expected at most {MAX_COLUMNS} columns, got {width}. Export fewer of them.")
     names = [x.strip().strip('"') for x in header.split(",")]
     if len(names) < 2:
         other = next((word for mark, word in ((";", "semicolons"), ("\t", "tabs")) if mark in header), None)
@@ -38,8 +46,8 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected names of columns in the first line, got numbers: {header.strip()[:40]}. "
             "Add a first line such as t,x,y,z,qx,qy,qz,qw."
         )
-    if twice := sorted({x for x in names if names.count(x) > 1}):
-        raise ConfigError(f"{path.name}: expected columns of different names, got {twice[0]!r} twice. Rename one.")
+    if twice := sorted(x for x, n in Counter(names).items() if n > 1):
+        raise ConfigError(f"{path.name}: expected columns of different names, got {twice[0][:60]!r} twice. Rename one.")
     rows = rows_of(path.name, lines, len(names), 2, repairs, "Export the log again.")
     return {key: _column(cells) for key, cells in zip(names, zip(*rows, strict=True), strict=True)}
 
@@ -91,4 +99,6 @@ def _column(cells: Sequence[str]) -> NDArray:
         return np.array(cells, np.float64)
     except ValueError:
         values = np.array([number(x) for x in cells])
-        return values if 2 * np.sum(np.isfinite(values)) > len(values) else np.array([x.strip() for x in cells])
+        return (
+            values if 2 * np.sum(np.isfinite(values)) > len(values) else np.array([x.strip()[:MAX_TEXT] for x in cells])
+        )

@@ -17,6 +17,7 @@ from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.errors import ConfigError
+from crazysim.identify.checks import check_turning
 from crazysim.identify.logs import Log
 from crazysim.identify.motion import integral
 from crazysim.identify.motors import motor_lag, with_speeds
@@ -143,6 +144,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     logs = [with_speeds(log, base) for log in logs]
     _check(logs, base)
     windows(logs, DURATION, DURATION)
+    check_turning(logs)
     if base.n_rotors <= 4:
         _check_order(logs, base)
     weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)

@@ -13,6 +13,8 @@ from crazysim.identify.readers import Stream, at_equal_times
 
 STEP = 0.005
 """Interval at which angular velocities are compared, s."""
+MAX_SPAN = 100
+"""Longest duration, in steps for each sample."""
 DERIVED_OVER = 0.06
 """Duration over which positions and attitudes are differentiated, s."""
 
@@ -53,6 +55,12 @@ def joined(
     for at, rates in ((t, ang_vel), ((other[1:] + other[:-1]) / 2, turned)):
         good = np.isfinite(at) & np.all(np.isfinite(rates), axis=-1)
         order = np.unique(at[good], return_index=True)[1]
+        span = np.ptp(at[good]) if len(order) > 1 else 0.0
+        if not 0 < span < MAX_SPAN * STEP * len(order):
+            raise ConfigError(
+                f"{name}: expected samples of one flight, got {len(order)} with times and angular velocities, over "
+                f"{span:.3g} s. Cut the log and its motion capture to the flight."
+            )
         grid = np.arange(at[good].min(), at[good].max(), STEP)
         speed = np.interp(grid, at[good][order], np.linalg.norm(rates[good][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(size) / size, "same")))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
 from crazysim.identify.logs import Log
 from crazysim.identify.prediction import Model, Windows, attitude_error, predict, windows
 from crazysim.plugins.effects.residual import ResidualData, residual_inputs
@@ -61,9 +61,7 @@ def fit_residual(
     try:
         import optax
     except ImportError as error:
-        raise ImportError(
-            "expected optax, which networks need, got none. Run pip install 'crazysim[train]'."
-        ) from error
+        raise ImportError(not_installed("networks need", "optax", "train")) from error
     if n_hidden < 0 or min(iterations, batch_size) < 1:
         raise ConfigError(
             f"expected n_hidden of at least 0, iterations and batch_size of at least 1, got {n_hidden}, {iterations} "

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from crazysim.errors import not_installed
 from crazysim.identify.logs import Log
 from crazysim.identify.prediction import HORIZONS, Predictor, prediction_errors
+from crazysim.storage import write_figure
 
 
 def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str | Path) -> None:
@@ -25,9 +27,7 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(
-            "expected matplotlib, which plots need, got none. Run pip install 'crazysim[demo]'."
-        ) from error
+        raise ImportError(not_installed("plots need", "matplotlib", "demo")) from error
     horizons = np.linspace(0, max(HORIZONS), 11)[1:].tolist()
     errors = {name: prediction_errors(logs, model, horizons) for name, model in models.items()}
     figure = Figure(figsize=(9, 3.6), layout="constrained")
@@ -41,4 +41,4 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
         ax.set(xlabel="horizon, s", ylabel=f"RMSE of {key}, {unit}", xlim=(0, None), ylim=(0, None))
         ax.grid(alpha=0.3)
         ax.legend()
-    figure.savefig(path, dpi=120)
+    write_figure(figure, path, dpi=120)

@@ -1,24 +1,26 @@
-"""Files of flight controllers as tables of columns at equal times."""
+"""Streams of messages at equal times, and logs of a Crazyflie's micro-SD card."""
 
 from __future__ import annotations
 
+import re
 import struct
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim import rotation
 from crazysim.errors import ConfigError
-from crazysim.identify.columns import Columns, plain
+from crazysim.identify.columns import Columns, plain, plausible
 from crazysim.identify.repairs import PERIODS, continuous
 
 LONGEST_HOLD = 3.0
 """Intervals of a stream, after which its interpolated values count as a gap."""
+VARIABLE = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
+"""Name and type of a variable of a micro-SD log, such as ``gyro.x(f)``."""
 LARGEST_RATE = 250.0
 """Rate to which faster logs are averaged, Hz: above some 50 Hz nothing is identified."""
 
@@ -61,7 +63,7 @@ def at_equal_times(
             repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples have no time of their own")
         if len(order) < 2:
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
-        values = {c: x[order] for c, x in stream.columns.items()}
+        values = {c: plausible(x[order]) for c, x in stream.columns.items()}
         step = float(np.median(np.diff(stream.t[order])))
         if step > PERIODS[1] and not set(values) <= slowly:
             wanted = f"{key} every {PERIODS[1]:g} s or more often, got every {step:.2g} s"
@@ -85,12 +87,13 @@ def at_equal_times(
     if end - start > 100 * dt * max(len(s.t) for s in sorted_streams.values()):
         raise ConfigError(f"{name}: expected one flight, got {end - start:.3g} s of pauses. Cut the log into flights.")
     t = start + dt * np.arange(int((end - start) / dt) + 1)
-    table, keep = {}, np.ones(len(t), bool)
+    keep = np.ones(len(t), bool)
     for key, s in sorted_streams.items():
-        table |= {c: np.interp(t, s.t, x) for c, x in s.columns.items()}
         before = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
         keep &= s.t[before + 1] - s.t[before] <= LONGEST_HOLD * steps[key]
-    return {"t": (t - start)[keep]} | {c: x[keep] for c, x in table.items()}
+    t = t[keep]
+    columns_at = {c: np.interp(t, s.t, x) for s in sorted_streams.values() for c, x in s.columns.items()}
+    return {"t": t - start} | columns_at
 
 
 def decimated(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
@@ -105,7 +108,7 @@ def decimated(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArra
         return table
     n = len(table["t"]) // size * size
     repairs.append(f"averaged {size} samples each of a log at {1 / step:.0f} Hz")
-    return {key: x[:n].reshape(-1, size).mean(axis=1) for key, x in table.items()}
+    return {key: plausible(x[:n]).reshape(-1, size).mean(axis=1) for key, x in table.items()}
 
 
 def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
@@ -156,14 +159,14 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
         at += head.size + kinds[kind][2].size
     if at < end and not repairs:
         repairs.append(f"left out {end - at} bytes at the end that are no record")
-    every = [variable for key, (_, variables, _) in kinds.items() if rows[key] for variable in variables]
+    times = Counter(variable for key, (_, variables, _) in kinds.items() if rows[key] for variable in variables)
     streams = {}
     for key, (name, variables, _) in kinds.items():
         if rows[key]:
             table = np.array(rows[key], np.float64)
-            names = [x if every.count(x) == 1 else f"{name}.{x}" for x in variables]
+            names = [x if times[x] == 1 else f"{name}.{x}" for x in variables]
             values = dict(zip(names, table.T[1:], strict=True))
-            for x in [x for x in names if x.endswith(".quat")]:
+            for x in [x for x in names if x.endswith(".quat") and np.all(values[x] == values[x].astype(np.uint32))]:
                 attitude = decompressed(values[x].astype(np.uint32))
                 values |= {f"{x[:-4]}q{axis}": c for axis, c in zip("xyzw", attitude.T, strict=True)}
             streams[name] = Stream(table[:, 0], values)
@@ -206,81 +209,10 @@ def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], s
         at += 2
         variables, layout = [], "<"
         for _ in range(count):
-            entry, at = text(at)  # such as "gyro.x(f)"
-            variables.append(entry[:-3])
-            layout += entry[-2]
+            entry, at = text(at)
+            if (found := VARIABLE.fullmatch(entry)) is None:
+                raise ValueError(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
+            variables.append(found[1])
+            layout += found[2]
         kinds[key] = (name, variables, struct.Struct(layout))
     return kinds, at
-
-
-def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
-    """Return the columns of a PX4 ULog in the names of crazysim's logs.
-
-    World axes are north, west, up, and body axes forward, left, up: PX4's, turned half about the first axis. Rotor
-    speeds are those of ``esc_status`` and commands those of ``actuator_motors``, or else of ``actuator_outputs``, in
-    PX4's order. Commanded attitudes are those of ``vehicle_attitude_setpoint``, with its thrust as a share from 0 to 1.
-    Logs before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
-
-    Args:
-        path: File.
-        repairs: List that descriptions of repairs are appended to.
-
-    Raises:
-        ConfigError: If the log lacks position or attitude, or is damaged.
-        ImportError: If pyulog is not installed.
-    """
-    try:
-        from pyulog import ULog
-    except ImportError as error:
-        raise ImportError(
-            "expected pyulog, which ULog files need, got none. Run pip install 'crazysim[logs]'."
-        ) from error
-    try:
-        with path.open("rb") as file:
-            log = ULog(file)
-    except Exception as error:  # of pyulog, whose versions raise several kinds
-        raise ConfigError(f"{path.name}: expected a ULog, got {error}. Copy the file again.") from error
-    if log.dropouts:
-        repairs.append(f"{len(log.dropouts)} dropouts of the logger")
-    found = {d.name: d.data for d in log.data_list if d.multi_id == 0}
-    if missing := [key for key in ("vehicle_local_position", "vehicle_attitude") if key not in found]:
-        raise ConfigError(
-            f"{path.name}: expected messages {' and '.join(missing)}, got {len(found)} others. "
-            "Add them to PX4's logged topics."
-        )
-    place, turn = found["vehicle_local_position"], found["vehicle_attitude"]
-    # PX4's quaternions are wxyz.
-    columns = {
-        "vehicle_local_position": {
-            "x": place["x"], "y": -place["y"], "z": -place["z"],
-            "vx": place["vx"], "vy": -place["vy"], "vz": -place["vz"],
-        },
-        "vehicle_attitude": {"qw": turn["q[0]"], "qx": turn["q[1]"], "qy": -turn["q[2]"], "qz": -turn["q[3]"]},
-    }  # fmt: skip
-    if "vehicle_angular_velocity" in found:
-        rates = [found["vehicle_angular_velocity"][f"xyz[{k}]"] for k in range(3)]
-        columns["vehicle_angular_velocity"] = {"wx": rates[0], "wy": -rates[1], "wz": -rates[2]}
-    elif "rollspeed" in turn:
-        columns["vehicle_attitude"] |= {"wx": turn["rollspeed"], "wy": -turn["pitchspeed"], "wz": -turn["yawspeed"]}
-    n_rotors = int(np.max(found["esc_status"]["esc_count"])) if "esc_status" in found else 0
-    if n_rotors:
-        speeds = [np.abs(found["esc_status"][f"esc[{k}].esc_rpm"]) for k in range(n_rotors)]
-        columns["esc_status"] = {f"rpm{k + 1}": x for k, x in enumerate(speeds)}
-    if "actuator_motors" in found:
-        outputs = [found["actuator_motors"][f"control[{k}]"] for k in range(12)]
-        used = [x for x in outputs if np.any(np.isfinite(x))]
-        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(used)}
-    elif "actuator_outputs" in found and n_rotors:
-        outputs = [found["actuator_outputs"][f"output[{k}]"] for k in range(n_rotors)]
-        columns["actuator_outputs"] = {f"command{k + 1}": x for k, x in enumerate(outputs)}
-    wanted = found.get("vehicle_attitude_setpoint", {})
-    if "q_d[0]" in wanted and "thrust_body[2]" in wanted:
-        aim = np.stack([wanted[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
-        angles = np.unwrap(np.asarray(rotation.to_rpy(jnp.asarray(aim)), np.float64), axis=0)
-        names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
-        values = [*angles.T, -wanted["thrust_body[2]"]]
-        columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
-    if "battery_status" in found:
-        columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}
-    streams = {key: Stream(found[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}
-    return at_equal_times(path.name, streams, repairs)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from zipfile import BadZipFile
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +15,10 @@ from crazysim.identify.bags import is_bag, read_bag
 from crazysim.identify.blackbox import header_of, read_blackbox
 from crazysim.identify.columns import KNOWN, Columns, plain, stacked
 from crazysim.identify.delimited import read_delimited
-from crazysim.identify.readers import read_crazyflie, read_ulog
+from crazysim.identify.readers import read_crazyflie
 from crazysim.identify.repairs import check_period
+from crazysim.identify.ulog import read_ulog
+from crazysim.storage import read_arrays, reading
 
 
 def read_table(
@@ -54,29 +55,23 @@ def _read(
         return "log", _in_seconds("log", source, columns)
     path = Path(source)
     if is_bag(path) and path.exists():
-        return path.stem, read_bag(path, repairs, columns)
+        with reading(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
+            return path.stem, read_bag(path, repairs, columns)
     if not path.is_file():
         raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
-    if path.suffix == ".ulg":
-        return path.stem, read_ulog(path, repairs)
-    if path.suffix == ".npz":
-        return path.stem, _in_seconds(path.stem, _arrays(path), columns)
-    if path.suffix != ".csv":
-        return path.stem, read_crazyflie(path, repairs, columns)
-    if header_of(path) is not None:
-        return path.stem, read_blackbox(path, repairs)
-    return path.stem, _in_seconds(path.stem, read_delimited(path, repairs), columns)
-
-
-def _arrays(path: Path) -> dict[str, NDArray]:
-    """Return the arrays of a .npz file."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (BadZipFile, ValueError, EOFError, OSError) as error:
-        raise ConfigError(
-            f"{path.name}: expected arrays of numbers as of numpy.savez, got {error}. Write the file again."
-        ) from error
+    with reading(path.name, "a log of a flight", "Copy or export it again."):
+        if path.suffix == ".ulg":
+            return path.stem, read_ulog(path, repairs)
+        if path.suffix == ".npz":
+            with path.open("rb") as file:
+                table = read_arrays(file, path.name)
+        elif path.suffix != ".csv":
+            return path.stem, read_crazyflie(path, repairs, columns)
+        elif header_of(path) is not None:
+            return path.stem, read_blackbox(path, repairs)
+        else:
+            table = read_delimited(path, repairs)
+    return path.stem, _in_seconds(path.stem, table, columns)
 
 
 def _in_seconds(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:

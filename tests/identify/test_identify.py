@@ -436,7 +436,7 @@ def test_arrays_that_are_no_columns_are_refused(flights, tmp_path):
     with pytest.raises(ConfigError, match=r"one number a sample in column rpm1, got shape \(500, 1\)"):
         read_log(flights[0] | {"rpm1": flights[0]["rpm1"][:, None]})
     (tmp_path / "log.npz").write_bytes(b"PK torn")
-    with pytest.raises(ConfigError, match="Write the file again"):
+    with pytest.raises(ConfigError, match=r"which is damaged or a file of another kind .* Copy or export it again\."):
         read_log(tmp_path / "log.npz")
 
 
@@ -495,3 +495,15 @@ def test_logs_shorter_than_a_window_are_refused(flights):
     short = {key: x[:60] for key, x in flights[0].items()}
     with pytest.raises(ConfigError, match="Use longer logs"):
         identify([read_log(short)])
+
+
+@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy"])
+def test_a_log_that_excites_nothing_is_refused(tmp_path, capsys, dynamics):
+    n, zero, one = 500, np.zeros(500), np.ones(500)
+    names = "x y z qx qy qz qw vx vy vz wx wy wz roll_command pitch_command yaw_command thrust_command".split()
+    table = {"t": 0.01 * np.arange(n)} | dict.fromkeys(names, zero) | {"qw": one, "z": one, "thrust_command": 0.4 * one}
+    np.savez(tmp_path / "hover.npz", **table, **{f"rpm{k}": 15000 * one for k in range(1, 5)})
+    out = tmp_path / "out.toml"
+    assert main(["identify", str(tmp_path / "hover.npz"), "--out", str(out), "--dynamics", dynamics]) == 2
+    assert "expected a flight that turns about x and y, got body rates whose" in capsys.readouterr().err
+    assert not out.exists()
