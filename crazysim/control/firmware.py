@@ -5,6 +5,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import signal
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -21,6 +24,7 @@ from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
+from crazysim.storage import read_bytes, replacing
 
 VERSION = 1
 """Version of the interface in ``firmware.h``."""
@@ -30,6 +34,10 @@ UNITS = ("throttle", "thrust", "rpm")
 """Units of motor commands."""
 FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
 """Functions of a library that are called from here."""
+MAX_LIBRARY, MAX_MEMORY = 2**28, 2**24
+"""Largest library, and largest memory of a drone, bytes."""
+LOADING = 60
+"""Longest time that loading a library takes, s."""
 N_COMMAND, N_FEEDFORWARD = 16, 8
 """Numbers of a state command and of its feedforward."""
 
@@ -151,13 +159,17 @@ def load(library: str | Path) -> str:
     """
     remedy, path = f"Compile it as {CFirmware.include / 'firmware.h'} says.", Path(library)
     try:
-        content = path.read_bytes()
-        copy = Path(_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
-        if not copy.exists():  # a loaded one is never written again
-            copy.write_bytes(content)
-        loaded = _opened(str(copy))
-    except OSError as error:
+        content = read_bytes(path, MAX_LIBRARY)
+    except ConfigError as error:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
+    copy = Path(_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
+    if not copy.exists():  # a loaded one is never written again
+        with replacing(copy) as file:
+            file.write(content)
+        if reason := _fault(copy):
+            copy.unlink()
+            raise ConfigError(f"expected a shared library at {path}, got one that cannot be loaded: {reason}. {remedy}")
+    loaded = _opened(str(copy))
     missing = [name for name in FUNCTIONS if not hasattr(loaded, name)]
     if missing:
         needed, lacking = ", ".join(FUNCTIONS), ", ".join(missing)
@@ -166,11 +178,30 @@ def load(library: str | Path) -> str:
         raise ConfigError(f"expected version {VERSION} of firmware.h in {path}, got {version}. {remedy}")
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
     loaded.crazysim_memory_size.restype = size
+    if (needed := loaded.crazysim_memory_size()) > MAX_MEMORY:
+        raise ConfigError(
+            f"expected a memory of at most {MAX_MEMORY} bytes a drone, got {needed} from {path}. {remedy}"
+        )
     loaded.crazysim_init.argtypes = [pointer]
     loaded.crazysim_init.restype = None
     loaded.crazysim_update_all.argtypes = [integer, integer, size, pointer, integer, pointer, pointer]
     loaded.crazysim_update_all.restype = None
     return str(copy)
+
+
+def _fault(library: Path) -> str:
+    """Return the reason why a library cannot be loaded, empty if it can.
+
+    A process of its own tries it: the system ends a process that loads one half of a library.
+    """
+    command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LOADING, check=False)
+    except subprocess.TimeoutExpired:
+        return f"it takes over {LOADING} s"
+    if done.returncode < 0:
+        return f"it ends the process with {signal.Signals(-done.returncode).name}"
+    return (done.stderr.strip().splitlines() or ["unknown"])[-1] if done.returncode else ""
 
 
 _opened = functools.cache(ctypes.CDLL)

@@ -1,5 +1,6 @@
 """Controllers in C: what they receive, what they command, and what they remember of each drone."""
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -282,3 +283,22 @@ def test_wrong_libraries_and_units_are_refused(library, tmp_path):
         CFirmware(library("newer", HOVER.replace("firmware.h", f"{tmp_path}/firmware.h")))
     with pytest.raises(ConfigError, match=r"expected motors as one of throttle, thrust, rpm, got 'volt'"):
         CFirmware(library("hover", HOVER), motors="volt")
+
+
+def test_what_is_no_whole_library_is_refused_without_harm(library, tmp_path):
+    """A pipe would be read for ever, a device without end, and half a library would end this process."""
+    pipe, half = tmp_path / "pipe.so", tmp_path / "half.so"
+    os.mkfifo(pipe)
+    whole = library("hover", HOVER).read_bytes()
+    half.write_bytes(whole[: len(whole) // 2])
+    for path, reason in (
+        (pipe, "expected an existing file"),
+        ("/dev/zero", "expected an existing file"),
+        (tmp_path, "expected an existing file"),
+        (half, "got one that cannot be loaded: "),
+    ):
+        with pytest.raises(ConfigError, match=rf"expected a shared library at .*{reason}.*firmware\.h says\."):
+            CFirmware(path)
+    huge = HOVER.replace("return sizeof(struct memory)", "return 1000000000000000ul")
+    with pytest.raises(ConfigError, match=r"a memory of at most 16777216 bytes a drone, got 1000000000000000 from"):
+        CFirmware(library("huge", huge))
