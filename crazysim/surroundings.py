@@ -4,12 +4,17 @@ XLA logs an error of 3,000 characters for each CPU program that it loads from a 
 ``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are no features of any CPU. What
 really fails is raised as an exception.
 
-MuJoCo draws through GLFW, which needs a screen. Without a screen, and where EGL is installed, it draws through EGL.
+MuJoCo draws through GLFW, which needs a screen. Without a screen, and where EGL is installed, it draws through EGL. A
+``MUJOCO_GL`` that it refuses would end the import of crazysim, so MuJoCo is imported here, and then without drawing.
 """
 
 import ctypes
 import os
 import sys
+import warnings
+
+refused: dict[str, str] = {}
+"""Variables that could not be used, with the user's values."""
 
 
 def set_variables() -> None:
@@ -21,6 +26,23 @@ def set_variables() -> None:
         os.environ["MUJOCO_GL"] = "egl"
 
 
+def import_mujoco() -> None:
+    """Import MuJoCo, and warn where ``MUJOCO_GL`` must be ``disable`` for that."""
+    try:
+        import mujoco
+    except Exception as error:  # of OpenGL's libraries, whose faults have many types
+        given = os.environ.get("MUJOCO_GL", "")
+        os.environ["MUJOCO_GL"] = "disable"
+        import mujoco  # noqa: F401
+
+        refused["MUJOCO_GL"] = given
+        warnings.warn(
+            f"expected a MUJOCO_GL that MuJoCo can use, got {given!r}: {error}. Use egl or glfw; until then nothing is "
+            "drawn.",
+            stacklevel=2,
+        )
+
+
 def _has_egl() -> bool:
     try:
         ctypes.CDLL("libEGL.so.1")
@@ -30,3 +52,4 @@ def _has_egl() -> bool:
 
 
 set_variables()
+import_mujoco()

@@ -70,3 +70,18 @@ def test_broken_settings_are_lines_with_the_reason(monkeypatch, capsys):
     monkeypatch.setenv("CXXFLAGS", "'-O2")
     assert main(["info"]) == 0
     assert "words in CXXFLAGS" in lines(capsys.readouterr().out)["C++ compiler"]
+
+
+def test_a_backend_that_cannot_be_used_is_a_line():
+    """MuJoCo ends its import at a ``MUJOCO_GL`` that it does not have, or whose library is missing."""
+    done = subprocess.run(
+        [sys.executable, "-m", "crazysim", "info"],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"MUJOCO_GL": "nope"},
+    )
+    assert done.returncode == 0
+    assert "expected a MUJOCO_GL that MuJoCo can use, got 'nope'" in done.stderr
+    found = lines(done.stdout)
+    assert found["rendering"].startswith("nope, fails: RuntimeError: invalid value")
+    assert "MUJOCO_GL=nope" in found["variables"]

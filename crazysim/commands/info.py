@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import crazysim
+from crazysim import surroundings
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
 """Packages that crazysim needs."""
@@ -134,15 +135,20 @@ def _size(folder: Path) -> str:
 def _rendering() -> str:
     """Return the backend of OpenGL, and whether it draws; tried in a process of its own, which it can end."""
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
+    environment = os.environ | surroundings.refused
+    backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"
     try:
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, env=environment
+        )
     except subprocess.TimeoutExpired:
-        return f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}, gave no answer in 60 s"
+        return f"{backend}, gave no answer in 60 s"
     lines = [line for line in done.stderr.strip().splitlines() if line and not line.startswith(" ")]
     result = "works" if done.returncode == 0 else f"fails: {lines[-1][:300] if lines else f'exit {done.returncode}'}"
-    return f"{os.environ.get('MUJOCO_GL') or 'MUJOCO_GL is not set'}, {result}"
+    return f"{backend}, {result}"
 
 
 def _variables() -> str:
-    given = [f"{name}={os.environ[name]}" for name in VARIABLES if name in os.environ]
+    environment = os.environ | surroundings.refused
+    given = [f"{name}={environment[name]}" for name in VARIABLES if name in environment]
     return ", ".join(given) or "none"
