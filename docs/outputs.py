@@ -1,5 +1,9 @@
 """Printed output of the Python blocks of a page: run them, compare, and write the output into the page.
 
+The blocks of a page run in one namespace, as a reader types them one after the other. A block ``python
+title="NAME.py"`` is a file of its own: it is saved under that name in the working directory and runs as ``python
+NAME.py`` does, without the names of other blocks.
+
 A block ``text`` that follows a block ``python`` shows what that block prints. ``text title="for example"`` shows what
 it printed once: times and other numbers that differ from run to run are not compared. ``python docs/outputs.py PAGE``
 runs a page and writes the outputs that are missing or have changed; the tests of ``tests/docs`` compare them.
@@ -9,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import io
 import os
 import re
@@ -19,7 +24,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 BLOCK = re.compile(
-    r"^```python\n(?P<code>.*?)^```\n(?:\n```text(?P<example> title=\"for example\")?\n(?P<output>.*?)^```\n)?",
+    r"^```python(?: title=\"(?P<file>\w+\.py)\")?\n(?P<code>.*?)^```\n"
+    r"(?:\n```text(?P<example> title=\"for example\")?\n(?P<output>.*?)^```\n)?",
     re.DOTALL | re.MULTILINE,
 )
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -31,6 +37,9 @@ class Block(NamedTuple):
 
     code: str
     """Source, with as many empty lines in front as precede it on the page, so that tracebacks show the page's lines."""
+
+    file: str | None
+    """Name of the file that the block is; None for one that continues those before it."""
 
     output: str | None
     """Output that the page shows below the block; None where it shows none."""
@@ -46,14 +55,37 @@ def blocks(text: str) -> Iterator[Block]:
     """Yield the Python blocks of a page in order."""
     for match in BLOCK.finditer(text):
         code = "\n" * text[: match.start("code")].count("\n") + match["code"]
-        yield Block(code, match["output"], match["example"] is not None, match.end())
+        yield Block(code, match["file"], match["output"], match["example"] is not None, match.end())
 
 
 def run(block: Block, page: Path, namespace: dict[str, Any]) -> str:
-    """Execute a block in a namespace and return what it prints, without spaces at the ends of lines."""
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        exec(compile(block.code, str(page), "exec", dont_inherit=True), namespace)
+    """Execute a block, in a namespace or as a file of its own, and return what it prints.
+
+    Lines are without spaces at their ends.
+    """
+    with contextlib.redirect_stdout(io.StringIO()) as printed, _as_file(block) as own:
+        code = compile(block.code, str(page), "exec", dont_inherit=True)
+        exec(code, namespace if own is None else own)
     return "".join(f"{line.rstrip()}\n" for line in printed.getvalue().strip("\n").splitlines())
+
+
+@contextlib.contextmanager
+def _as_file(block: Block) -> Iterator[dict[str, Any] | None]:
+    """Save a block that is a file and yield its namespace; modules that it imports from its folder are forgotten."""
+    if block.file is None:
+        yield None
+        return
+    folder = Path.cwd()
+    (folder / block.file).write_text(block.code.lstrip("\n"))
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
+    try:
+        yield {"__name__": "__main__", "__file__": str(folder / block.file)}
+    finally:
+        sys.path.remove(str(folder))
+        for name, module in list(sys.modules.items()):
+            if Path(getattr(module, "__file__", None) or "/").parent == folder:
+                del sys.modules[name]
 
 
 def same(shown: str, printed: str, example: bool = False) -> bool:

@@ -1,4 +1,6 @@
-"""Every Python block of every page runs, in the order of the page and in one namespace, and prints what is shown."""
+"""Every Python block of every page runs as a reader would run it, and prints what is shown."""
+
+import sys
 
 import pytest
 from pages import FIRST, PAGES, ROOT, outputs, run
@@ -83,3 +85,22 @@ def test_an_example_has_the_words_of_the_output_and_other_numbers():
 def test_an_output_belongs_to_the_block_before_it():
     text = "```python\nprint(1)\n```\n\n```text\n1\n```\n\n```python\nx = 1\n```\n\nPlan:\n\n```text\nx\n```\n"
     assert [block.output for block in outputs.blocks(text)] == ["1\n", None]
+
+
+def test_a_block_with_a_title_is_a_file_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = (
+        '```python title="mine.py"\nx = 1\nif __name__ == "__main__":\n    print("main")\n```\n\n'
+        "```python\ny = 2\n```\n\n"
+        '```python title="other.py"\nfrom mine import x\nprint(x, "y" in globals())\n```\n\n'
+        '```python title="wrong.py"\nprint(x)\n```\n'
+    )
+    first, plain, other, wrong = outputs.blocks(text)
+    namespace = {"__name__": "page"}
+    assert outputs.run(first, tmp_path / "page.md", namespace) == "main\n"
+    assert outputs.run(plain, tmp_path / "page.md", namespace) == ""
+    assert outputs.run(other, tmp_path / "page.md", namespace) == "1 False\n"
+    with pytest.raises(NameError, match="'x' is not defined"):
+        outputs.run(wrong, tmp_path / "page.md", namespace)
+    assert "mine" not in sys.modules
+    assert (tmp_path / "mine.py").read_text().startswith("x = 1\n")
