@@ -11,6 +11,8 @@ all learning curves. ``--parallel 12`` runs twelve trainings at a time, which ch
 from __future__ import annotations
 
 import argparse
+import itertools
+import re
 import subprocess
 import sys
 import time
@@ -35,7 +37,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="image of the learning curves")
     parser.add_argument("--only-plot", action="store_true", help="plot and summarise existing runs without training")
     args = parser.parse_args()
-    folders = {(task, seed): args.out / f"{task}-{args.device}-{seed}" for task in args.tasks for seed in args.seeds}
+    folders = {key: folder_of(args.out, *key, args.device) for key in itertools.product(args.tasks, args.seeds)}
     if not args.only_plot:
         with ThreadPoolExecutor(args.parallel) as pool:
             for run in [pool.submit(train, *key, folder, args.device) for key, folder in folders.items()]:
@@ -45,6 +47,11 @@ def main() -> None:
         summary(task, curves[task], args.device, args.parallel)
     if args.plot is not None:
         plot(curves, args.plot)
+
+
+def folder_of(out: Path, task: str, seed: int, device: str) -> Path:
+    """Return the folder of a run, which is in ``out`` whatever the place of the task, such as ``../task.py:NAME``."""
+    return out / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', task)}-{device}-{seed}"
 
 
 def plot(curves: dict[str, list[Any]], path: Path) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from crazysim import cache
 from crazysim.commands import airframe, demo, identify, info, live, replay, show, training, validate
-from crazysim.errors import DivergedError, RenderError
+from crazysim.errors import DivergedError, RenderError, not_installed
 
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
           "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio",
@@ -34,14 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = options.run(options)
         sys.stdout.flush()
-    except (ValueError, ImportError, DivergedError, RenderError) as error:
-        print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # who reads the output, such as head, has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
         return 141
+    except (ValueError, ImportError, OSError, DivergedError, RenderError) as error:
+        print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
+        return 2
     return status or 0
 
 
@@ -50,8 +50,7 @@ def _named_extra(error: Exception, command: str) -> str:
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package not in EXTRAS:
         return str(error)
-    install = f"pip install 'crazysim[{EXTRAS[package]}]'"
-    return f"expected {package}, which 'crazysim {command}' needs, got none. Run {install}."
+    return not_installed(f"'crazysim {command}' needs", package, EXTRAS[package])
 
 
 if __name__ == "__main__":

@@ -253,14 +253,15 @@ def announce(work: str, seconds: str) -> None:
 
 
 @contextlib.contextmanager
-def announced(work: str, seconds: str) -> Iterator[None]:
-    """Keep the programs of long work, and announce it where it has not ended after ``PATIENCE``.
+def announced(work: str, seconds: str, patience: float = PATIENCE) -> Iterator[None]:
+    """Keep the programs of long work, and announce it where it has not ended after some time.
 
     Args:
         work: Name of the work, such as ``"compiling the gradient"``.
         seconds: Duration on two cores, such as ``"10 to 40 s"``.
+        patience: Time after which it is announced, s.
     """
-    timer = threading.Timer(PATIENCE, announce, (work, seconds))
+    timer = threading.Timer(patience, announce, (work, seconds))
     timer.daemon = True
     timer.start()
     try:

@@ -21,6 +21,17 @@ def _kind(value: object) -> str:
     return f"a {type(value).__name__}"
 
 
+def not_installed(use: str, package: str, extra: str) -> str:
+    """Return the message about a package that is missing.
+
+    Args:
+        use: What needs it, and the verb, such as ``"films need"``.
+        package: Name of the package.
+        extra: Extra of crazysim that brings it.
+    """
+    return f"{use} {package}, which is not installed. Run pip install 'crazysim[{extra}]'."
+
+
 class ConfigError(ValueError):
     """Settings that are invalid, incomplete or contradict each other."""
 

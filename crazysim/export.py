@@ -18,7 +18,7 @@ from crazysim.engine.ir.program import Program, Slot, UnfusedStage
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
 from crazysim.engine.tools import symbolic
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, not_installed
 from crazysim.jaxcompat import is_key
 from crazysim.sim.sim import Sim
 
@@ -105,7 +105,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     try:
         import casadi
     except ImportError as error:
-        raise ImportError("CasADi is not installed; pip install 'crazysim[casadi]'") from error
+        raise ImportError(not_installed("the export needs", "casadi", "casadi")) from error
     data, stages = sim.data, as_stages(sim.step_pipeline)
     if not (0 <= world < data.core.n_worlds and 0 <= drone < data.core.n_drones):
         raise ConfigError(

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def progress(items: Iterable[Any], label: str, unit: str = "frame") -> Iterable[Any]:
-    """Return the items with a progress bar, if tqdm is installed.
+    """Return the items with a progress bar, if tqdm is installed and stderr is a terminal.
 
     Args:
         items: Items.
@@ -19,4 +19,4 @@ def progress(items: Iterable[Any], label: str, unit: str = "frame") -> Iterable[
     except ImportError:
         print(f"{label} ...")
         return items
-    return tqdm(items, desc=label, unit=unit, ncols=80)
+    return tqdm(items, desc=label, unit=unit, ncols=80, disable=None)

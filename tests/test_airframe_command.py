@@ -4,6 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from disks import full_disk
 
 from crazysim import load_airframe
 from crazysim.__main__ import main
@@ -43,12 +44,14 @@ def test_new_writes_a_file_that_check_reads_and_draws(tmp_path, capsys, opengl):
     assert found["auto"] == "state, attitude, body_rate"
     loops = ("position", "velocity", "attitude", "rate")
     gains = "; ".join(f"[pid.{loop}] kp, ki, kd" for loop in loops)
-    assert found["pid"] == f"not: lacks {gains}; [pid] tilt_max, thrust_base, thrust_min; [controller] pwm_max"
-    assert found["mellinger"].startswith("not: lacks [mellinger] mass, mass_thrust, kp, kd, ki, integral_max, kR, ")
+    lacking = f"{gains}; [pid] tilt_max, thrust_base, thrust_min; [controller] pwm_max"
+    assert found["pid"] == f"none; not state, attitude, body_rate: lacks {lacking}"
+    assert found["mellinger"].startswith(
+        "none; not state, attitude: lacks [mellinger] mass, mass_thrust, kp, kd, ki, integral_max, kR, "
+    )
     assert found["mellinger"].endswith("; [controller] pwm_max")
-    assert "state not: lacks [controller.state] kp, kd, ki, int_err_max; [controller] mass, " in found["crazyflow"]
-    assert "attitude, body_rate not: lacks [controller.attitude] kR, kw, ki_m" in found["crazyflow"]
-    assert found["crazyflow"].endswith("; force_torque")
+    assert found["crazyflow"].startswith("force_torque; not state: lacks [controller.state] kp, kd, ki, int_err_max;")
+    assert "; not attitude, body_rate: lacks [controller.attitude] kR, kw, ki_m" in found["crazyflow"]
     assert "warning" not in found
     from matplotlib.image import imread
 
@@ -76,8 +79,10 @@ def test_new_takes_rotors_one_by_one(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["mine.txt", *NUMBERS], "expected a .toml file in an existing folder"),
+        (["mine.txt", *NUMBERS], "expected the name of a file that ends with .toml"),
+        (["none/mine.toml", *NUMBERS], "expected an existing folder"),
         (["mine.toml", *NUMBERS], "expected either arm"),
+        (["mine.toml", *NUMBERS, "--arm", "0.12", "--rotors", "100000"], "rotors from 4 to 64, which alternate"),
         (["mine.toml", *NUMBERS, "--arm", "0.12", "--spins", "left"], "--spins of ccw and cw, got 'left'"),
         (["mine.toml", *NUMBERS, "--positions", "a,b"], "--positions such as"),
         (["there.toml", *NUMBERS, "--arm", "0.12"], "expected a new file"),
@@ -92,6 +97,23 @@ def test_wrong_arguments_are_one_line_and_write_nothing(arguments, message, tmp_
     assert message in error
     assert "\n" not in error
     assert not (tmp_path / "mine.toml").exists()
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    with full_disk():
+        assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "expected a file that can be written" in error
+    assert "\n" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_of_another_kind_is_refused_first(tmp_path, capsys):
+    assert main(["airframe", "check", "cf21B_500", "--picture", str(tmp_path / "x.exe")]) == 2
+    printed = capsys.readouterr()
+    assert "expected the name of a file that ends with .png, got" in printed.err
+    assert not printed.out
 
 
 def test_a_drone_is_checked_by_hand():

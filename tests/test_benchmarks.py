@@ -304,3 +304,12 @@ def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
     assert line["steps_per_s"] == pytest.approx(12 / line["gradient_s"], rel=0.01)
     assert line["forward_passes"] == pytest.approx(line["gradient_s"] / line["forward_s"], rel=0.01)
     assert line["jvp_passes"] == pytest.approx(line["jvp_s"] / line["forward_s"], rel=0.01)
+
+
+def test_the_runs_of_any_task_are_below_the_folder_that_was_named(benchmarks, tmp_path):
+    train = importlib.import_module("train")
+    places = ["hover", "tasks/mine.py:Mine", "../mine.py:Mine", f"{tmp_path}/mine.py:Mine"]
+    folders = [train.folder_of(tmp_path / "out", place, 0, "cpu") for place in places]
+    assert folders[0] == tmp_path / "out" / "hover-cpu-0"
+    assert {folder.resolve().parent for folder in folders} == {tmp_path / "out"}
+    assert len(set(folders)) == len(places)

@@ -1,5 +1,7 @@
 """The command line and the demo, as a user runs them, but smaller."""
 
+import errno
+import os
 import subprocess
 import sys
 import tomllib
@@ -35,6 +37,15 @@ def test_a_reader_may_have_read_enough():
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
+
+
+def test_an_error_of_the_system_is_a_line(monkeypatch, capsys):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out")
+
+    monkeypatch.setattr("crazysim.commands.info.run", full)
+    assert main(["info"]) == 2
+    assert capsys.readouterr().err == "crazysim: [Errno 28] No space left on device: 'out'\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from crazysim.commands.options import DefaultsFormatter
+from crazysim.storage import check_writable, write_file
 
 NUMBERS = (
     "mass", "propeller", "arm", "n_rotors", "layout", "thrust_to_weight", "motor_table", "pitch", "inertia",
@@ -66,8 +67,7 @@ def new(options: argparse.Namespace) -> None:
     from crazysim.drones import estimate_airframe, load_airframe
 
     path: Path = options.file
-    if path.suffix != ".toml" or not path.parent.is_dir():
-        raise ValueError(f"expected a .toml file in an existing folder, got {str(path)!r}")
+    check_writable(path, (".toml",))
     if path.exists():
         raise ValueError(f"expected a new file, got {str(path)!r}, which exists; choose another name or remove it")
     if wrong := [x for x in options.spins or () if x.lower() not in SPINS]:
@@ -85,7 +85,7 @@ def new(options: argparse.Namespace) -> None:
     )
     tables = tomllib.loads(text)
     load_airframe(tables)
-    path.write_text(text, encoding="utf-8")
+    write_file(path, text)
     estimates = [key for key, source in tables["sources"].items() if source.startswith("estimate: ")]
     print(f"wrote {path}; estimated: {', '.join(estimates)}")
     print(f"next: crazysim airframe check {path} --picture {path.with_suffix('.png')}")
@@ -96,6 +96,8 @@ def check(options: argparse.Namespace) -> None:
     from crazysim.commands.airframe_check import describe_airframe, draw_airframe
     from crazysim.drones import load_airframe
 
+    if options.picture is not None:
+        check_writable(options.picture, (".png",))
     airframe = load_airframe(options.file)
     print(describe_airframe(airframe))
     if options.picture is not None:

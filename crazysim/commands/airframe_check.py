@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from crazysim.control.bandwidth import rotor_rate
 from crazysim.control.controllers import CASCADE, find_controller
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, supported_dynamics
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
+from crazysim.storage import replacing
 
 GRAVITY = 9.81
 """Gravitational acceleration, m/s^2."""
@@ -53,9 +54,7 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
     try:
         from matplotlib.image import imsave
     except ImportError as error:
-        raise ImportError(
-            "expected matplotlib, which pictures need, got none. Run pip install 'crazysim[demo]'."
-        ) from error
+        raise ImportError(not_installed("pictures need", "matplotlib", "demo")) from error
 
     reach = float(np.max(np.linalg.norm(airframe.value("rotors.position")[:, :2], axis=-1)))
     sim = Sim(drone=airframe, dynamics=supported_dynamics(airframe)[0], control="attitude", controller="auto")
@@ -64,7 +63,8 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
         sim.data = sim.data.replace(states=states.replace(pos=states.pos + np.array([0, 0, 3 * reach])))
         view = {"lookat": [0, 0, 3 * reach], "distance": 5 * reach, "azimuth": 215, "elevation": -35}
         image: Any = sim.render("rgb_array", cam_config=view, width=960, height=640)
-        imsave(path, image)
+        with replacing(path) as file:
+            imsave(file, image, format=path.suffix[1:])
     finally:
         sim.close()
 
@@ -127,20 +127,27 @@ def _battery(airframe: Airframe) -> str:
 
 
 def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    """Yield which command levels each controller supports, or what it lacks."""
+    """Yield the command levels that each controller follows, or what it lacks."""
+    yield "controllers", "command levels that each of them follows"
     if Dynamics.first_principles not in dynamics:
         if dynamics:
-            yield "auto", "state, above the response of the fitted model"
-            lack = _lack(lambda: StateParams.create(airframe))
-            yield CASCADE, f"state {lack}; attitude" if lack else "state, attitude"
+            yield "  auto", "state, above the response of the fitted model"
+            yield f"  {CASCADE}", _levels({"state": _lack(lambda: StateParams.create(airframe)), "attitude": ""})
         return
     for name in STATE:
         found: Any = find_controller(name)
         lack = _lack(functools.partial(found.params, airframe))
-        yield name, lack or ", ".join(level.value for level in found.levels)
+        yield f"  {name}", _levels({", ".join(level.value for level in found.levels): lack})
     stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
     lacks = {levels: _lack(functools.partial(params.create, airframe)) for levels, params in stages.items()}
-    yield CASCADE, "; ".join(f"{levels} {lack}" if lack else levels for levels, lack in lacks.items())
+    yield f"  {CASCADE}", _levels(lacks)
+
+
+def _levels(lacks: Mapping[str, str]) -> str:
+    """Return the levels that nothing is lacking for, and the reasons why others are not among them."""
+    followed = ", ".join(levels for levels, lack in lacks.items() if not lack)
+    reasons = [f"not {levels}: {lack}" for levels, lack in lacks.items() if lack]
+    return "; ".join([followed or "none", *reasons])
 
 
 def _lack(create: Callable[[], Any]) -> str:
@@ -149,7 +156,7 @@ def _lack(create: Callable[[], Any]) -> str:
         create()
     except ConfigError as error:
         text = re.sub(r"^airframe '.*?' ", "", str(error).split(". ")[0])
-        return f"not: {text.split(', which ')[0]}"
+        return text.split(", which ")[0]
     return ""
 
 

@@ -31,6 +31,7 @@ from crazysim.identify import (
     read_log,
     with_speeds,
 )
+from crazysim.storage import PICTURES, check_writable, write_file
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -60,8 +61,11 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fit an airframe, print its errors, and write its file."""
-    if options.out.suffix != ".toml" or not options.out.parent.is_dir() or options.out.exists():
-        raise ValueError(f"expected a new .toml file in an existing folder, got {str(options.out)!r}")
+    check_writable(options.out, (".toml",))
+    if options.out.exists():
+        raise ConfigError(f"expected a new file, got {str(options.out)!r}, which exists. Choose another name.")
+    if options.plot is not None:
+        check_writable(options.plot, PICTURES)
     if options.dynamics != "first_principles" and options.network is not None:
         raise ConfigError(
             f"expected no --network with --dynamics {options.dynamics}, which has no residual. "
@@ -127,7 +131,7 @@ def _report(
 
 
 def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_file(path, text)
     print(f"wrote {path}")
 
 

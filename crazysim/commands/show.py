@@ -9,6 +9,7 @@ from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given
 from crazysim.errors import ConfigError
+from crazysim.storage import check_writable, write_file
 from crazysim.trajectories.files import Show, load_show
 
 
@@ -39,10 +40,8 @@ def run(options: argparse.Namespace) -> None:
     from crazysim.shows.view import play
 
     for path, suffixes in ((options.report, (".json",)), (options.page, (".html",)), (options.film, (".mp4", ".gif"))):
-        if path is not None and path.suffix not in suffixes:
-            raise ConfigError(f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}")
-        if path is not None and not path.parent.is_dir():
-            raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
+        if path is not None:
+            check_writable(path, suffixes)
     show = load_show(options.file)
     settings = given(options, "drone", "controller", "device")
     if options.live:
@@ -52,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     figures = report(flight)
     print(summary(flight, figures))
     if options.report is not None:
-        options.report.write_text(json.dumps(figures))
+        write_file(options.report, json.dumps(figures))
         print(f"wrote {options.report}")
     if options.film is not None:
         film(flight, options.film, options.fps, progress=True)
@@ -62,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
     if options.page is not None or options.browser:
         html = page(flight)
         if options.page is not None:
-            options.page.write_text(html, encoding="utf-8")
+            write_file(options.page, html)
             print(f"wrote {options.page}")
         if options.browser:
             from crazysim.media.web import serve_page

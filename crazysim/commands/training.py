@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter, given
+from crazysim.storage import PICTURES, check_writable
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -109,6 +110,8 @@ def evaluate(options: argparse.Namespace) -> None:
     from crazysim.train.show import plot_episode
     from crazysim.train.training import load_policy
 
+    if options.plot is not None:
+        check_writable(options.plot, PICTURES)
     policy, config, _ = load_policy(options.folder, options.task)
     env = config.with_device(options.device).make_env(options.worlds)
     key = None if options.seed is None else jax.random.key(options.seed)

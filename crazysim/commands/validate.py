@@ -12,13 +12,15 @@ from pathlib import Path
 
 import crazysim
 from crazysim.commands.options import DefaultsFormatter
-from crazysim.errors import ConfigError
-from crazysim.storage import replacing
+from crazysim.storage import check_writable, write_file
 from crazysim.validate import NAMES, Row, validate
 from crazysim.validate.page import bound_text, page
 from crazysim.validate.pictures import draw
 from crazysim.validate.rows import Section
 from crazysim.validate.sections import sections
+
+PICTURES = "pictures"
+"""Name of the folder of the pictures, beside the page."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -34,16 +36,16 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the page and its pictures; the exit status is 1 if a figure is out of its bound."""
-    if options.out.is_dir() or not options.out.parent.is_dir():
-        raise ConfigError(f"expected a file in an existing folder, got {str(options.out)!r}. Use --out validation.md.")
+    check_writable(options.out)
+    if (pictures := options.out.parent / PICTURES).exists():
+        check_writable(pictures / options.out.name)
     rows = validate(options.data, options.only)
     chosen = [section for section in sections(options.data) if section.name in options.only]
     for section in chosen:
         if section.missing:
             print(f"left out {section.name}: {section.missing}")
     pictures = _draw(chosen, rows, options.out.parent)
-    with replacing(options.out) as file:
-        file.write(page(chosen, rows, _made(chosen), pictures).encode())
+    write_file(options.out, page(chosen, rows, _made(chosen), pictures))
     for row in rows:
         if row.failed:
             print(f"failed: {row.what}: {row.problem or f'{row.text}, {bound_text(row.bound)} passes'}")
@@ -58,7 +60,7 @@ def _draw(chosen: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[
         own = [row for row in rows if row.section == section.name]
         if not any(row.series for row in own):
             continue
-        pictures[section.name] = f"pictures/validation_{section.name}.png"
+        pictures[section.name] = f"{PICTURES}/validation_{section.name}.png"
         try:
             draw(section, own, folder / pictures[section.name])
         except ImportError as error:

@@ -17,7 +17,7 @@ from crazysim.core.data import SimData
 from crazysim.demos.common import FPS, counted, frames_of
 from crazysim.dynamics import first_principles
 from crazysim.eager import compiled
-from crazysim.errors import RenderError
+from crazysim.errors import RenderError, not_installed
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
 from crazysim.progress import progress
@@ -25,6 +25,7 @@ from crazysim.pytree import on_device
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
+from crazysim.storage import write_figure
 
 PERIOD = 5.0
 """Period of the figure eight, s."""
@@ -211,7 +212,7 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
         matplotlib.use("Agg")
         from matplotlib import pyplot as plt
     except ImportError:
-        print("no plot: matplotlib is not installed; pip install 'crazysim[demo]'")
+        print(f"no plot: {not_installed('plots need', 'matplotlib', 'demo')}")
         return
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     setpoint = np.asarray(reference(jnp.linspace(0, PERIOD, 200)[:, None], 1))[:, 0]
@@ -228,7 +229,7 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     right.plot(seconds, np.median(flat, axis=1), color=COLORS[1], label="median")
     right.set(title=f"Tracking error of {flat.shape[1]:,} drones", xlabel="time, s", ylabel="error, cm", ylim=(0, None))
     right.legend(fontsize=8)
-    fig.savefig(path, dpi=110)
+    write_figure(fig, path, dpi=110)
     plt.close(fig)
     print(f"wrote {path}")
 

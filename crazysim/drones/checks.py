@@ -11,6 +11,8 @@ from crazysim.tables import INERTIA, check_numbers
 
 GRAVITY = 9.81
 """Gravitational acceleration, m/s^2."""
+MAX_ROTORS = 64
+"""Most rotors; the VoloCity, an air taxi, has 18."""
 MAX_THRUST_TO_WEIGHT = 1000
 """Largest ratio of thrust to weight; that of racers is about 20."""
 MAX_ANG_ACC = 1e6
@@ -35,6 +37,10 @@ def check_airframe(airframe: Airframe) -> None:
     if position.ndim != 2 or position.shape[1] != 3:
         raise ConfigError(f"{owner}: expected rotors.position of shape (n, 3), got {position.shape}")
     n = len(position)
+    if n > MAX_ROTORS:
+        raise ConfigError(
+            f"{owner}: expected at most {MAX_ROTORS} rotors, got {n}. Leave rotors.position of others out."
+        )
     for path, value in airframe.values.items():
         check_numbers(owner, path, value, LAYOUT.keys[path], n)
     for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.drones.checks import GRAVITY
+from crazysim.drones.checks import GRAVITY, MAX_ROTORS
 from crazysim.errors import ConfigError, shown
 from crazysim.storage import is_file
 from crazysim.tables import POSITIVE, number
@@ -246,9 +246,10 @@ def _rotors(
     if positions is None:
         if layout not in ("x", "+"):
             raise ConfigError(f"expected layout as 'x' or '+', got {shown(layout)}. Use positions for any other.")
-        if n_rotors < 4 or n_rotors % 2:
+        if not 4 <= n_rotors <= MAX_ROTORS or n_rotors % 2:
             raise ConfigError(
-                f"expected an even number of rotors from 4, which alternate, got {n_rotors}. Use positions and spins."
+                f"expected an even number of rotors from 4 to {MAX_ROTORS}, which alternate, got {n_rotors}. Use "
+                "positions and spins."
             )
         turn = 2 * np.pi / n_rotors
         angles = -turn * (np.arange(n_rotors) + (0.5 if layout == "x" else 0.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
+from crazysim.cache import announced
 from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import placed, stage_command
 from crazysim.core.pipeline import Pipeline
@@ -17,6 +19,9 @@ from crazysim.core.sharding import put, shard
 from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
+
+PATIENCE = 5.0
+"""Time after which the compilation of a step is announced, s: most take less, filters with many states take more."""
 
 
 class Stepper:
@@ -44,6 +49,7 @@ class Stepper:
         self._unsynced: object = None
         self._most_steps: int | None = None
         self._counted: tuple[object, int] = (None, 0)
+        self._compiled: Step | None = None
 
     @property
     def data(self) -> SimData:
@@ -115,11 +121,13 @@ class Stepper:
     def advance(self, n_steps: int) -> None:
         """Advance the data; any number of steps uses the same compilation."""
         self.count(n_steps)
-        flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
-        if flat.plan.host_call is None:
-            after = self.step.advance(flat, self._as_array(n_steps))
-        else:
-            after = self.step.advance_on_host(flat, n_steps)
+        compiles, self._compiled = self._compiled is not self.step, self.step
+        with announced("compiling the step", "5 to 40 s", PATIENCE) if compiles else nullcontext():
+            flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
+            if flat.plan.host_call is None:
+                after = self.step.advance(flat, self._as_array(n_steps))
+            else:
+                after = self.step.advance_on_host(flat, n_steps)
         self._data, self._unsynced = after, after.leaves[flat.plan.synced]
 
     def count(self, n_steps: int, times: int = 1) -> None:

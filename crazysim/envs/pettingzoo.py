@@ -17,12 +17,12 @@ from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, flatten
 from crazysim.envs.wrappers import AutoReset
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, not_installed
 
 try:
     from pettingzoo import ParallelEnv
 except ImportError as error:
-    raise ImportError("crazysim.envs.pettingzoo needs PettingZoo; pip install 'crazysim[pettingzoo]'") from error
+    raise ImportError(not_installed("crazysim.envs.pettingzoo needs", "pettingzoo", "pettingzoo")) from error
 
 
 class DroneParallelEnv(ParallelEnv):

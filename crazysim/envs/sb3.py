@@ -22,7 +22,9 @@ from crazysim.errors import ConfigError
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
-    raise ImportError("crazysim.envs.sb3 needs Stable-Baselines3; pip install stable-baselines3") from error
+    raise ImportError(
+        "crazysim.envs.sb3 needs stable-baselines3, which is not installed. Run pip install stable-baselines3."
+    ) from error
 
 
 class DroneVecEnv(VecEnv):

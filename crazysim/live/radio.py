@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.drones import load_airframe
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
 from crazysim.live.mocap.frames import Frame
 from crazysim.live.swarm import DroneState
 
@@ -91,7 +91,7 @@ class Radio(Closing):
             from cflib.crazyflie.log import LogConfig
             from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
         except ImportError as error:
-            raise ConfigError("expected cflib, got none. Run pip install 'crazysim[radio]'.") from error
+            raise ConfigError(not_installed("real Crazyflies need", "cflib", "radio")) from error
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         self._sync = SyncCrazyflie(uri, cf=crazyflie or Crazyflie())

@@ -56,7 +56,7 @@ def ros_messages() -> Any:
         found = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGES.items()}
     except ImportError as error:
         raise ConfigError(
-            f"expected an installation of ROS 2, got none: {error}. Source its setup file, or pass messages=."
+            f"messages need ROS 2, which is not installed ({error}). Source its setup file, or pass messages=."
         ) from error
     return SimpleNamespace(**found)
 

@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.core.settings import flag
-from crazysim.errors import ConfigError, RenderError
+from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media.flight import Flight
 from crazysim.media.flight_recorder import Clock, put
 from crazysim.media.view import View
 from crazysim.media.worlds import require_world
 from crazysim.sim.sim import Sim
+from crazysim.storage import check_writable, unfinished_path
 
 ENCODERS = {
-    # Fragments of a second, each written at once, keep what has been encoded readable if the encoder is killed.
+    # Fragments of a second, each written at once, keep the unfinished file readable if the program is killed.
     ".mp4": [
         "-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p", "-crf", "22",
         "-movflags", "+frag_keyframe+empty_moov", "-flush_packets", "1",
@@ -55,14 +56,14 @@ class Film:
         progress: bool = False,
         total: int | None = None,
     ):
-        """Prepare a film; the first frame creates the file.
+        """Prepare a film, which is in the file ``NAME.part`` until it is closed.
 
         Args:
             path: Path of an ``.mp4`` or ``.gif`` file.
             view: View to film; None for world 0 in 1280 x 720 pixels.
             fps: Frames per second of film.
             speed: Simulated seconds per second of film: 0.1 is slow motion, 10 a time lapse.
-            progress: True to show a progress bar, which needs tqdm.
+            progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
             total: Expected number of frames, for the bar.
 
         Raises:
@@ -70,12 +71,7 @@ class Film:
             ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         """
         self.path, self.view = Path(path), View() if view is None else view
-        if self.path.suffix.lower() not in ENCODERS:
-            raise ConfigError(
-                f"expected the name of a film to end with {' or '.join(ENCODERS)}, got {str(self.path)!r}"
-            )
-        if not self.path.parent.is_dir():
-            raise ConfigError(f"expected an existing folder, got {str(self.path.parent)!r} for {self.path.name!r}")
+        check_writable(self.path, tuple(ENCODERS))
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
@@ -179,7 +175,11 @@ class Film:
             ffmpeg.stdin.close()
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
-        if ffmpeg.wait() != 0:
+        unfinished = unfinished_path(self.path)
+        if ffmpeg.wait() == 0:
+            unfinished.replace(self.path)
+        else:
+            unfinished.unlink(missing_ok=True)
             raise RenderError(
                 f"expected a file that can be written, got {str(self.path)!r}: {message or 'ffmpeg failed'}"
             )
@@ -188,13 +188,12 @@ class Film:
         try:
             from imageio_ffmpeg import get_ffmpeg_exe
         except ImportError as error:
-            raise ImportError(
-                "expected imageio-ffmpeg, which films need, got none. Run pip install 'crazysim[demo]'."
-            ) from error
+            raise ImportError(not_installed("films need", "imageio-ffmpeg", "demo")) from error
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
         encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
-        target = str(self.path.absolute())  # not an option, as -y.mp4 would be
-        return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, "-y", target]
+        target = str(unfinished_path(self.path.absolute()))  # not an option, as -y.mp4 would be
+        kind = ["-f", self.path.suffix[1:].lower()]
+        return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, *kind, "-y", target]
 
     def __enter__(self) -> Film:
         return self
@@ -213,7 +212,5 @@ def _bar(total: int | None) -> Any:
     try:
         from tqdm import tqdm
     except ImportError as error:
-        raise ImportError(
-            "expected tqdm, which progress=True needs, got none. Run pip install 'crazysim[demo]'."
-        ) from error
-    return tqdm(total=total, desc="filming", unit="frame", ncols=80)
+        raise ImportError(not_installed("progress bars need", "tqdm", "demo")) from error
+    return tqdm(total=total, desc="filming", unit="frame", ncols=80, disable=None)

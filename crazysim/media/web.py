@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, RenderError
+from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media.access import LOCAL, Access, guarded_server, is_own_name, wrong_name
 from crazysim.media.flight import Flight
 from crazysim.media.trail import colors_of
 from crazysim.scene.visual_geoms import VisualGeom
+from crazysim.storage import check_writable, write_file
 
 FPS = 30
 """Samples per second of a page."""
@@ -67,11 +68,8 @@ def export(flight: Flight, path: str | Path, world: int | None = None) -> None:
         ImportError: If viser is not installed.
     """
     path = Path(path)
-    if path.suffix != ".html":
-        raise ConfigError(f"expected the name of a page to end with .html, got {str(path)!r}")
-    if not path.parent.is_dir():
-        raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
-    path.write_text(page(flight, world), encoding="utf-8")
+    check_writable(path, (".html",))
+    write_file(path, page(flight, world))
 
 
 def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.ThreadingHTTPServer:
@@ -285,7 +283,7 @@ def import_viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ImportError("expected viser, which pages need, got none. Run pip install 'crazysim[web]'.") from error
+        raise ImportError(not_installed("pages need", "viser", "web")) from error
     return viser
 
 

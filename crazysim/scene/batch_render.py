@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
 from crazysim.scene.render import camera_id, require_size
 
-MISSING = "expected MuJoCo Warp to render many worlds at once, got no warp-lang. Run pip install 'crazysim[warp]'."
+MISSING = not_installed("images of many worlds at once need", "warp-lang", "warp")
 
 
 def installed() -> bool:

@@ -48,7 +48,7 @@ def film(
         flight: Flight.
         path: ``.mp4`` or ``.gif`` file to write.
         fps: Frames per second.
-        progress: True to show a progress bar, which needs tqdm.
+        progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
         night: True to darken the scene, which makes the lights stand out.
         view: Settings of ``crazysim.media.View`` other than its own.
 

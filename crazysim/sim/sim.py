@@ -523,7 +523,7 @@ class Sim:
             n_control_steps: Number of control steps; a multiple of ``every``.
             keep: ``keep(data)`` returns what to record after a control step, any tree of arrays.
             every: Control steps from one record to the next.
-            progress: True to show a bar, which needs tqdm.
+            progress: True to show a bar, which needs tqdm, where stderr is a terminal.
 
         Returns:
             The results of ``keep``, with time in front. (n_control_steps // every, ...)

@@ -19,7 +19,8 @@ import crazysim
 from crazysim.control import Control
 from crazysim.envs.env import Env
 from crazysim.envs.statistics import CLIP, EPSILON
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
+from crazysim.storage import write_file
 from crazysim.train.networks import Policy
 
 OBSERVATIONS = {
@@ -85,7 +86,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         import onnx
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
-        raise ImportError("writing ONNX files needs onnx; pip install 'crazysim[onnx]'") from error
+        raise ImportError(not_installed("ONNX files need", "onnx", "onnx")) from error
     mean, std, layers = _numbers(policy, meta)
     constants = {"mean": mean, "std": std, "low": np.float32(-CLIP), "high": np.float32(CLIP)}
     nodes = [
@@ -119,7 +120,7 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
     helper.set_model_props(model, {k: v if isinstance(v, str) else json.dumps(v) for k, v in properties.items()})
     onnx.checker.check_model(model)
     path = Path(path)
-    path.write_bytes(model.SerializeToString())
+    write_file(path, model.SerializeToString())
     return path
 
 
@@ -167,7 +168,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
     ]
     lines += ["{", *(f"    {line}" for line in _body(name, layers)), "}", "", f"#endif /* {guard} */", ""]
     path = Path(path)
-    path.write_text("\n".join(lines))
+    write_file(path, "\n".join(lines))
     return path
 
 

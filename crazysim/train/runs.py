@@ -42,7 +42,7 @@ def run(
         film: True to write a film.
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
-        progress: True to show progress bars, if tqdm is installed.
+        progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
         settings: ``algorithm``, ``seed``, ``n_worlds``, ``options`` and ``config`` of ``TrainConfig.create``.
 
     Raises:

@@ -13,11 +13,12 @@ from jax import Array
 
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.state import EnvState, Obs
+from crazysim.errors import not_installed
 from crazysim.media import Film, View
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
-from crazysim.storage import reading
+from crazysim.storage import reading, write_figure
 from crazysim.train.evaluation import HELD_OUT, TERM, as_tree, fly
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE
@@ -110,7 +111,7 @@ def _figure(n: int) -> Any:
         matplotlib.use("Agg")
         import matplotlib.pyplot as plt
     except ImportError as error:
-        raise ImportError("a plot needs matplotlib; pip install 'crazysim[train]'") from error
+        raise ImportError(not_installed("plots need", "matplotlib", "train")) from error
     figure, axes = plt.subplots(1, n, figsize=(4 * n, 3.5), constrained_layout=True)
     for axis in axes:
         axis.grid(alpha=0.3)
@@ -122,7 +123,7 @@ def _save(figure: Any, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    write_figure(figure, path, dpi=110)
     plt.close(figure)
 
 

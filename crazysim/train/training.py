@@ -82,7 +82,7 @@ def train(
         resume: True to continue from the checkpoint in the folder.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
-        progress: True to show a progress bar, if tqdm is installed.
+        progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
@@ -365,7 +365,7 @@ def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
     except ImportError:
         yield lambda *_: None
         return
-    with tqdm(total=total, initial=done, unit="iteration", ncols=100) as bar:
+    with tqdm(total=total, initial=done, unit="iteration", ncols=100, disable=None) as bar:
         shown: dict[str, str] = {}
 
         def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:

@@ -6,6 +6,8 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from crazysim.errors import not_installed
+from crazysim.storage import replacing
 from crazysim.validate.rows import Row, Section
 
 
@@ -26,9 +28,7 @@ def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(
-            "expected matplotlib, which pictures need, got none. Run pip install 'crazysim[demo]'."
-        ) from error
+        raise ImportError(not_installed("pictures need", "matplotlib", "demo")) from error
     from PIL import Image
 
     rows = [row for row in rows if row.series and not row.problem]
@@ -59,4 +59,5 @@ def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=110)
     path.parent.mkdir(exist_ok=True)
-    Image.open(buffer).convert("RGB").quantize(64).save(path, optimize=True)
+    with replacing(path) as file:
+        Image.open(buffer).convert("RGB").quantize(64).save(file, format="PNG", optimize=True)

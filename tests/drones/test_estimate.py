@@ -116,6 +116,7 @@ def test_given_numbers_replace_estimates():
         ({"mass": 1200.0}, r"mass in kg and lengths in m, got 1200 kg, .* N/m\^2 of propeller"),
         ({"arm": 120.0}, "mass in kg and lengths in m, .*rotors up to 120 m from the centre"),
         ({"n_rotors": 5}, "an even number of rotors from 4"),
+        ({"n_rotors": 100_000}, "an even number of rotors from 4 to 64, which alternate, got 100000"),
         ({"layout": "h"}, "layout as 'x' or '\\+', got 'h'"),
         ({"arm": None, "positions": [[0.1, 0.1, 0]]}, "at least 3 rotors"),
         ({"arm": None, "positions": [[0.2, 0], [-0.2, 0.2], [-0.2, -0.2]]}, "expected spins for 3 rotors"),

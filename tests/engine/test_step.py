@@ -469,7 +469,7 @@ def hold(gain, data):
     return jnp.concatenate([jnp.zeros_like(data.states.pos), thrust], axis=-1)
 
 
-def test_a_rollout_is_the_loop_it_stands_for():
+def test_a_rollout_is_the_loop_it_stands_for(capfd):
     """The same numbers, kept at the rate asked for, and the simulation goes on from the end."""
     sim = Sim(n_worlds=3, n_drones=2, control="attitude", attitude_freq=100)
     start, gain = sim.data, jnp.float32(0.3)
@@ -485,6 +485,7 @@ def test_a_rollout_is_the_loop_it_stands_for():
     assert not start.states.pos.is_deleted()  # law 11
     again = sim.rollout(hold, gain, 40, keep=lambda d: d.states.pos, every=20, progress=True)
     assert again.shape == (2, 3, 2, 3)
+    assert "control steps" not in capfd.readouterr().err  # no bar without a terminal
 
 
 def test_a_rollout_returns_its_last_command_where_leaves_share_an_array():

@@ -1,5 +1,7 @@
 """Data between calls of the compiled step: flattened while it advances, a record when it is read."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from crazysim import Sim
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
 from crazysim.engine import Stepper, step
+from crazysim.engine import stepper as stepper_module
 
 
 @pytest.fixture
@@ -52,6 +55,23 @@ def test_steps_in_a_row_flatten_once(stepper, monkeypatch):
     stepper.assign(stepper.data.replace())
     stepper.advance(1)
     assert len(flattened) == 2
+
+
+def test_a_step_that_compiles_for_long_is_announced_once(sim, stepper, monkeypatch):
+    """The first step of a pipeline compiles: with a filter of many states for most of a minute."""
+    announced = []
+
+    def announce(work, *_):
+        announced.append(work)
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr(stepper_module, "announced", announce)
+    for _ in range(3):
+        stepper.advance(1)
+    assert announced == ["compiling the step"]
+    stepper.build(sim.step_pipeline)
+    stepper.advance(1)
+    assert len(announced) == 2
 
 
 LEVELS = [

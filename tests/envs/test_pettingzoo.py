@@ -130,8 +130,12 @@ def test_pictures(functional):
 @pytest.mark.parametrize(
     ("module", "package", "way"),
     [
-        ("crazysim.envs.pettingzoo", "pettingzoo", r"needs PettingZoo; pip install 'crazysim\[pettingzoo\]'"),
-        ("crazysim.envs.sb3", "stable_baselines3", "needs Stable-Baselines3; pip install stable-baselines3"),
+        (
+            "crazysim.envs.pettingzoo",
+            "pettingzoo",
+            r"needs pettingzoo, which is not installed\. Run pip install 'crazysim\[pettingzoo\]'",
+        ),
+        ("crazysim.envs.sb3", "stable_baselines3", "needs stable-baselines3, which is not installed"),
     ],
 )
 def test_without_a_package_the_way_to_it_is_told(monkeypatch, module, package, way):

@@ -6,6 +6,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disks import full_disk
 from pictures import frames_of
 
 from crazysim.errors import ConfigError, RenderError
@@ -75,7 +76,7 @@ def test_a_reset_does_not_turn_the_film_back(sim, tmp_path):
     assert film.n_frames == 5  # 0.2 s before the reset, 0.2 s after it
 
 
-def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path):
+def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path, capfd):
     """Recorded at 10 Hz and played at 20 Hz: drones are interpolated, and the simulation stays as it is."""
     recorder = Recorder(sim)
     for k in range(6):
@@ -85,6 +86,7 @@ def test_a_recorded_flight_is_played_world_by_world(sim, tmp_path):
     shown = view(worlds=[0, 1], columns=1, border=0)
     with Film(tmp_path / "flight.mp4", shown, fps=20, progress=True) as film:
         assert film.play(sim, recorder.flight()) == 11
+    assert not capfd.readouterr().err  # no bar without a terminal
     np.testing.assert_allclose(sim.data.states.pos[:, 0, 0], 9.5)
     np.testing.assert_array_equal(sim.data.core.steps, 5000)
     frames = frames_of(tmp_path / "flight.mp4", HEIGHT, WIDTH)
@@ -116,7 +118,7 @@ def test_a_name_that_looks_like_an_option_is_a_name(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("flight.avi", {}, "expected the name of a film to end with .mp4 or .gif"),
+        ("flight.avi", {}, "expected the name of a file that ends with .mp4 or .gif"),
         ("nowhere/flight.mp4", {}, "expected an existing folder"),
         ("flight.mp4", {"fps": 0}, "expected a positive fps, got 0"),
         ("flight.mp4", {"fps": -5}, "got -5"),
@@ -152,11 +154,27 @@ def test_wrong_worlds_cameras_and_images_are_refused(sim, tmp_path):
 
 def test_an_unwritable_file_is_refused(sim, tmp_path):
     (tmp_path / "flight.mp4").mkdir()
-    with (
-        pytest.raises(RenderError, match=r"can be written, got .*flight\.mp4': "),
-        Film(tmp_path / "flight.mp4", view()) as film,
-    ):
+    with pytest.raises(ConfigError, match=r"can be written, got the folder .*flight\.mp4'"):
+        Film(tmp_path / "flight.mp4", view())
+
+
+def test_a_film_takes_the_place_of_another_one_when_it_is_whole(sim, tmp_path):
+    path = tmp_path / "flight.mp4"
+    path.write_bytes(b"before")
+
+    def film_until_the_disk_is_full():
+        with full_disk(), Film(path, view()) as film:
+            film.add(sim)
+            assert path.read_bytes() == b"before"
+
+    with pytest.raises(RenderError, match=r"can be written, got .*flight\.mp4': "):
+        film_until_the_disk_is_full()
+    assert path.read_bytes() == b"before"
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.mp4"]
+    with Film(path, view()) as film:
         film.add(sim)
+    assert path.read_bytes()[4:8] == b"ftyp"
+    assert [p.name for p in tmp_path.iterdir()] == ["flight.mp4"]
 
 
 @pytest.mark.parametrize(("missing", "word"), [("imageio_ffmpeg", "imageio-ffmpeg"), ("tqdm", "tqdm")])
@@ -169,5 +187,5 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, missing, word):
         return found(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=rf"expected {word}, .*pip install 'crazysim\[demo\]'"):
+    with pytest.raises(ImportError, match=rf"need {word}, which is not installed\. Run pip install 'crazysim\[demo\]'"):
         Film(tmp_path / "flight.mp4", progress=True)

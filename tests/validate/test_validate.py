@@ -57,10 +57,20 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
     assert main(["validate", "--only", "idsia", "nanobench", "--data", str(tmp_path), "--out", out]) == 1
     lines = capsys.readouterr().out.splitlines()
     (failed,) = (line for line in lines if line.startswith("failed"))
-    assert "failed: open loop: melon.npz: expected arrays of numbers as of numpy.savez" in failed
+    assert "failed: open loop: expected a log of a flight, got 'melon.npz', which is damaged" in failed
     assert "left out nanobench: FOLDER has no folder nanobench" in lines
-    assert main(["validate", "--only", "idsia", "--out", str(tmp_path)]) == 2
-    assert "expected a file in an existing folder" in capsys.readouterr().err
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("crazysim.commands.validate.validate", lambda *_: pytest.fail("minutes of work"))
+    for out, message in ((tmp_path, "got the folder"), (tmp_path / "none" / "page.md", "expected an existing folder")):
+        assert main(["validate", "--only", "closed", "--out", str(out)]) == 2
+        assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "pictures").write_text("no folder")
+    assert main(["validate", "--only", "closed", "--out", str(tmp_path / "page.md")]) == 2
+    assert "expected an existing folder, got" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["pictures"]
 
 
 @pytest.mark.parametrize("check", [closed_forms.free_fall, closed_forms.precession, closed_forms.dzhanibekov])

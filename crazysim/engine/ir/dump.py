@@ -7,6 +7,8 @@ import os
 import re
 from pathlib import Path
 
+from crazysim.storage import write_file
+
 VARIABLE = "CRAZYSIM_DUMP"
 """Environment variable that names the folder; nothing is written where it is not set."""
 
@@ -34,5 +36,5 @@ def write(name: str, text: str) -> Path | None:
     folder = Path(os.environ[VARIABLE])
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{os.getpid()}-{next(_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}"
-    file.write_text(text)
+    write_file(file, text)
     return file

@@ -63,7 +63,7 @@ def _simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[Sim, lis
             import yaml
         except ImportError as error:
             raise ConfigError(
-                "expected the package PyYAML to read crazyflies.yaml, got none. Install it with pip install pyyaml."
+                "crazyflies.yaml needs PyYAML, which is not installed. Run pip install pyyaml."
             ) from error
         try:
             configuration = yaml.safe_load(Path(configuration).read_text())

@@ -6,7 +6,7 @@ import queue
 from typing import Any
 from urllib.parse import urlparse
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
 from crazysim.live.crtp.device import CrtpDevice
 from crazysim.live.swarm import Swarm
 
@@ -24,7 +24,7 @@ def add_cflib_driver(swarm: Swarm) -> list[str]:
     try:
         import cflib.crtp
     except ImportError as error:
-        raise ConfigError("expected cflib, got none. Run pip install 'crazysim[radio]'.") from error
+        raise ConfigError(not_installed("links of cflib need", "cflib", "radio")) from error
     remove_cflib_driver(swarm)
     _drivers[id(swarm)] = _driver(swarm)
     cflib.crtp.CLASSES.insert(0, _drivers[id(swarm)])

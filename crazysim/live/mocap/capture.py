@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
 from crazysim.live.mocap.frames import Convention, Frame
 from crazysim.live.mocap.source import ThreadSource
 
@@ -58,9 +58,7 @@ class MotionCaptureSource(ThreadSource):
         if system not in SYSTEMS:
             raise ConfigError(f"expected one of {', '.join(SYSTEMS)}, got {system!r}")
         if command is None and find_spec("motioncapture") is None:
-            raise ConfigError(
-                "expected the package motioncapture, got none installed. Run pip install 'crazysim[mocap]'."
-            )
+            raise ConfigError(not_installed("motion capture needs", "motioncapture", "mocap"))
         super().__init__(f"{system} at {hostname}", convention)
         command = [sys.executable, str(WORKER)] if command is None else command
         self._worker = subprocess.Popen([*command, system, hostname], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL)

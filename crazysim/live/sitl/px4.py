@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, not_installed
 from crazysim.live.sitl.link import DRAINING, TIMEOUT, FirmwareLink, check_address
 from crazysim.live.sitl.measured import ZURICH, Measured, Origin, as_origin, frd, ned, quat_ned
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
@@ -66,7 +66,7 @@ class Px4(FirmwareLink):
         try:
             from pymavlink.dialects.v20 import common
         except ImportError as error:
-            raise ConfigError("expected pymavlink, got none. Run pip install 'crazysim[mavlink]'.") from error
+            raise ConfigError(not_installed("links to PX4 need", "pymavlink", "mavlink")) from error
         self._mavlink: Any = common
         check_address(host, port)
         self.origin = as_origin(origin)

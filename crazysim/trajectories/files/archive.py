@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from crazysim.errors import ConfigError, shown
-from crazysim.storage import ZipReader, reading
+from crazysim.storage import ZipReader, reading, write_file
 from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
@@ -92,4 +92,4 @@ def write_archive(path: str | Path, files: Mapping[str, str]) -> None:
             entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, content)
-    checks.write_bytes(path, buffer.getvalue())
+    write_file(path, buffer.getvalue())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -36,18 +35,6 @@ def refuse(expected: str, got: str, place: str) -> NoReturn:
         ConfigError: Always.
     """
     raise ConfigError(f"expected {expected}, got {got} in {place}")
-
-
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file.
-
-    Raises:
-        ConfigError: If the folder does not exist.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
-    path.write_bytes(content)
 
 
 def parse_json(content: bytes | str, place: str) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError, shown
-from crazysim.storage import read_text
+from crazysim.storage import read_text, write_file
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.polynomials import of_rows, rows_of
 from crazysim.trajectories.splines import of_unit_pieces
@@ -92,7 +92,7 @@ def save_csv(trajectory: Trajectory, path: str | Path) -> None:
         ConfigError: If its degree is higher, or the folder does not exist.
     """
     lines = [POLYNOMIALS, *(",".join(f"{x:.9g}" for x in row) for row in rows_of(trajectory))]
-    checks.write_bytes(path, "".join(f"{line}\n" for line in lines).encode())
+    write_file(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayLike | None = None) -> None:
@@ -118,4 +118,4 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
             "Pass one row per time."
         )
     lines = [header, *(",".join(f"{x:.9g}" for x in row) for row in np.concatenate(columns, axis=1))]
-    checks.write_bytes(path, "".join(f"{line}\n" for line in lines).encode())
+    write_file(path, "".join(f"{line}\n" for line in lines).encode())

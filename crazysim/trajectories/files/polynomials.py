@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.storage import read_bytes
+from crazysim.storage import read_bytes, write_file
 from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split
@@ -200,7 +200,7 @@ def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = Fal
     Raises:
         ConfigError: If the folder does not exist, or the format cannot hold the trajectory.
     """
-    checks.write_bytes(path, pack_compressed(trajectory) if compressed else pack_poly4d(trajectory))
+    write_file(path, pack_compressed(trajectory) if compressed else pack_poly4d(trajectory))
 
 
 def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
