@@ -20,6 +20,9 @@ from crazysim.identify.repairs import check_period
 from crazysim.identify.ulog import read_ulog
 from crazysim.storage import read_arrays, reading
 
+MAX_LOG = 2**31
+"""Largest file of a log, bytes, but for ROS bags, which are not read into memory as a whole."""
+
 
 def read_table(
     source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
@@ -59,6 +62,8 @@ def _read(
             return path.stem, read_bag(path, repairs, columns)
     if not path.is_file():
         raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
+    if (size := path.stat().st_size) > MAX_LOG:
+        raise ConfigError(f"{path.name}: expected a log of at most {MAX_LOG} bytes, got {size}. Cut it into flights.")
     with reading(path.name, "a log of a flight", "Copy or export it again."):
         if path.suffix == ".ulg":
             return path.stem, read_ulog(path, repairs)

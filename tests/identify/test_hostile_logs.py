@@ -280,6 +280,13 @@ def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, cap
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("name", ["log00", "a.ulg", "a.csv", "a.npz"])
+def test_a_log_without_an_end_is_refused_before_it_is_read(name, tmp_path, traced):
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(2**40)  # takes no room on the disk
+    assert "expected a log of at most 2147483648 bytes, got 1099511627776" in refusal(tmp_path / name, None, None)
+
+
 def test_a_blackbox_log_without_a_motor_or_with_a_strange_setting_is_refused_or_read(seeds, tmp_path):
     text, path = seeds["blackbox"].decode(), tmp_path / "a.csv"
     path.write_text(text.replace("motor[2]", "other", 1))
