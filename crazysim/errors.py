@@ -25,7 +25,7 @@ def not_installed(use: str, package: str, extra: str) -> str:
     """Return the message about a package that is missing.
 
     Args:
-        use: What needs it, and the verb, such as ``"films need"``.
+        use: Subject and verb of the sentence, such as ``"films need"``.
         package: Name of the package.
         extra: Extra of crazysim that brings it.
     """

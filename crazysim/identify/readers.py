@@ -211,7 +211,7 @@ def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], s
         for _ in range(count):
             entry, at = text(at)
             if (found := VARIABLE.fullmatch(entry)) is None:
-                raise ValueError(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
+                raise struct.error(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
             variables.append(found[1])
             layout += found[2]
         kinds[key] = (name, variables, struct.Struct(layout))

@@ -185,7 +185,7 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
 def _layout(
     file: str, formats: Mapping[str, str], name: str, prefix: str = "", depth: int = 0
 ) -> list[tuple[str, str]]:
-    """Return names and types of the fields of a format, those of nested formats written out.
+    """Return names and types of the fields of a format, those of nested formats unrolled.
 
     Padding at the end, which PX4 does not log, is left out.
 
