@@ -138,7 +138,7 @@ def test_an_exported_flight_opens_from_its_file(chromium, flight, tmp_path, caps
     [
         (["nowhere.npz"], "expected an existing file with a recorded flight, got 'nowhere.npz'"),
         (["flight.npz", "--world", "5"], "expected a recorded world, one of [0, 1], got 5"),
-        (["flight.npz", "--export", "flight.txt"], "to end with .html"),
+        (["flight.npz", "--export", "flight.txt"], "a file that ends with .html"),
         (["flight.npz", "--export", "nowhere/flight.html"], "expected an existing folder, got 'nowhere'"),
         (["flight.npz", "--port", "99999"], "Choose another --port"),
     ],
