@@ -57,7 +57,7 @@ def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> 
     tables["drag"] = {"coefficients": linear * drag}
     sim = Sim(n_worlds, drone=tables, control="rotor_vel", integrator="rk4", freq=FREQ)
     p, inertia = sim.data.params, np.diag([params["Ixx"], params["Iyy"], params["Izz"]])
-    # Airframes refuse these moments of inertia, since the largest exceeds the sum of the others.
+    # As parameters: in an airframe they are a warning, since the largest moment exceeds the sum of the others.
     changes = {"J": inertia, "J_inv": np.linalg.inv(inertia), "prop_inertia": np.zeros_like(p.prop_inertia)}
     sim.data = sim.data.replace(params=p.replace(**{k: np.asarray(x, p.J.dtype) for k, x in changes.items()}))
     return sim

@@ -74,6 +74,9 @@ def update_flow(
 ) -> Estimate:
     """Return the estimate after a measured motion of the image of the ground.
 
+    As in the firmware, both numbers are predicted from the estimate before either was used, so that the second one
+    counts part of the first once more. With biases, the second one is predicted from the estimate after the first.
+
     Args:
         estimate: The estimate.
         rot: Attitude at the end of the loop before, as a matrix. (3, 3)
@@ -82,15 +85,17 @@ def update_flow(
         scale: Pixels by which the image moves at 1 rad/s. ()
         deviation: Standard deviation of a motion, pixels.
     """
+    at = estimate
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
-        height = jnp.maximum(estimate.pos[2], LOWEST)
+        height = jnp.maximum(at.pos[2], LOWEST)
         rate = rot[2, 2] / height
-        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-estimate.vel[k] * rate / height, rate]
-        if estimate.gyro_bias is not None:
-            turn = turn - estimate.gyro_bias[axis]
+        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-at.vel[k] * rate / height, rate]
+        if at.gyro_bias is not None:
+            turn = turn - at.gyro_bias[axis]
             rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(rate, -sign)]
-        predicted = scale * (estimate.vel[k] * rate + sign * turn)
+        predicted = scale * (at.vel[k] * rate + sign * turn)
         estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
+        at = at if estimate.gyro_bias is None else estimate
     return estimate
 
 

@@ -1,10 +1,11 @@
-"""Record ``firmware_filter.npz``: the compiled Kalman filter of the firmware on random inputs.
+"""Record ``firmware_filter.npz``: the compiled Kalman filter of the firmware in fast flights, and on the ground.
 
     python tests/plugins/estimators/record_filter.py PATH/OF/crazyflie-firmware
 
-Needs gcc and a checkout of bitcraze/crazyflie-firmware; recorded at commit 2a18fc29 on 2026-11-24. The functions of
-CMSIS that the filter calls are replaced by plain C. Loops last 1 ms; every 20th is kept: position, velocity in the body
-frame, attitude error, attitude wxyz, and the upper triangle of the covariance.
+Needs gcc and a checkout of bitcraze/crazyflie-firmware; recorded at commit 2a18fc29 on 2026-11-25. The functions of
+CMSIS that the filter calls are replaced by plain C. Flights last 4 s, with up to 5.4 m/s and tilts up to 62 degrees.
+Loops last 1 ms; every 100th is kept: position, velocity in the body frame, attitude error, attitude wxyz, and the upper
+triangle of the covariance.
 """
 
 import ctypes
@@ -52,80 +53,111 @@ def v(x):
     return (f * len(x))(*[float(a) for a in x])
 
 
-rng = np.random.default_rng(5)
+LOOPS, EVERY, GRAVITY = 4000, 100, 9.81
+PIXELS = 35 / 0.71674
+"""Pixels per rad of the flow sensor (mm_flow.c)."""
 ANCHORS = np.float32([[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]])
+STATIONS = np.float32([[-3.5, -3.0, 2.4], [3.5, 3.0, 2.4]])
+DIODE = np.float32([0.015, 0.0075, 0.0])
 
 
-def rotation(rng):
-    q = rng.normal(size=4)
-    q /= np.linalg.norm(q)
-    x, y, z, w = q
-    return np.float32(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def facing(place):
+    """Return the attitude of a station that looks at the middle of the flight, station to world. (3, 3)"""
+    x = np.array([0, 0, 1.2]) - place
+    y = np.cross([0, 0, 1], x)
+    return np.float32(np.stack([a / np.linalg.norm(a) for a in (x, y, np.cross(x, y))], axis=-1))
 
 
-def run(lib, kind, loops=400, every=20):
+FRAMES = np.stack([facing(place) for place in STATIONS])
+
+
+def flight():
+    """Return position, velocity, attitude as matrices, angular velocity and specific force in each loop.
+
+    A Lissajous figure that starts at rest, whose thrust points along the acceleration, with a heading that turns.
+    """
+    t = np.arange(-5, LOOPS + 6) / 1000
+    s = np.clip(t, 0, 1)
+    phase = np.where(t < 1, s**3 - s**4 / 2, t - 0.5)
+    pos = np.stack([a * np.sin(w * phase) for a, w in ((1.6, 2.6), (1.2, 3.1), (0.3, 2.2))], axis=-1) + [0, 0, 1.2]
+    vel = np.gradient(pos, 1e-3, axis=0)
+    force = np.gradient(vel, 1e-3, axis=0) + [0.0, 0.0, GRAVITY]
+    z = force / np.linalg.norm(force, axis=-1, keepdims=True)
+    yaw = 1.5 * phase
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1)
+    y = np.cross(z, ahead)
+    y /= np.linalg.norm(y, axis=-1, keepdims=True)
+    rot = np.stack([np.cross(y, z), y, z], axis=-1)
+    turn = np.einsum("kji,kjl->kil", rot, np.gradient(rot, 1e-3, axis=0))
+    rate = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=-1)
+    return [x[5:-5] for x in (pos, vel, rot, rate, np.einsum("kji,kj->ki", rot, force))]
+
+
+def quaternion(rot):
+    """Return the quaternion of a rotation by less than pi, xyzw."""
+    w = 0.5 * np.sqrt(max(1 + np.trace(rot), 1e-12))
+    v = [rot[2, 1] - rot[1, 2], rot[0, 2] - rot[2, 0], rot[1, 0] - rot[0, 1]]
+    return np.array([*(np.array(v) / (4 * w)), w])
+
+
+def inertial(flown, flies, rng):
+    """Return accelerations and angular velocities of each loop, used in every tenth, zero in the others. (n, 6)"""
+    rows = np.zeros((LOOPS + 1, 6), np.float32)
+    for k in range(10, LOOPS + 1, 10):
+        accel, rate = flown[4][k - 10 : k].mean(0), flown[3][k - 10 : k].mean(0)
+        if not flies:
+            accel, rate = np.array([0.3, -0.2, GRAVITY]), 0.8 * np.sin(k / 1000 * np.array([4.4, 6.9, 2.5]))
+        rows[k] = *(accel + 0.3 * rng.normal(size=3)), *(rate + 0.02 * rng.normal(size=3))
+    return rows
+
+
+def run(lib, kind, flown, sums):
+    """Return the measurements of each loop, and the outputs."""
+    rng = np.random.default_rng(7)
     inputs, out = [], []
-    start = [0.3, -0.2, 1.0, 0.0]
-    lib.k_init(*[f(x) for x in start])
-    pos = np.array(start[:3])
-    g0 = rng.normal(size=3) * 0.5
-    rotation(rng)  # one draw, to keep the numbers that are recorded
-    for k in range(1, loops + 1):
-        t = k / 1000
-        gyro = 0.8 * np.sin(2 * np.pi * t * np.array([0.7, 1.1, 0.4]) + g0)
-        accel = np.array([0.3, -0.2, 9.81]) + 0.5 * rng.normal(size=3)
-        flying = int(kind != "ground")
-        values = np.zeros(20, np.float32)
-        values[:3], values[3:6] = accel, gyro
+    lib.k_init(*[f(x) for x in (0.05, -0.05, 1.25, 0.0)])
+    for k in range(1, LOOPS + 1):
+        pos, vel, rot, rate, _ = (x[k] for x in flown)
+        accel, gyro = sums[k, :3], sums[k, 3:]
         if k % 10 == 0:
-            lib.k_predict(v(values[:3]), v(values[3:6]), k, flying)
+            lib.k_predict(v(accel), v(gyro), k, int(kind != "ground"))
         lib.k_noise(k)
-        m = values[6:]
+        m = np.zeros(9, np.float32)
         if (kind in ("position", "ground") and k % 10 == 5) or (kind == "sweep" and k == 2):
-            m[:3] = pos + 0.05 * rng.normal(size=3)
+            m[:3] = (0 if kind == "ground" else pos) + 0.05 * rng.normal(size=3)
             lib.k_position(v(m[:3]), f(0.01))
         if kind == "pose" and k % 10 == 0:
-            q = np.array([0.02, -0.03, 0.02, 1.0]) + 0.01 * rng.normal(size=4)
-            q /= np.linalg.norm(q)
+            q = quaternion(rot) + 0.01 * rng.normal(size=4)
             m[:3] = pos + 0.02 * rng.normal(size=3)
-            m[3:7] = q
+            m[3:7] = q / np.linalg.norm(q)
             lib.k_pose(v(m[:3]), v(m[3:7]), f(0.01), f(0.05))
-        if kind == "flow":
-            if k % 10 == 3:
-                m[:2] = rng.normal(size=2) * 3
-                lib.k_flow(f(m[0]), f(m[1]), f(2.0), f(2.0), f(0.01), v(np.degrees(values[3:6].astype(np.float64))))
-            if k % 25 == 10:
-                m[2] = 1.0 + 0.02 * rng.normal()
-                lib.k_tof(f(m[2]), f(0.02))
+        if kind in ("flow", "range") and k % 10 == 0:
+            moved = (rot.T @ vel)[:2] * rot[2, 2] / pos[2] + [-rate[1], rate[0]]
+            m[:2] = 10 * (0.01 * PIXELS * moved + 0.2 * rng.normal(size=2))
+            degrees = v(np.degrees(gyro.astype(np.float64)))
+            lib.k_flow(f(m[0]), f(m[1]), f(2.0), f(2.0), f(0.01), degrees)
+        if kind == "range" and k % 25 == 10:
+            tilt = max(np.arccos(rot[2, 2]) - np.radians(7.5), 0)
+            m[2] = pos[2] / np.cos(tilt) + 0.02 * rng.normal()
+            lib.k_tof(f(m[2]), f(0.02))
+        a = k // 5 % 4
+        b = (a + 1) % 4
         if kind == "distance" and k % 5 == 0:
-            a = k // 5 % 4
             m[0] = np.linalg.norm(pos - ANCHORS[a]) + 0.1 * rng.normal()
-            m[1] = a
             lib.k_distance(f(m[0]), v(ANCHORS[a]), f(0.25))
         if kind == "difference" and k % 5 == 0:
-            a = k // 5 % 4
-            b = (a + 1) % 4
             m[0] = np.linalg.norm(pos - ANCHORS[b]) - np.linalg.norm(pos - ANCHORS[a]) + 0.1 * rng.normal()
-            m[1] = a
             lib.k_tdoa(f(m[0]), v(ANCHORS[a]), v(ANCHORS[b]), f(0.15), k)
         if kind == "sweep" and k % 4 == 0:
-            tilt = math.pi / 6 * (-1) ** (k // 4)
-            place = np.float32([-2, 1, 2.2])
-            M = rotation(np.random.default_rng(2))
-            s = np.float32([0.015, 0.0075, 0.0])
-            d = M.T @ (pos + s - place)
-            r = math.hypot(d[0], d[1])
-            m[0] = math.atan2(d[1], d[0]) + math.asin(d[2] * math.tan(tilt) / r) + 0.002 * rng.normal()
-            lib.k_sweep(f(m[0]), f(tilt), v(s), v(place), v(M.ravel()), f(0.001), k)
+            tilt, station = math.pi / 6 * (-1) ** (k // 4), k // 8 % 2
+            d = FRAMES[station].T @ (pos + rot @ DIODE - STATIONS[station])
+            m[0] = math.atan2(d[1], d[0]) + math.asin(d[2] * math.tan(tilt) / math.hypot(*d[:2]))
+            m[0] += 0.002 * rng.normal()
+            frame = v(FRAMES[station].ravel())
+            lib.k_sweep(f(m[0]), f(tilt), v(DIODE), v(STATIONS[station]), frame, f(0.001), k)
         lib.k_finalize()
-        inputs.append(values)
-        if k % every == 0:
+        inputs.append(m)
+        if k % EVERY == 0:
             S, q, P = v([0] * 9), v([0] * 4), v([0] * 81)
             lib.k_get(S, q, P)
             out.append(np.concatenate([S[:], q[:], np.float32(P[:]).reshape(9, 9)[np.triu_indices(9)]]))
@@ -133,8 +165,11 @@ def run(lib, kind, loops=400, every=20):
 
 
 if __name__ == "__main__":
-    library, recorded = compiled(Path(sys.argv[1])), {}
-    for kind in ("position", "pose", "flow", "distance", "difference", "sweep", "ground"):
-        recorded[f"{kind}/inputs"], recorded[f"{kind}/outputs"] = run(library, kind)
-    recorded["sweep/frame"] = rotation(np.random.default_rng(2))
+    library, flown = compiled(Path(sys.argv[1])), flight()
+    recorded = {"sweep/places": STATIONS, "sweep/frames": FRAMES}
+    for name, flies in (("air", True), ("ground", False)):
+        recorded[f"inertial/{name}"] = inertial(flown, flies, np.random.default_rng(5))
+    for kind in ("position", "pose", "flow", "range", "distance", "difference", "sweep", "ground"):
+        sums = recorded["inertial/ground" if kind == "ground" else "inertial/air"]
+        recorded[f"{kind}/inputs"], recorded[f"{kind}/outputs"] = run(library, kind, flown, sums)
     np.savez_compressed(HERE / "firmware_filter.npz", **recorded)
