@@ -56,6 +56,10 @@ class RenderError(RuntimeError):
     """A missing or broken screen or OpenGL."""
 
 
+class AirframeWarning(UserWarning):
+    """Numbers of an airframe that no drone has exactly, but that are near enough to fly with."""
+
+
 class EngineWarning(UserWarning):
     """A step that runs on a slower engine than the one that was chosen, which does not support all of it."""
 

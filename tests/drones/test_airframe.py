@@ -15,6 +15,7 @@ from crazysim.drones.body import body_geoms, outline
 from crazysim.drones.keys import LAYOUT, TABLES
 from crazysim.drones.loading import FOLDER
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
+from crazysim.errors import AirframeWarning
 
 FILES = sorted(FOLDER.glob("*.toml"))
 
@@ -421,6 +422,19 @@ def test_law_09_a_wrong_airframe_is_refused(case):
     controller = "crazyflow" if case in ("no gain", "no controller") else "auto"  # which needs no gains
     with pytest.raises(ConfigError, match=message):
         Sim(drone=tables, controller=controller)
+
+
+def test_moments_of_inertia_that_are_slightly_wrong_are_a_warning_with_the_figure():
+    """RotorPy's Crazyflie, whose largest moment exceeds the sum of the others by 1%; 6% are an error."""
+
+    def body(z):
+        return {"base": "cf2x_L250", "rigid_body": {"mass": 0.03, "inertia": [1.43e-5, 1.43e-5, z]}}
+
+    with pytest.warns(AirframeWarning, match=r"largest moment is at most the sum .* 1\.0% more\. Measure"):
+        assert Sim(drone=body(2.89e-5)).data.params.J[..., 2, 2] == np.float32(2.89e-5)
+    with pytest.raises(ConfigError, match="largest moment is at most the sum of the others"):
+        load_airframe(body(3.04e-5))
+    load_airframe(body(2.86e-5 * 1.000005))
 
 
 @pytest.mark.parametrize(
