@@ -134,7 +134,7 @@ def predict(
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
     upper = p[_upper(N)]
     cov = jnp.where(_is_variance(N), upper, _at_most(upper))
-    return estimate.replace(pos=pos, vel=new_vel, quat=_turned(quat, angle, resting), cov=cov)
+    return estimate.replace(pos=pos, vel=new_vel, quat=turned(quat, angle, resting), cov=cov)
 
 
 def moved(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, gravity: Array) -> Estimate:
@@ -148,7 +148,7 @@ def moved(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, grav
         gravity: Acceleration of gravity, world frame, m/s^2. (3,)
     """
     angle = dt * (gyro - estimate.gyro_bias)  # type: ignore[operator]
-    middle, end = _turned(estimate.quat, 0.5 * angle), _turned(estimate.quat, angle)
+    middle, end = turned(estimate.quat, 0.5 * angle), turned(estimate.quat, angle)
     acc = rotation.matvec(rotation.matrix(middle), accel - estimate.accel_bias, gravity)  # type: ignore[operator]
     vel = rotation.rotate(estimate.quat, estimate.vel)
     pos = estimate.pos + dt * vel + 0.5 * dt**2 * acc
@@ -185,7 +185,7 @@ def predict_biased(
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
     vel, after = estimate.vel, moved(estimate, accel, gyro, dt, gravity)
-    middle = _turned(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
+    middle = turned(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
     rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, middle, after.quat))
 
     turn, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
@@ -205,7 +205,7 @@ def predict_biased(
     both = -dt * by_gyro
     p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(both).at[6:9, 3:6].add(both.T)
     p = p.at[6:9, 6:9].add(dt**2 * jnp.diag(gyro_variance))
-    return after.replace(cov=_bounded(p))
+    return after.replace(cov=bounded(p))
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
@@ -246,7 +246,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
         pos=estimate.pos + step[:3],
         vel=estimate.vel + step[3:6],
         att_error=estimate.att_error + step[6:9],
-        cov=_bounded(p),
+        cov=bounded(p),
         **biases,
     )
 
@@ -264,8 +264,8 @@ def finalize(estimate: Estimate, least: float = SMALL_ANGLE) -> Estimate:
     turn = _turn(0.5 * jnp.where(moves, error, 0.0))
     p = jnp.concatenate([p[:6], turn @ p[6:9], p[9:]])
     p = jnp.concatenate([p[:, :6], p[:, 6:9] @ turn.T, p[:, 9:]], axis=1)
-    quat = jnp.where(moves, _turned(estimate.quat, error), estimate.quat)
-    return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=_bounded(p))
+    quat = jnp.where(moves, turned(estimate.quat, error), estimate.quat)
+    return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=bounded(p))
 
 
 def within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
@@ -278,7 +278,7 @@ def select(which: Array, one: Estimate, other: Estimate) -> Estimate:
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), one, other)
 
 
-def _bounded(p: Array) -> Array:
+def bounded(p: Array) -> Array:
     """Return the upper triangle of a covariance, bounded; NaN becomes the upper bound.
 
     The firmware takes the mean of both triangles, which differ by rounding; with one, the engine computes half of them.
@@ -286,6 +286,20 @@ def _bounded(p: Array) -> Array:
     n = p.shape[0]
     upper = p[_upper(n)]
     return jnp.where(_is_variance(n), _variances(upper, n), _at_most(upper))
+
+
+def turned(quat: Array, angle: Array, resting: Array | None = None) -> Array:
+    """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
+
+    A part of an attitude at rest is mixed in where one is given.
+    """
+    size = rotation.safe_norm(angle) + EPS
+    half = 0.5 * size
+    step = jnp.concatenate([jnp.sin(half) / size * angle, jnp.cos(half)])
+    quat = rotation.multiply(quat, step)
+    if resting is not None:
+        quat = (1 - REVERSION) * quat + REVERSION * resting
+    return quat / (rotation.safe_norm(quat) + EPS)
 
 
 def _at_most(covariances: Array) -> Array:
@@ -318,17 +332,3 @@ def _turn(half: Array) -> Array:
     """Return the rotation of the error of an attitude that turns by twice ``half``, to second order. (3, 3)"""
     cross = rotation.cross_matrix(half)
     return jnp.eye(3, dtype=half.dtype) - cross + 0.5 * (cross @ cross)
-
-
-def _turned(quat: Array, angle: Array, resting: Array | None = None) -> Array:
-    """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
-
-    A part of an attitude at rest is mixed in where one is given.
-    """
-    size = rotation.safe_norm(angle) + EPS
-    half = 0.5 * size
-    step = jnp.concatenate([jnp.sin(half) / size * angle, jnp.cos(half)])
-    quat = rotation.multiply(quat, step)
-    if resting is not None:
-        quat = (1 - REVERSION) * quat + REVERSION * resting
-    return quat / (rotation.safe_norm(quat) + EPS)

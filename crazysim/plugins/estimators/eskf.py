@@ -13,10 +13,11 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Simulation, per_drone
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, at_the_start
-from crazysim.plugins.estimators import error_state, updates
+from crazysim.core.stage import Stage, at_the_start, tick
+from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
+from crazysim.plugins.estimators.inertial_path import Path
 from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
@@ -52,6 +53,9 @@ class ESKFData(PyTree):
     """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
     """Number of times that the estimate left its bounds and the filter began again. (n_worlds, n_drones, 1)"""
+    paths: Array | None = leaf("drone", 2)
+    """Paths from where measurements in transit were taken to the last prediction, newest first, for each sensor whose
+    measurements are late; None without one. (n_worlds, n_drones, n_rows, 10)"""
 
 
 class ESKF(ErrorStateFilter):
@@ -82,7 +86,9 @@ class ESKF(ErrorStateFilter):
         n = error_state.N_BIASED
         level, still = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4), per_drone(sim, 0.0, 3)
         cov = per_drone(sim, 0.0, n * (n + 1) // 2)
-        return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still))
+        rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aids)
+        paths = per_drone(sim, inertial_path.START, rows, len(inertial_path.START)) if rows else None
+        return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still), paths=paths)
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that begins with the state before the first step, and those of every estimator."""
@@ -95,9 +101,22 @@ class ESKF(ErrorStateFilter):
         return [
             ("sample", Stage(self.sample, "drone")),
             ("predict", Stage(self._predict(period), "drone", is_due)),
+            *(
+                (f"{sensor.name}_path", Stage(self._begin_path(sensor, period), "drone", _takes(sensor)))
+                for sensor in self.aids
+                if sensor.is_late
+            ),
             *self.fusions(),
             ("", self.restart()),
         ]
+
+    def inertial(self, data: SimData) -> tuple[Array, Array]:
+        """Return measured angular velocity, rad/s, and specific force, m/s^2, of one drone, body frame. (3,) each
+
+        The ``IMU`` measures the mean force of a step in the frame at its end; here it is in the frame in its middle.
+        """
+        gyro, accel = super().inertial(data)
+        return gyro, accel + 0.5 / data.core.freq * rotation.cross(gyro, accel)
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
         """Return the estimated position, attitude, velocity and angular velocity of one drone."""
@@ -132,19 +151,50 @@ class ESKF(ErrorStateFilter):
             )
             walks = [_bias_walk(triad, dt) for triad in (imu.accel, imu.gyro)]
             estimate = error_state.add_noise(estimate, jnp.concatenate([jnp.zeros(9, accel.dtype), *walks]))
+            if record.paths is not None:
+                paths = [Path.unpacked(row, jnp.zeros_like(dt)).extended(accel, gyro, dt) for row in record.paths]
+                record = record.replace(paths=jnp.stack([path.packed() for path in paths]))
             return self.write(data, record.replace(estimate=estimate, accel=jnp.zeros_like(accel), gyro=half))
 
         return predict
 
+    def _begin_path(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
+        def begin_path(data: SimData) -> SimData:
+            """Begin a path where one sensor takes a measurement: back to the last prediction, for now."""
+            record, (gyro, accel) = self.read(data), self.inertial(data)
+            since = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
+            start = jnp.asarray(inertial_path.START, gyro.dtype)
+            back = Path.unpacked(start, jnp.zeros_like(since)).extended(accel, gyro, since).reversed().packed()
+            first, last = self._rows(sensor, data)
+            paths = [record.paths[:first], back[None], record.paths[first : last - 1], record.paths[last:]]
+            return self.write(data, record.replace(paths=jnp.concatenate(paths)))
+
+        return begin_path
+
+    def _rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
+        """Return the first row of the paths of one sensor, and that after its last one."""
+        counts = [_rows_in_transit(aid, data) for aid in self.aids]
+        first = sum(counts[: self.aids.index(sensor)])
+        return first, first + counts[self.aids.index(sensor)]
+
     def updated(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor, used where it was taken."""
-        steps, (gyro, accel) = data.core.steps, self.inertial(data)
-        period, _ = self.predictions(data.core.freq)
-        since = sensor.read(data).samples.taken[0] - steps + (steps + 1) % period  # the last prediction
-        lag, gravity = since.astype(gyro.dtype) / data.core.freq, data.params.gravity_vec
-        then = error_state.moved(record.estimate, accel, gyro, lag, gravity)
+        steps, taken, gravity = data.core.steps, sensor.read(data).samples.taken[0], data.params.gravity_vec
+        period, (gyro, accel) = self.predictions(data.core.freq)[0], self.inertial(data)
+        since = (taken - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq  # the last prediction
+        if not sensor.is_late:
+            then = error_state.moved(record.estimate, accel, gyro, since, gravity)
+            then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
+            return error_state.moved(then, accel, gyro, -since, gravity)
+        interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._rows(sensor, data)
+        row, number = record.paths[first], (steps - taken) // interval
+        for k in range(first + 1, last):
+            row = jnp.where(number == k - first, record.paths[k], row)
+        path, estimate = Path.unpacked(row, -since), record.estimate
+        back = path.without_biases(estimate.accel_bias, estimate.gyro_bias).reversed()
+        then = inertial_path.carried(estimate, back, gravity)
         then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
-        return error_state.moved(then, accel, gyro, -lag, gravity)
+        return inertial_path.carried(then, path.without_biases(then.accel_bias, then.gyro_bias), gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:
         """Return True where the estimate of one drone is within ``max_pos`` and ``max_vel``. ()"""
@@ -153,6 +203,17 @@ class ESKF(ErrorStateFilter):
     def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
         """Return the estimate with which the filter of one drone begins again."""
         return self._started(data, pos, jnp.zeros_like(pos), quat, RESTART)
+
+
+def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
+    """Return the number of measurements of one sensor that can be in transit."""
+    due = sensor.read(data).samples.due
+    return 0 if due is None else due.shape[-1]
+
+
+def _takes(sensor: Sensor) -> Callable[[SimData], Array] | None:
+    """Return when a sensor takes a measurement."""
+    return None if sensor.freq is None else lambda data: tick(data, sensor.freq)
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:

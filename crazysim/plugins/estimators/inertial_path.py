@@ -1,0 +1,116 @@
+"""Paths of integrated inertial measurements, along which an estimate and its covariance go back in time and forward.
+
+A measurement that arrives late is used with the estimate of the time at which it was taken. The path from there is
+integrated without biases and without the estimate, so that it stays valid while both are corrected: the preintegration
+of C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, On-manifold preintegration for real-time visual-inertial
+odometry, IEEE Transactions on Robotics 33 (2017), with their derivatives with respect to biases in closed form for a
+uniform motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim import rotation
+from crazysim.plugins.estimators.error_state import Estimate, bounded, covariance, turned
+
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+"""Attitude without a rotation, xyzw."""
+START = np.concatenate([LEVEL, np.zeros(6, np.float32)])
+"""Row of the path of no duration. (10,)"""
+
+
+class Path(NamedTuple):
+    """Motion of a body during a time, in its own frame at the start, without gravity and velocity at the start."""
+
+    quat: Array
+    """Attitude at the end, end to start, unit, xyzw. (4,)"""
+    vel: Array
+    """Velocity at the end, m/s. (3,)"""
+    pos: Array
+    """Position at the end, m. (3,)"""
+    duration: Array
+    """Duration, s; negative for a path that goes back in time. ()"""
+
+    @staticmethod
+    def unpacked(row: Array, duration: Array) -> Path:
+        """Return the path whose numbers ``packed`` are in a row. (10,)"""
+        return Path(row[:4], row[4:7], row[7:], duration)
+
+    def packed(self) -> Array:
+        """Return the numbers of the path without its duration. (10,)"""
+        return jnp.concatenate([self.quat, self.vel, self.pos])
+
+    def extended(self, accel: Array, gyro: Array, dt: Array | float) -> Path:
+        """Return the path after another interval.
+
+        Args:
+            accel: Mean specific force as measured, body frame, m/s^2. (3,)
+            gyro: Mean angular velocity as measured, body frame, rad/s. (3,)
+            dt: Length of the interval, s.
+        """
+        force = rotation.rotate(turned(self.quat, 0.5 * dt * gyro), accel)
+        pos = self.pos + dt * self.vel + 0.5 * dt**2 * force
+        return Path(turned(self.quat, dt * gyro), self.vel + dt * force, pos, self.duration + dt)
+
+    def reversed(self) -> Path:
+        """Return the path from the end to the start."""
+        back = rotation.conjugate(self.quat)
+        pos = rotation.rotate(back, self.duration * self.vel - self.pos)
+        return Path(back, -rotation.rotate(back, self.vel), pos, -self.duration)
+
+    def without_biases(self, accel_bias: Array, gyro_bias: Array) -> Path:
+        """Return the path for measurements without biases, m/s^2 and rad/s, (3,) each, to first order in them."""
+        half, t = _half(self.quat), self.duration
+        rate, force = rotation.rotate(half, gyro_bias), rotation.rotate(half, accel_bias)
+        vel, pos = self.vel - t * force, self.pos - 0.5 * t**2 * force
+        vel, pos = vel - rotation.cross(rate, t * vel - pos), pos - t / 3 * rotation.cross(rate, pos)
+        return Path(rotation.multiply(turned(jnp.asarray(LEVEL, rate.dtype), -t * rate), self.quat), vel, pos, t)
+
+
+def carried(estimate: Estimate, path: Path, gravity: Array) -> Estimate:
+    """Return an estimate with biases at the end of a path, with the covariance of its errors there.
+
+    R and v are attitude and velocity at the start, R' and v' at the end, d, u and E^T are position, velocity and
+    attitude of the path, M is its attitude halfway, t its duration, a and w are the errors of the biases:
+
+        d_pos' = d_pos + t R d_vel - R [t v + d]x d_att - R (t^2 / 2 M a - t / 3 [d]x M w)
+        d_vel' = E (d_vel - [v + u]x d_att - t M a + [t u - d]x M w) + [v']x d_att'
+        d_att' = E (d_att - t M w)
+
+    Noise of the inertial sensors along the path is left out.
+
+    Args:
+        estimate: The estimate at the start of the path.
+        path: The path, without the biases of the estimate.
+        gravity: Acceleration of gravity, world frame, m/s^2. (3,)
+    """
+    t, rot, half = path.duration, rotation.matrix(estimate.quat), rotation.matrix(_half(path.quat))
+    quat, speed = rotation.multiply(estimate.quat, path.quat), rotation.matvec(rot, estimate.vel)
+    pos = rotation.matvec(rot, path.pos, estimate.pos + t * speed + 0.5 * t**2 * gravity)
+    vel = rotation.rotate_inverse(quat, rotation.matvec(rot, path.vel, speed + t * gravity))
+
+    back, across = rotation.matrix(path.quat).T, rotation.cross_matrix
+    gyro_to_att = -t * half
+    att_to_vel, att_to_pos = -across(estimate.vel + path.vel), -rot @ across(t * estimate.vel + path.pos)
+    gyro_to_vel, gyro_to_pos = across(t * path.vel - path.pos) @ half, t / 3 * rot @ across(path.pos) @ half
+    accel_to_vel, accel_to_pos, turn = -t * half, -0.5 * t**2 * rot @ half, across(vel)
+
+    def rows(p: Array) -> Array:
+        """Return the derivatives of the errors at the end times a matrix."""
+        att = back @ (p[6:9] + gyro_to_att @ p[12:])
+        pushed = p[3:6] + att_to_vel @ p[6:9] + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
+        moved = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
+        return jnp.concatenate([moved, back @ pushed + turn @ att, att, p[9:]])
+
+    cov = bounded(rows(rows(covariance(estimate.cov)).T))
+    return estimate.replace(pos=pos, vel=vel, quat=quat, cov=cov)
+
+
+def _half(quat: Array) -> Array:
+    """Return half of a rotation by less than a turn. (4,)"""
+    return rotation.safe_normalize(quat + LEVEL * jnp.where(quat[3] < 0, -1.0, 1.0), LEVEL)
