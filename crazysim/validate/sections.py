@@ -53,7 +53,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "Recorded outputs of its compiled C sources, on the same inputs, in float32; the recordings are in "
             "tests/control and tests/plugins/estimators of a checkout. Figures are the largest differences: of motors "
             "in 8 flights, where full thrust is 65,535, and of filters over whole flights, in which rounding adds up. "
-            "Those of the Kalman filter last 4 s, with up to 5.2 m/s and tilts of up to 61 degrees, except on the "
+            "Those of the Kalman filter last 4 s, with up to 5.4 m/s and tilts of up to 62 degrees, except on the "
             "ground; `flow` has no other sensor, `range` has flow and time of flight. Differences of covariances are "
             "relative to their size plus 1e-5.",
             (firmware_controllers.of_controllers, firmware_filters.of_filters),
