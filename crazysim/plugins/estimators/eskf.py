@@ -187,14 +187,15 @@ class ESKF(ErrorStateFilter):
             then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
             return error_state.moved(then, accel, gyro, -since, gravity)
         interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._rows(sensor, data)
-        row, number = record.paths[first], (steps - taken) // interval
+        paths: Array = record.paths  # type: ignore[assignment]
+        row, number = paths[first], (steps - taken) // interval
         for k in range(first + 1, last):
-            row = jnp.where(number == k - first, record.paths[k], row)
+            row = jnp.where(number == k - first, paths[k], row)
         path, estimate = Path.unpacked(row, -since), record.estimate
-        back = path.without_biases(estimate.accel_bias, estimate.gyro_bias).reversed()
+        back = path.without_biases(estimate).reversed()
         then = inertial_path.carried(estimate, back, gravity)
         then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
-        return inertial_path.carried(then, path.without_biases(then.accel_bias, then.gyro_bias), gravity)
+        return inertial_path.carried(then, path.without_biases(then), gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:
         """Return True where the estimate of one drone is within ``max_pos`` and ``max_vel``. ()"""
@@ -211,9 +212,9 @@ def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
     return 0 if due is None else due.shape[-1]
 
 
-def _takes(sensor: Sensor) -> Callable[[SimData], Array] | None:
+def _takes(sensor: Sensor) -> Callable[[SimData], Array | None]:
     """Return when a sensor takes a measurement."""
-    return None if sensor.freq is None else lambda data: tick(data, sensor.freq)
+    return lambda data: tick(data, sensor.freq or data.core.freq)
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:

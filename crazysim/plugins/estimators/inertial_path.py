@@ -63,10 +63,10 @@ class Path(NamedTuple):
         pos = rotation.rotate(back, self.duration * self.vel - self.pos)
         return Path(back, -rotation.rotate(back, self.vel), pos, -self.duration)
 
-    def without_biases(self, accel_bias: Array, gyro_bias: Array) -> Path:
-        """Return the path for measurements without biases, m/s^2 and rad/s, (3,) each, to first order in them."""
+    def without_biases(self, estimate: Estimate) -> Path:
+        """Return the path for measurements without the biases of an estimate, to first order in them."""
         half, t = _half(self.quat), self.duration
-        rate, force = rotation.rotate(half, gyro_bias), rotation.rotate(half, accel_bias)
+        rate, force = (rotation.rotate(half, x) for x in (estimate.gyro_bias, estimate.accel_bias))  # type: ignore[arg-type]
         vel, pos = self.vel - t * force, self.pos - 0.5 * t**2 * force
         vel, pos = vel - rotation.cross(rate, t * vel - pos), pos - t / 3 * rotation.cross(rate, pos)
         return Path(rotation.multiply(turned(jnp.asarray(LEVEL, rate.dtype), -t * rate), self.quat), vel, pos, t)
@@ -113,4 +113,5 @@ def carried(estimate: Estimate, path: Path, gravity: Array) -> Estimate:
 
 def _half(quat: Array) -> Array:
     """Return half of a rotation by less than a turn. (4,)"""
-    return rotation.safe_normalize(quat + LEVEL * jnp.where(quat[3] < 0, -1.0, 1.0), LEVEL)
+    level = jnp.asarray(LEVEL, quat.dtype)
+    return rotation.safe_normalize(quat + level * jnp.where(quat[3] < 0, -1.0, 1.0), level)

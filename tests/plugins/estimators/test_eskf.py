@@ -144,7 +144,7 @@ def test_a_path_carries_covariance_and_state(estimate):
         path = path.extended(jnp.array([0.5, 1.0, 9.0 + 0.1 * k]), jnp.array([1.0, -0.8, 0.5 - 0.02 * k]), 0.01)
 
     def carry(at):
-        return carried(at, path.without_biases(at.accel_bias, at.gyro_bias), gravity)
+        return carried(at, path.without_biases(at), gravity)
 
     there = jax.jit(carry)(estimate)
     f = jax.jit(jax.jacfwd(lambda error: difference(carry(moved(estimate, error)), there)))(jnp.zeros(15))
@@ -152,7 +152,7 @@ def test_a_path_carries_covariance_and_state(estimate):
     np.testing.assert_allclose(error_state.covariance(there.cov), f @ p @ f.T, rtol=0, atol=2e-3 * float(p.max()))
     assert np.abs(f @ p @ f.T - p).max() > 0.1 * float(p.max()), "the path shows nothing"
 
-    back = jax.jit(carried)(there, path.without_biases(there.accel_bias, there.gyro_bias).reversed(), gravity)
+    back = jax.jit(carried)(there, path.without_biases(there).reversed(), gravity)
     assert np.abs(there.pos - estimate.pos).max() > 0.1
     for name, atol in (("pos", 5e-5), ("vel", 5e-5), ("quat", 5e-5), ("cov", 2e-3 * float(p.max()))):
         np.testing.assert_allclose(getattr(back, name), getattr(estimate, name), rtol=0, atol=atol, err_msg=name)
