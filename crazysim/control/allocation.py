@@ -8,6 +8,7 @@ from jax import Array
 
 from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
+from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec, safe_clip
@@ -20,6 +21,8 @@ class AllocationParams(PyTree):
     """Minimum thrust of a rotor that is on, N. (1,)"""
     thrust_max: Array = leaf("parameter", 1)
     """Maximum thrust of one rotor, N. (1,)"""
+    weight: Array = leaf("parameter", 1)
+    """Weight that the rotors carry in hover, N. (1,)"""
     arms: Array = leaf("parameter", 1)
     """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     rpm2thrust: Array = leaf("parameter", 2)
@@ -42,6 +45,7 @@ class AllocationParams(PyTree):
         return AllocationParams(
             thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
+            weight=as_parameter(-GRAVITY[2] * airframe.value("rigid_body.mass", ())),
             arms=as_parameter(torque_arms(airframe)),
             rpm2thrust=as_parameter(curve.reshape(-1, 3)),
             allocation_matrix=as_parameter(allocation_matrix(airframe)),
@@ -56,6 +60,11 @@ def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
     """
     thrust = float(airframe.value("rigid_body.mass", ())) * 9.81 / airframe.n_rotors
     return airframe.rotor_vel([thrust])
+
+
+def level_thrust(airframe: Airframe) -> float:
+    """Return the largest collective thrust without a torque, N: that at which the first rotor is at its limit."""
+    return float(airframe.value("rotors.thrust_max", ()) / np.max(allocation_matrix(airframe)[:, 0]))
 
 
 def torque_arms(airframe: Airframe) -> np.ndarray:

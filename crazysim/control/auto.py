@@ -4,14 +4,30 @@ A force follows from the errors of position and velocity (``crazysim.control.pos
 attitude and body rates. Forces and torques that the model lacks, such as wind, a load, a wrong mass or a shifted centre
 of mass, are estimated from velocities that differ from those that the rotors should have caused, and compensated.
 
-All gains follow from the rate ``a`` at which the rotors, with feedback of their speeds, follow a command. A drone turns
-under gains per inertia kp and kd on attitude and body rate as ``s^3 / a + s^2 + kd s + kp``. With
+All gains follow from one rate ``a`` about each axis. A drone whose thrusts follow their command with the rate ``a``
+turns under gains per inertia kp and kd on attitude and body rate as ``s^3 / a + s^2 + kd s + kp``. With
 
-    kd = 0.6 a,   kp = 0.12 a^2,   and half of these rates about yaw, where rotors have less authority,
+    kd = 0.6 a,   kp = 0.12 a^2,   and at most half of the rate of roll and pitch about yaw,
 
 body rates follow with a damping ratio of 0.65, which overshoots a step by 7%, and attitudes with a pole at 0.31 a and
 a pair of damping ratio 0.55, without overshoot. The attitude loop delays a slow command by kd / kp = 5 / a, from which
 the gains of the position loop follow.
+
+The rate has two limits. The first is the lag: ``1 / a`` is at least that of the rotors, with feedback of their speeds,
+and 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line on which
+kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can, from every error, if that
+is at most the angular acceleration that they give in hover where e is largest (``turn_rates``). Without this limit a
+drone with quick rotors turns faster than it can stop, saturates to both sides in turn, and never settles.
+
+A rotor that speeds up turns the body the other way. With rotors of the inertia I, whose drag torque changes by q over
+their speed, the yaw torque follows the drag torque y as y + z y' with z = I / q, up to a second for heavy rotors. As
+feedback that lead would alternate the rotors at every tick. The rotors are therefore given only the part
+1 / (1 + r z) of the missing drag torque, with their rate r: the torque then follows as
+
+    (1 + z s) / (1 + (z + 1 / r) s),
+
+which is at most one at every frequency, and immediate for heavy rotors. Their momentum counts with that of the body
+where unknown torques are estimated.
 """
 
 from __future__ import annotations
@@ -20,11 +36,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.control.allocation import AllocationParams, hover_arms, wrench_matrix
-from crazysim.control.bandwidth import YAW, rotor_rate
+from crazysim.control.bandwidth import YAW, fastest_rotor_rate, reaction_time, rotor_rate, turn_rates
 from crazysim.control.fitted import FittedAuto
 from crazysim.control.flatness import HORIZONTAL, NO_THRUST
 from crazysim.control.levels import Control
@@ -35,22 +51,22 @@ from crazysim.control.rigid_body import RigidBodyParams, rigid_body
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
-from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.dynamics.rotor import curve, thrust_slope
 from crazysim.pytree import PyTree, as_parameter, leaf
-from crazysim.rotation import cross, dot, matvec, safe_clip, safe_sqrt
+from crazysim.rotation import cross, dot, matvec, safe_clip
 
 RATE = 50.0
-"""Rate at which the rotors follow with feedback of their speeds, 1/s, where that needs at most ``LEAD``."""
+"""Rate at which the rotors follow with feedback of their speeds, 1/s, where ``LEAD`` suffices and authority allows."""
 LEAD = 5.0
 """Largest factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
 STEP = 0.5
 """Largest part of the missing rotor speed that the feedback adds in one tick of the controller, 1."""
 DAMPING = 0.6
-"""Angular acceleration per body rate over the rate of the rotors, 1."""
+"""Angular acceleration per body rate over the rate about the axis, 1."""
 STIFFNESS = 0.12
-"""Angular acceleration per rotation error over the squared rate of the rotors, 1."""
+"""Angular acceleration per rotation error over the squared rate about the axis, 1."""
 OBSERVER = 0.6
-"""Rate of the estimate of unknown torques over the rate of the rotors, 1."""
+"""Rate of the estimate of unknown torques over the largest rate about an axis, 1."""
 TORQUE_MAX = 0.5
 """Largest unknown torque that is compensated, as the rotation error against which it holds, rad."""
 YAW_RATE_MAX = 35.0
@@ -63,7 +79,7 @@ class AutoParams(RigidBodyParams):
     """Gains and parameters of the default controller, each shared or one per drone."""
 
     mixing_matrix: Array = leaf("parameter", 2)
-    """Rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
+    """Rotor thrusts to body torque, m. (3, n_rotors)"""
     stiffness: Array = leaf("parameter", 1)
     """Angular acceleration per rotation error, 1/s^2. (3,)"""
     damping: Array = leaf("parameter", 1)
@@ -74,11 +90,15 @@ class AutoParams(RigidBodyParams):
     """Part of a new measurement in the estimate of unknown torques, 1. (1,)"""
     lead: Array = leaf("parameter", 1, (1,))
     """Factor on the difference of desired and present rotor speeds, 1. (1,)"""
+    reaction: Array = leaf("parameter", 1, (1,))
+    """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
+    share: Array = leaf("parameter", 1, (1,))
+    """Part of the missing yaw torque that the rotors' drag is to give; the reaction to them gives the rest, 1. (1,)"""
     position: PositionParams
     """Gains and limits of the position loop."""
 
     @staticmethod
-    def create(airframe: Airframe, freq: int) -> AutoParams:
+    def create(airframe: Airframe, freq: int, outer_freq: int) -> AutoParams:
         """Return the shared parameters of an airframe.
 
         A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
@@ -87,35 +107,46 @@ class AutoParams(RigidBodyParams):
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
+            outer_freq: Rate of its position loop, Hz, whose command is half a period old on average.
 
         Raises:
             ConfigError: If the airframe lacks a value.
         """
-        lag = rotor_rate(airframe)
-        lead = max(min(RATE / lag, LEAD, STEP / (1 - np.exp(-lag / freq))), 1.0)
+        lag, turns = rotor_rate(airframe), DAMPING / STIFFNESS * turn_rates(airframe)
+        wanted = 1 / max(1 / np.max(turns[:2]) - 1.5 / freq, 1 / RATE)
+        lead = max(min(wanted / lag, LEAD, STEP * freq / fastest_rotor_rate(airframe)), 1.0)
         rate = 1 / (1 / (lead * lag) + 1.5 / freq)
-        rates = rate * np.array([1.0, 1.0, YAW])
+        rates = np.minimum(rate * np.array([1.0, 1.0, YAW]), turns)
         stiffness, damping = STIFFNESS * rates**2, DAMPING * rates
+        delay, reaction = DAMPING / STIFFNESS / np.min(rates[:2]), reaction_time(airframe)
         body = rigid_body(airframe)
         allocation: AllocationParams = body.pop("allocation")
         return AutoParams(
             **body,
             allocation=allocation.replace(arms=as_parameter(hover_arms(airframe))),
-            mixing_matrix=as_parameter(wrench_matrix(airframe)),
+            mixing_matrix=as_parameter(wrench_matrix(airframe)[1:]),
             stiffness=as_parameter(stiffness),
             damping=as_parameter(damping),
             torque_max=as_parameter(TORQUE_MAX * np.diag(airframe.inertia) * stiffness),
-            observer=as_parameter(1 - np.exp(-OBSERVER * rate / freq)),
+            observer=as_parameter(1 - np.exp(-OBSERVER * np.max(rates) / freq)),
             lead=as_parameter(lead),
-            position=PositionParams.create(airframe, DAMPING / STIFFNESS / rate, freq),
+            reaction=as_parameter(reaction),
+            share=as_parameter(1 / (1 + lead * lag * reaction)),
+            position=PositionParams.create(airframe, delay + 0.5 / outer_freq, outer_freq),
         )
 
 
 class AutoMemory(PyTree):
-    """Memory of the default controller: what it expects of this tick, and its estimates."""
+    """Memory of the default controller: what it expects of this tick, its estimates, and the attitude to hold."""
 
     position: PositionMemory
     """Memory of the position loop."""
+    quat: Array = leaf("drone", 1)
+    """Attitude that leads to the setpoint, body to world, unit, xyzw. (n_worlds, n_drones, 4)"""
+    ang_vel: Array = leaf("drone", 1)
+    """Body rates of that attitude, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    thrust: Array = leaf("drone", 1)
+    """Collective thrust that leads to the setpoint once the attitude is reached, N. (n_worlds, n_drones, 1)"""
     momentum: Array = leaf("drone", 1)
     """Angular momentum expected at this tick from the known torques, body frame, N m s. (n_worlds, n_drones, 3)"""
     torque: Array = leaf("drone", 1)
@@ -124,7 +155,8 @@ class AutoMemory(PyTree):
     @staticmethod
     def at_rest() -> AutoMemory:
         """Return the memory of one drone before the first tick."""
-        return AutoMemory(PositionMemory.at_rest(), as_parameter(np.zeros(3)), as_parameter(np.zeros(3)))
+        level, zeros = as_parameter([0.0, 0.0, 0.0, 1.0]), as_parameter(np.zeros(3))
+        return AutoMemory(PositionMemory.at_rest(), level, zeros, as_parameter(np.zeros(1)), zeros, zeros)
 
 
 def error_of_quat(quat: Array) -> Array:
@@ -142,25 +174,10 @@ def error_of_quat(quat: Array) -> Array:
     """
     x, y, z, w = (quat[..., i : i + 1] for i in range(4))
     squared = w * w + z * z
-    inverted = squared < INVERTED / 2
-    inverse = jnp.where(inverted, 0.0, 1 / safe_sqrt(jnp.where(inverted, 1.0, squared)))
-    roll = jnp.where(inverted, 2.0, 2 * (w * x - y * z) * inverse)
-    yaw = 2 * jnp.where(w < 0, -z, z) * inverse
-    return jnp.concatenate([roll, 2 * (w * y + x * z) * inverse, yaw], axis=-1)
-
-
-def error_of_axes(x: Array, y: Array, z: Array) -> Array:
-    """Return the rotation error of ``error_of_quat`` from the axes of the desired frame in the body frame. (..., 3)"""
-    plus = 1 + z[..., 2:]
-    inverted = plus < INVERTED
-    plus = jnp.where(inverted, 1.0, plus)
-    tilt = 1 / safe_sqrt(0.5 * plus)
-    sin, cos = (x[..., 1:2] - y[..., :1]) / plus, (x[..., :1] + y[..., 1:2]) / plus
-    # Of half the yaw error: the cosine up to 90 degrees; beyond, where rounding spoils that, the sine.
-    half = safe_sqrt(0.5 * (1 + jnp.abs(cos)))
-    yaw = jnp.where(cos < 0, jnp.where(sin < 0, -2 * half, 2 * half), sin / half)
-    roll = jnp.where(inverted, 2.0, -z[..., 1:2] * tilt)
-    return jnp.concatenate([roll, z[..., :1] * tilt, jnp.where(inverted, 0.0, yaw)], axis=-1)
+    twice = 2 * lax.rsqrt(jnp.maximum(squared, INVERTED / 2))
+    roll = jnp.where(squared < INVERTED / 2, 2.0, (w * x - y * z) * twice)
+    yaw = jnp.where(w < 0, -z, z) * twice
+    return jnp.concatenate([roll, (w * y + x * z) * twice, yaw], axis=-1)
 
 
 class Auto(Controller):
@@ -192,13 +209,46 @@ class Auto(Controller):
             return self if control in self.levels else None
         return FittedAuto(Dynamics(fitted), self.outer_freq) if control == Control.state else None
 
-    def outer(self, data: DroneData, command: Setpoint, memory: Any, params: Any) -> Any:
-        """Return the memory as it is: the position loop runs with the others, at ``freq``."""
-        return memory
+    def outer(self, data: DroneData, command: Setpoint, memory: AutoMemory, params: AutoParams) -> AutoMemory:
+        """Return the memory with attitude, body rates and thrust that lead to a setpoint.
+
+        The z axis of the body is to point along the specific force, its x axis closest to the heading, and their rates
+        are fed forward from jerk and yaw rate, as in ``attitude_of_thrust``.
+        """
+        s, p, sp = data.states, params, command
+        matrix = rotation.matrix(s.quat)
+        to_body = jnp.swapaxes(matrix, -1, -2)
+        drag = matvec(matrix, matvec(p.drag_matrix, matvec(to_body, s.vel))) / p.mass
+        push = jnp.sum(curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
+        known = drag + push * matrix[..., 2]
+        specific, position = specific_force(s.pos, s.vel, known, sp, memory.position, self.outer_freq, p.position)
+        # The attitude is held for a period, in whose middle the setpoint's acceleration has changed by half a step.
+        specific = upright(specific - drag + 0.5 / self.outer_freq * sp.jerk, sp, p.position)
+
+        # The heading of a state command is that of its quaternion, which needs no angles.
+        ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
+        squared = dot(specific, specific)
+        falls = squared < NO_THRUST**2
+        inverse = jnp.where(falls, 0.0, lax.rsqrt(jnp.where(falls, 1.0, squared)))
+        z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], specific.dtype), specific * inverse)
+        across = cross(z, ahead)
+        x_ahead = rotation.safe_norm(across)
+        parallel = x_ahead < NO_THRUST
+        y = jnp.where(parallel, left, across / jnp.where(parallel, 1.0, x_ahead))
+        z_rate = (sp.jerk - dot(z, sp.jerk) * z) * inverse
+        turned = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
+        yaw_rate = turned / jnp.maximum(x_ahead, HORIZONTAL)
+        ang_vel = cross(z, z_rate) + safe_clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
+        return memory.replace(
+            position=position,
+            quat=rotation.quat_from_axes(cross(y, z), y, z),
+            ang_vel=matvec(to_body, ang_vel),
+            thrust=p.mass * squared * inverse,
+        )
 
     def params(self, airframe: Airframe) -> AutoParams:
         """Return gains and constants for an airframe."""
-        return AutoParams.create(airframe, self.freq)
+        return AutoParams.create(airframe, self.freq, self.outer_freq)
 
     def memory(self, airframe: Airframe) -> AutoMemory:
         """Return the memory before the first tick."""
@@ -209,74 +259,47 @@ class Auto(Controller):
     ) -> tuple[Array, AutoMemory]:
         """Return the rotor speeds, and the memory."""
         s, p = data.states, params
-        wrench = matvec(p.mixing_matrix, curve(s.rotor_vel, p.allocation.rpm2thrust))
         if isinstance(command, Setpoint):
-            # The heading of a state command is that of its quaternion, which needs no angles.
-            ahead, _ = rotation.heading(data.controls.state.cmd[..., 9:13])
-            thrust, acc, position = self._of_setpoint(s, command, ahead, wrench[..., :1], memory.position, p)
-            memory = memory.replace(position=position)
+            error = rotation.multiply(rotation.conjugate(s.quat), memory.quat)
+            z, w = error[..., 2:3], error[..., 3:]
+            thrust = memory.thrust * (2 * (w * w + z * z) - 1)  # its part along the present z axis
+            error, rate = error_of_quat(error), memory.ang_vel
             on: Any = True
         else:
-            thrust, acc = command[..., 3:], self._of_command(s, command, data.controls.mode, p)
+            thrust = command[..., 3:]
+            error, rate = self._of_command(s, command, data.controls.mode)
             on = thrust > 0
 
+        rotors = matvec(p.mixing_matrix, curve(s.rotor_vel, p.allocation.rpm2thrust))
         momentum = matvec(p.J, s.ang_vel)
         gyroscopic = cross(s.ang_vel, momentum)
-        measured = safe_clip((momentum - memory.momentum) * self.freq, -p.torque_max, p.torque_max)
-        measured = jnp.where(dot(s.ang_vel, s.ang_vel) == 0, 0.0, measured)  # the floor holds it
-        unknown = memory.torque + p.observer * (measured - memory.torque)
-        expected = momentum + (wrench[..., 1:] - gyroscopic) / self.freq
-        torque = matvec(p.J, acc) + gyroscopic - unknown
+        # Rotors that speed up turn the body the other way: their momentum counts with that of the body.
+        total = momentum - rotation.along_z((p.reaction * rotors[..., 2:])[..., 0])
+        impulse = p.torque_max / self.freq
+        measured = jnp.clip(total - memory.momentum, -impulse, impulse)
+        held = dot(s.ang_vel, s.ang_vel) == 0  # the floor holds it
+        unknown = (1 - p.observer) * memory.torque + jnp.where(held, 0.0, p.observer * self.freq) * measured
+        expected = total + (rotors - gyroscopic) / self.freq
+        torque = gyroscopic - unknown - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)
+        if error is not None:
+            torque = torque + matvec(p.J * p.stiffness[..., None, :], error)
+        yaw = rotors[..., 2:] + p.share * (torque[..., 2:] - rotors[..., 2:])
 
-        thrusts = prioritized_thrusts(jnp.concatenate([thrust, torque], axis=-1), params=p.allocation)
-        desired = rotor_vel_of_thrust(thrusts, p.allocation.rpm2thrust)
-        driven = jnp.maximum(s.rotor_vel + p.lead * (desired - s.rotor_vel), 1.0)  # zero would be off
+        wrench = jnp.concatenate([thrust, torque[..., :2], yaw], axis=-1)
+        thrusts = prioritized_thrusts(wrench, params=p.allocation)
+        # The rotor speeds of rotor_vel_of_thrust, approached with a lead.
+        _, k1, k2 = (p.allocation.rpm2thrust[..., i] for i in range(3))
+        lead = p.lead / (2 * k2)
+        driven = lead * thrust_slope(thrusts, p.allocation.rpm2thrust) + ((1 - p.lead) * s.rotor_vel - lead * k1)
+        driven = jnp.maximum(driven, 1.0)  # zero would be off
         return jnp.where(on, driven, 0.0), memory.replace(momentum=expected, torque=unknown)
 
-    def _of_setpoint(
-        self, s: DroneState, setpoint: Setpoint, ahead: Array, thrust: Array, memory: PositionMemory, params: AutoParams
-    ) -> tuple[Array, Array, PositionMemory]:
-        """Return collective thrust, N, and angular acceleration, rad/s^2, that lead to a setpoint, and the memory.
-
-        The desired z axis of the body is along the specific force, its x axis is closest to the heading, and their
-        rates are fed forward from jerk and yaw rate, as in ``attitude_of_thrust``, here in the body frame.
-        """
-        p, matrix = params, rotation.matrix(s.quat)
-        to_body = jnp.swapaxes(matrix, -1, -2)
-        drag = matvec(p.drag_matrix, matvec(to_body, s.vel)) / p.mass
-        known = matvec(matrix, drag + rotation.along_z(thrust[..., 0] / p.mass[..., 0]))
-        specific, memory = specific_force(s.pos, s.vel, known, setpoint, memory, self.freq, p.position)
-        up = matrix[..., 2, :]  # the world's z axis in the body frame
-        specific = upright(matvec(to_body, specific) - drag, up, setpoint, p.position)
-
-        squared = dot(specific, specific)
-        falls = squared < NO_THRUST**2
-        inverse = jnp.where(falls, 0.0, 1 / safe_sqrt(jnp.where(falls, 1.0, squared)))
-        z = jnp.where(falls, up, specific * inverse)
-        jerk = matvec(to_body, setpoint.jerk)
-        z_rate = (jerk - dot(z, jerk) * z) * inverse
-
-        ahead = matvec(to_body, ahead)
-        across = cross(z, ahead)
-        x_ahead = rotation.safe_norm(across)
-        parallel = x_ahead < NO_THRUST
-        left = cross(up, ahead)
-        y = jnp.where(parallel, left, across / jnp.where(parallel, 1.0, x_ahead))
-        x = cross(y, z)
-        turned = setpoint.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
-        yaw_rate = safe_clip(turned / jnp.maximum(x_ahead, HORIZONTAL), -YAW_RATE_MAX, YAW_RATE_MAX)
-        rate = cross(z, z_rate) + yaw_rate * z
-        acc = p.stiffness * error_of_axes(x, y, z) + p.damping * (rate - s.ang_vel)
-        return p.mass * specific[..., 2:], acc, memory
-
-    def _of_command(self, s: DroneState, command: Array, mode: Control, params: AutoParams) -> Array:
-        """Return the angular acceleration that follows an attitude or body rates, rad/s^2. (3,)"""
-        p = params
+    def _of_command(self, s: DroneState, command: Array, mode: Control) -> tuple[Array | None, Array]:
+        """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
-            return p.damping * (command[..., :3] - s.ang_vel)
+            return None, command[..., :3]
         rpy, rate = command[..., :3], jnp.zeros_like(s.ang_vel)
         if self.yaw_rate:
             rpy = jnp.concatenate([rpy[..., :2], rotation.yaw(s.quat)[..., None]], axis=-1)
             rate = command[..., 2:3] * rotation.matrix(s.quat)[..., 2, :]
-        error = error_of_quat(rotation.multiply(rotation.conjugate(s.quat), rotation.from_rpy(rpy)))
-        return p.stiffness * error + p.damping * (rate - s.ang_vel)
+        return error_of_quat(rotation.multiply(rotation.conjugate(s.quat), rotation.from_rpy(rpy))), rate

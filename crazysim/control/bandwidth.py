@@ -17,13 +17,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crazysim.control.allocation import hover_rotor_vel
+from crazysim.control.allocation import hover_arms, hover_rotor_vel
+from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
+from crazysim.dynamics.rotor import RPM_TO_RAD_S
 
 ATTITUDE_STIFFNESS = 0.3
 """Attitude gain per inertia over the squared lag rate, 1."""
 YAW = 0.5
 """Rate of the yaw loop over that of roll and pitch, 1."""
+ERRORS = np.array([2.0, 2.0, 1.0])
+"""Rotation errors about x, y and z from which a turn can be stopped, 1: 2 sin(angle / 2) of half a turn, and 1 rad."""
 POSITION = 0.12
 """Natural frequency of the position loop over the lag rate, 1."""
 
@@ -47,9 +51,57 @@ def rotor_rate(airframe: Airframe) -> float:
     Raises:
         ConfigError: If the airframe has no rotor constants.
     """
-    hover = hover_rotor_vel(airframe)
+    return float(np.min(_slopes(airframe, hover_rotor_vel(airframe))))
+
+
+def fastest_rotor_rate(airframe: Airframe) -> float:
+    """Return the rate of the lag of the rotors at their highest speed, in the faster direction, 1/s."""
+    return float(np.max(_slopes(airframe, airframe.rotor_vel_limits[1])))
+
+
+def _slopes(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
+    """Return the rates of the lag at a speed of the rotors, rpm, on spin-up and spin-down, 1/s. (n, 2)"""
     lag = np.atleast_2d(airframe.value("rotors.lag"))
-    return float(np.min([lag[:, 0] + 2 * lag[:, 1] * hover, lag[:, 2] + 2 * lag[:, 3] * hover]))
+    return lag[:, 0::2] + 2 * lag[:, 1::2] * rotor_vel[:, None]
+
+
+def reaction_time(airframe: Airframe) -> float:
+    """Return the change of a rotor's angular momentum over that of its drag torque around hover, s.
+
+    Raises:
+        ConfigError: If the airframe has no rotor constants.
+    """
+    hover = hover_rotor_vel(airframe)
+    _, k1, k2 = np.atleast_2d(airframe.value("rotors.torque_curve")).T
+    return float(np.mean(airframe.value("rotors.inertia") * RPM_TO_RAD_S / (k1 + 2 * k2 * hover)))
+
+
+def authority(airframe: Airframe) -> np.ndarray:
+    """Return the angular acceleration that the rotors can give about each axis, either way, rad/s^2. (3,)
+
+    Roll and pitch may lower the collective thrust from that of hover, as ``prioritized_thrusts`` does, yaw may not.
+
+    Raises:
+        ConfigError: If the airframe has no rotor constants.
+    """
+    shares = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
+    low, high = (float(airframe.value(f"rotors.thrust_{end}", ())) for end in ("min", "max"))
+    weight = 9.81 * float(airframe.value("rigid_body.mass", ()))
+    lift, turn = shares[:, 0], shares[:, 3]
+    torques = []
+    for axis in (1, 2):
+        ratio = shares[:, axis] / lift
+        # Rotor i needs at least low / lift_i - t ratio_i, rotor k allows high / lift_k - t ratio_k, all the weight.
+        rooms = np.append(high / lift, weight)[None] - (low / lift)[:, None]
+        needs = np.abs(np.append(ratio, 0.0)[None] - ratio[:, None])
+        torques.append(np.min(rooms[needs > 0] / needs[needs > 0]))
+    torques.append(min(np.min(high / lift) - weight, weight - np.max(low / lift)) / np.max(np.abs(turn / lift)))
+    return np.array(torques) / np.diag(airframe.inertia)
+
+
+def turn_rates(airframe: Airframe) -> np.ndarray:
+    """Return the largest ratio of attitude gain to damping whose turns the rotors can stop, 1/s. (3,)"""
+    return np.sqrt(authority(airframe) / ERRORS)
 
 
 def bandwidth(airframe: Airframe, freq: int, rate: float | None = None) -> Bandwidth:
@@ -64,5 +116,5 @@ def bandwidth(airframe: Airframe, freq: int, rate: float | None = None) -> Bandw
         ConfigError: If the airframe has no rotor constants.
     """
     rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
-    axes = rate * np.array([1.0, 1.0, YAW])
-    return Bandwidth(POSITION * rate, ATTITUDE_STIFFNESS * axes**2, axes)
+    axes = np.minimum(rate * np.array([1.0, 1.0, YAW]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
+    return Bandwidth(float(POSITION * np.min(axes[:2])), ATTITUDE_STIFFNESS * axes**2, axes)

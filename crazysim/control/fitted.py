@@ -92,8 +92,7 @@ class FittedAuto(Controller):
             drag = matvec(model.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), s.vel))
         known = matvec(matrix, force + drag) / model.mass
         specific, memory = specific_force(s.pos, s.vel, known, command, memory, self.freq, p.position)  # type: ignore
-        up = jnp.asarray([0.0, 0.0, 1.0], specific.dtype)
-        specific = upright(specific - matvec(matrix, drag) / model.mass, up, command, p.position)  # type: ignore
+        specific = upright(specific - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
 
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         later = specific + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap

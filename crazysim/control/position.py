@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.control.allocation import level_thrust
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
@@ -63,8 +64,7 @@ class PositionParams(PyTree):
             ConfigError: If the airframe lacks a value.
         """
         g = -GRAVITY[2]
-        thrust = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
-        most = THROTTLE * thrust / float(airframe.value("rigid_body.mass", ()))
+        most = THROTTLE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
         up, down = max(most - g, LEAST * g), FALL * g
         side = min(TILT * g, np.sqrt(max(most**2 - g**2, (LEAST * g) ** 2)))
         frequency = POSITION / delay
@@ -136,7 +136,7 @@ def specific_force(
     return specific, PositionMemory(vel + (known + p.gravity_vec) / freq, disturbance)
 
 
-def upright(specific: Array, up: Array, setpoint: Setpoint, params: PositionParams) -> Array:
+def upright(specific: Array, setpoint: Setpoint, params: PositionParams) -> Array:
     """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
 
     Where feedback, drag and estimates cancel the weight, as in a fall, the sum points anywhere. A small upward
@@ -144,14 +144,13 @@ def upright(specific: Array, up: Array, setpoint: Setpoint, params: PositionPara
     turn the drone over: what it needs beyond gravity lowers the limit twice.
 
     Args:
-        specific: Specific force of the rotors, m/s^2. (..., 3)
-        up: The world's z axis in the frame of that force. (..., 3)
+        specific: Specific force of the rotors, world frame, m/s^2. (..., 3)
         setpoint: Setpoint with the leading axes of the force.
         params: Gains and limits, shared or with the leading axes of the force.
     """
     wanted = setpoint.acc[..., 2:] - params.gravity_vec[..., 2:]
-    lacking = -UPRIGHT * GRAVITY[2] + 2 * jnp.where(wanted < 0, wanted, 0.0) - dot(up, specific)
-    return specific + up * jnp.where(lacking > 0, lacking, 0.0)
+    least = -UPRIGHT * GRAVITY[2] + 2 * jnp.where(wanted < 0, wanted, 0.0)
+    return _with_height(specific[..., :2], jnp.where(specific[..., 2:] < least, least, specific[..., 2:]))
 
 
 def _within(x: Array, limit: Array) -> Array:

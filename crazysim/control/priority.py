@@ -19,7 +19,7 @@ BOUNDLESS = 1e9
 def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
     """Return a wrench that every rotor can give, from a desired one by the priority of ``prioritized_thrusts``.
 
-    A wrench within the limits is returned unchanged.
+    A wrench that every rotor can give, with its yaw torque either way, is returned unchanged.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
@@ -28,8 +28,8 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
     Returns:
         Collective thrust, N, and body torque, N m. (..., 4)
     """
-    force, scale, yaw_scale, _, _ = _prioritized(wrench, params)
-    return jnp.concatenate([force, scale * wrench[..., 1:3], yaw_scale * wrench[..., 3:]], axis=-1)
+    force, scale, yaw, _ = _prioritized(wrench, params)
+    return jnp.concatenate([force, scale * wrench[..., 1:3], yaw * params.arms[..., 2:]], axis=-1)
 
 
 def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
@@ -38,50 +38,49 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
     ``force_torque2rotor_vel`` clips each rotor on its own, which changes the torque. Roll and pitch decide where the
     thrust points and yaw does not, so that order of priority keeps a saturated drone stable (Faessler, Falanga and
     Scaramuzza 2017): roll and pitch torque are scaled down only if no collective thrust makes room for
-    them, the collective thrust is moved to where they fit, and the yaw torque gets the rest. Rotors are never switched
-    off.
+    them, the collective thrust is moved to where they fit, and the yaw torque gets the rest: what every rotor can give
+    either way. Rotors are never switched off.
 
-    If all rotors carry the same part of the collective thrust, roll and pitch torque keep the largest scale that fits,
-    otherwise one that is at most as large.
+    Roll and pitch torque raise the collective thrust up to the weight at most. Rotors that could carry ten times the
+    weight would otherwise throw the drone up as long as they turn it.
+
+    If all rotors carry the same part of the collective thrust, and the weight does not limit it, roll and pitch torque
+    keep the largest scale that fits, otherwise one that is at most as large.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
         params: Parameters of the allocation, shared or with the leading axes of the wrench.
     """
-    _, _, yaw_scale, thrusts, turn = _prioritized(wrench, params)
-    return thrusts + yaw_scale * turn
+    force, scale, yaw, ratio = _prioritized(wrench, params)
+    lift, turn = params.allocation_matrix[..., 0], params.allocation_matrix[..., 3]
+    return lift * (force + scale * ratio) + turn * yaw
 
 
-def _prioritized(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array, Array]:
-    """Return collective thrust, scales of tilt and yaw torque, rotor thrusts without yaw torque, and those of yaw."""
+def _prioritized(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
+    """Return collective thrust, scale of the tilt torque, yaw torque over its arm, and what the tilt torque needs.
+
+    The last is the thrust that each rotor adds for it, as collective thrust, N. (..., n_rotors)
+    """
     p = params
-    low, high = p.thrust_min, p.thrust_max
-    lift = p.allocation_matrix[..., 0]  # thrust of each rotor per collective thrust, positive
-    tilt = matvec(p.allocation_matrix[..., 1:3], wrench[..., 1:3] / p.arms[..., :2])
-    turn = p.allocation_matrix[..., 3] * (wrench[..., 3:] / p.arms[..., 2:])
+    lift = where_present(p.rotors, p.allocation_matrix[..., 0], 1.0)  # of each rotor per collective thrust, positive
+    turn = _of_all(jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift))  # the most per yaw torque over its arm
+    ratio = matvec(p.allocation_matrix[..., 1:3] / lift[..., None] / p.arms[..., None, :2], wrench[..., 1:3])
 
-    # Rotor i allows collective thrusts F with low <= lift_i F + s tilt_i <= high; one that a drone lacks, any.
-    inverse = 1 / where_present(p.rotors, lift, 1.0)
-    most, least = where_present(p.rotors, high * inverse, BOUNDLESS), where_present(p.rotors, low * inverse, -BOUNDLESS)
-    ratio = tilt * inverse
-
-    def bounds(scale: Array | float) -> tuple[Array, Array]:
-        """Return the smallest and largest collective thrust that all rotors allow."""
-        return _of_all(jnp.maximum, least - scale * ratio), _of_all(jnp.minimum, most - scale * ratio)
+    # Rotor i allows collective thrusts F with low <= lift_i (F + s ratio_i) <= high; one that a drone lacks, any.
+    least = where_present(p.rotors, p.thrust_min / lift, -BOUNDLESS)
+    most = where_present(p.rotors, p.thrust_max / lift, BOUNDLESS)
+    still_low, still_high = _of_all(jnp.maximum, least), _of_all(jnp.minimum, most)
+    full_low, full_high = _of_all(jnp.maximum, least - ratio), _of_all(jnp.minimum, most - ratio)
+    limit = jnp.maximum(wrench[..., :1], jnp.maximum(p.weight, still_low))
 
     # The room between the bounds is concave in s, so it is at least the chord from s = 0, where it is positive, to 1.
-    (still_low, still_high), (full_low, full_high) = bounds(0.0), bounds(1.0)
-    still, full = still_high - still_low, full_high - full_low
-    lacks = full < 0
-    scale = jnp.where(lacks, still / jnp.where(lacks, still - full, 1.0), 1.0)
-    force = safe_clip(wrench[..., :1], *bounds(scale))
+    still, full = jnp.minimum(still_high, limit) - still_low, jnp.minimum(full_high, limit) - full_low
+    scale = still / jnp.maximum(still - jnp.minimum(full, 0.0), 1 / BOUNDLESS)
+    chord = still_low + scale * (full_low - still_low)
+    force = safe_clip(wrench[..., :1], chord, jnp.where(full < 0, chord, jnp.minimum(full_high, limit)))
 
-    thrusts = lift * force + scale * tilt
-    room = jnp.where(turn > 0, high, low) - thrusts
-    over = jnp.abs(turn) > jnp.abs(room)
-    share = jnp.where(over, room / jnp.where(over, turn, 1.0), 1.0)
-    yaw_scale = jnp.maximum(_of_all(jnp.minimum, share), 0.0)
-    return force, scale, yaw_scale, thrusts, turn
+    room = jnp.maximum(jnp.minimum(force - chord, full_high - force), 0.0) / turn
+    return force, scale, safe_clip(wrench[..., 3:] / p.arms[..., 2:], -room, room), ratio
 
 
 def _of_all(function: Callable[[Array, Array], Array], x: Array) -> Array:

@@ -106,5 +106,18 @@ def rotor_vel_of_thrust(thrust: Array, rpm2thrust: Array) -> Array:
     Returns:
         Rotor speeds, rpm. (..., n_rotors)
     """
+    return (thrust_slope(thrust, rpm2thrust) - rpm2thrust[..., 1]) / (2 * rpm2thrust[..., 2])
+
+
+def thrust_slope(thrust: Array, rpm2thrust: Array) -> Array:
+    """Return the slope of the thrust curve over the speed where it reaches a thrust, N/rpm; zero below its minimum.
+
+    Args:
+        thrust: Thrust of each rotor, N. (..., n_rotors)
+        rpm2thrust: Constant, linear and quadratic term over rpm. (..., 1 or n_rotors, 3)
+
+    Returns:
+        Slope for each rotor, N/rpm. (..., n_rotors)
+    """
     k0, k1, k2 = rpm2thrust[..., 0], rpm2thrust[..., 1], rpm2thrust[..., 2]
-    return (safe_sqrt(k1 * k1 - 4 * k2 * k0 + 4 * k2 * thrust) - k1) / (2 * k2)
+    return safe_sqrt(k1 * k1 - 4 * k2 * k0 + 4 * k2 * thrust)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe, rotation
 from crazysim.control.allocation import yaw_arm
-from crazysim.control.auto import DAMPING, STIFFNESS, Auto, AutoParams, error_of_axes, error_of_quat
-from crazysim.control.bandwidth import rotor_rate
+from crazysim.control.auto import DAMPING, STIFFNESS, Auto, AutoParams, error_of_quat
+from crazysim.control.bandwidth import authority, rotor_rate
 from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.models import supported_drones
@@ -176,9 +176,8 @@ def test_a_far_setpoint_is_approached_without_losing_height():
     body=np.array([0.74740932, 0, 0, -0.66436384]), desired=np.array([0.10349082, 0.98124632, 0.1149898, 0.1149898])
 )
 def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
-    """The error of SciPy's rotations: both forms agree, and their lengths are 2 sin(angle / 2)."""
+    """The error of SciPy's rotations, whose length is 2 sin(angle / 2)."""
     relative = Rotation.from_quat(body).inv() * Rotation.from_quat(desired)
-    axes = relative.as_matrix().astype(np.float32)
     z = relative.as_matrix()[:, 2]
     tilt = np.arccos(np.clip(z[2], -1, 1))
     if tilt > 3.1:
@@ -187,24 +186,20 @@ def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
     axis = axis / max(np.linalg.norm(axis), 1e-12)
     turn = (Rotation.from_rotvec(tilt * axis).inv() * relative).as_rotvec()[2]
     expected = 2 * np.array([*(np.sin(tilt / 2) * axis[:2]), np.sin(turn / 2)])
-    from_axes = np.asarray(jitted_axes(axes[:, 0], axes[:, 1], axes[:, 2]))
-    from_quat = np.asarray(jitted_quat(relative.as_quat().astype(np.float32)))
-    for found in (from_axes, from_quat):
-        np.testing.assert_allclose(found[:2], expected[:2], atol=5e-3)
-        np.testing.assert_allclose(np.abs(found[2]), np.abs(expected[2]), atol=5e-3)
-        if abs(turn) < 3.0:
-            np.testing.assert_allclose(found[2], expected[2], atol=5e-3)
+    found = np.asarray(jitted_quat(relative.as_quat().astype(np.float32)))
+    np.testing.assert_allclose(found[:2], expected[:2], atol=5e-3)
+    np.testing.assert_allclose(np.abs(found[2]), np.abs(expected[2]), atol=5e-3)
+    if abs(turn) < 3.0:
+        np.testing.assert_allclose(found[2], expected[2], atol=5e-3)
 
 
-jitted_axes, jitted_quat = jax.jit(error_of_axes), jax.jit(error_of_quat)
+jitted_quat = jax.jit(error_of_quat)
 
 
 def test_upside_down_the_error_is_a_full_turn_about_x():
     """Where the direction of the shortest turn is undefined, so that such a drone does not stay there."""
-    x, y, z = (np.float32(v) for v in ([1, 0, 0], [0, -1, 0], [0, 0, -1]))
-    np.testing.assert_allclose(jitted_axes(x, y, z), [2, 0, 0])
     np.testing.assert_allclose(jitted_quat(np.float32([1, 0, 0, 0])), [2, 0, 0])
-    np.testing.assert_allclose(jitted_axes(-x, y, -z)[2], 2.0, atol=1e-3)  # turned by 180 degrees
+    np.testing.assert_allclose(jitted_quat(np.float32([0, 0, 1, 0]))[2], 2.0, atol=1e-3)  # turned by 180 degrees
 
 
 def test_the_gains_are_damped_as_documented():
@@ -222,15 +217,59 @@ def test_the_gains_are_damped_as_documented():
 def test_gains_by_hand():
     """cf21B_500: lag 16.094 1/s, made faster to 50 1/s; with 1.5 periods of 500 Hz that is 43.48 1/s."""
     airframe = load_airframe("cf21B_500")
-    p = AutoParams.create(airframe, 500)
+    p = AutoParams.create(airframe, 500, 100)
     rate = 1 / (1 / 50 + 1.5 / 500)
     np.testing.assert_allclose(p.lead, 50 / rotor_rate(airframe))
     np.testing.assert_allclose(p.damping, 0.6 * rate * np.array([1, 1, 0.5]))
     np.testing.assert_allclose(p.stiffness, 0.12 * rate**2 * np.array([1, 1, 0.25]))
-    np.testing.assert_allclose(p.position.damping, 2 * 0.4 * rate / 5)
-    slow = AutoParams.create(load_airframe("cf2x_L250"), 500)
+    np.testing.assert_allclose(p.position.damping, 2 * 0.4 / (5 / rate + 0.5 / 100))
+    slow = AutoParams.create(load_airframe("cf2x_L250"), 500, 100)
     np.testing.assert_allclose(slow.lead, 5.0)  # the most
-    assert AutoParams.create(airframe, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
+    assert AutoParams.create(airframe, 50, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
+
+
+@pytest.mark.fast
+def test_authority_by_hand():
+    """A quadrotor in X of 1 kg with arms of 0.1 m, 0.1 to 10 N a rotor, 20 mm of drag torque over thrust.
+
+    Two rotors lose what they have above 0.1 N, two gain it: 2 (9.81 / 4 - 0.1) N at 0.1 m twice. With at most 3 N a
+    rotor, roll and pitch lower the collective thrust to 4 x 1.55 N, which leaves 1.45 N for each; yaw has 3 N - 2.45 N.
+    """
+    quad = {
+        "rigid_body": {"mass": 1.0, "inertia": [0.01, 0.01, 0.02]},
+        "rotors": {
+            "position": [[0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0], [0.1, 0.1, 0]],
+            "yaw_torque_sign": [-1, 1, -1, 1],
+            "thrust_min": 0.1,
+            "thrust_max": 10.0,
+            "inertia": 1e-5,
+            "thrust_curve": [0, 0, 1e-8],
+            "torque_curve": [0, 0, 2e-10],
+            "lag": [500, 0, 500, 0],
+        },
+        "drag": {"coefficients": [-0.1, -0.1, -0.1]},
+    }
+    hover = 9.81 / 4
+    least = hover - 0.1
+    np.testing.assert_allclose(authority(load_airframe(quad)), [40 * least, 40 * least, 4 * least], rtol=1e-6)
+    quad["rotors"]["thrust_max"] = 3.0
+    np.testing.assert_allclose(authority(load_airframe(quad)), [40 * 1.45, 40 * 1.45, 4 * (3 - hover)], rtol=1e-6)
+    # Quick rotors: the rate follows from the authority, so that the rotors can brake each turn.
+    p, (roll, _, yaw) = AutoParams.create(load_airframe(quad), 500, 100), authority(load_airframe(quad))
+    np.testing.assert_allclose(p.lead, 1.0)
+    np.testing.assert_allclose((p.stiffness / p.damping) ** 2 * [2, 2, 1], [roll, roll, yaw], rtol=1e-5)
+
+
+@pytest.mark.fast
+def test_heavy_rotors_give_yaw_torque_by_their_acceleration():
+    """The transfer function of the module's docstring, in discrete time, never exceeds one, nor its own limit."""
+    lag, reaction = 25.0, 0.8
+    share = 1 / (1 + lag * reaction)
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 200))  # one tick of 2 ms
+    drag = lag * 0.002 * share / (z - 1 + lag * 0.002 * share)
+    gain = np.abs(drag * (1 + reaction / 0.002 * (z - 1)))
+    assert np.all(gain <= 1 + 1e-9)
+    assert np.all(gain > 0.95 * lag * reaction * share)
 
 
 def test_the_drag_torque_over_thrust_of_the_curves_is_that_of_the_tables():

@@ -144,16 +144,21 @@ def test_a_wrench_is_brought_within_the_limits_by_priority(wrench):
     thrusts = thrusts_of(out, p)
     assert np.all(thrusts > low - 1e-12)
     assert np.all(thrusts < high + 1e-12)
-    wanted = thrusts_of(wrench, p)
-    if np.all((wanted >= low) & (wanted <= high)):
+    still, yaw = thrusts_of(wrench * [1, 1, 1, 0], p), np.abs(thrusts_of(wrench * [0, 0, 0, 1], p))
+    if np.all((still - yaw >= low) & (still + yaw <= high)):
         np.testing.assert_allclose(out, wrench, atol=1e-12)
     tilt = thrusts_of(np.array([0, *wrench[1:3], 0]), p)
-    if np.ptp(tilt) <= high - low:
+    limit = max(wrench[0], float(p.weight[0]))
+    assert out[0] <= limit + 1e-12  # torque alone does not lift the drone
+    fits = min((high - low) / max(np.ptp(tilt), 1e-12), (limit / 4 - low) / max(-tilt.min(), 1e-12))
+    if fits >= 1:
         np.testing.assert_allclose(out[1:3], wrench[1:3], atol=1e-12)  # thrust and yaw give way
     else:
-        cosine = out[1:3] @ wrench[1:3] / np.linalg.norm(out[1:3]) / np.linalg.norm(wrench[1:3])
-        np.testing.assert_allclose(cosine, 1.0)
-        np.testing.assert_allclose(np.ptp(thrusts_of(np.array([0, *out[1:3], 0]), p)), high - low)
+        scale = out[1:3] @ wrench[1:3] / (wrench[1:3] @ wrench[1:3])
+        np.testing.assert_allclose(out[1:3], scale * wrench[1:3], atol=1e-12)
+        assert fits / 2 < scale < fits + 1e-9
+        if limit >= 4 * high:
+            np.testing.assert_allclose(scale, fits)
     assert out[3] * wrench[3] >= 0
     assert abs(out[3]) <= abs(wrench[3]) + 1e-15
 
