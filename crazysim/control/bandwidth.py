@@ -24,6 +24,8 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 
 ATTITUDE_STIFFNESS = 0.3
 """Attitude gain per inertia over the squared lag rate, 1."""
+REACTION = 1 / 3
+"""Largest part of an error of the yaw rate that the reaction to accelerating rotors takes away in a tick, 1."""
 YAW = 0.5
 """Rate of the yaw loop over that of roll and pitch, 1."""
 ERRORS = np.array([2.0, 2.0, 1.0])
@@ -104,17 +106,20 @@ def turn_rates(airframe: Airframe) -> np.ndarray:
     return np.sqrt(authority(airframe) / ERRORS)
 
 
-def bandwidth(airframe: Airframe, freq: int, rate: float | None = None) -> Bandwidth:
+def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, reacts: bool = True) -> Bandwidth:
     """Return the rates of the loops of an airframe under a controller that runs at ``freq`` Hz.
 
     Args:
         airframe: The airframe.
         freq: Rate of the controller, Hz.
         rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
+        reacts: True for a controller that leaves the reaction to accelerating rotors out of account.
 
     Raises:
         ConfigError: If the airframe has no rotor constants.
     """
     rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
     axes = np.minimum(rate * np.array([1.0, 1.0, YAW]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
+    if reacts:
+        axes[2] = min(axes[2], REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
     return Bandwidth(float(POSITION * np.min(axes[:2])), ATTITUDE_STIFFNESS * axes**2, axes)

@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.allocation import force_torque2rotor_vel, wrench_matrix
-from crazysim.control.bandwidth import bandwidth, rotor_rate
+from crazysim.control.bandwidth import bandwidth, fastest_rotor_rate, reaction_time, rotor_rate
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
 from crazysim.control.levels import Control
@@ -28,6 +28,8 @@ from crazysim.rotation import cross, dot, matvec
 LEAD = 2.0
 """Factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
 
+STEP = 0.5
+"""Largest part of the missing rotor speed that the feedback adds in one tick of the controller, 1."""
 DISTURBANCE_MAX = 5.0
 """Largest acceleration by a disturbance that is compensated along an axis, m/s^2: half of the weight."""
 TORQUE_MAX = 0.5
@@ -43,6 +45,10 @@ class INDIParams(PyTree):
     """Rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
     lead: Array = leaf("parameter", 1)
     """Factor on the difference of commanded and present rotor speeds, 1. (1,)"""
+    reaction: Array = leaf("parameter", 1, (1,))
+    """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
+    share: Array = leaf("parameter", 1, (1,))
+    """Part of the missing yaw torque that the rotors' drag is to give; the reaction to them gives the rest, 1. (1,)"""
     filter: Array = leaf("parameter", 1)
     """Coefficients b0, a1, a2 of the low-pass filter. (3,)"""
 
@@ -63,11 +69,15 @@ class INDIParams(PyTree):
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
-        gains = gains_of(airframe, bandwidth(airframe, freq, LEAD * rotor_rate(airframe)))
+        lag, reaction = rotor_rate(airframe), reaction_time(airframe)
+        lead = max(min(LEAD, STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        gains = gains_of(airframe, bandwidth(airframe, freq, lead * lag, reacts=False))
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
             mixing_matrix=as_parameter(wrench_matrix(airframe)),
-            lead=as_parameter(LEAD),
+            lead=as_parameter(lead),
+            reaction=as_parameter(reaction),
+            share=as_parameter(1 / (1 + lead * lag * reaction)),
             filter=as_parameter(butterworth(min(cutoff, 0.45 * freq), freq)),
         )
 
@@ -77,8 +87,8 @@ class INDIMemory(PyTree):
 
     vel: Array = leaf("drone", 1)
     """Velocity at the last tick, world frame, m/s. (n_worlds, n_drones, 3)"""
-    ang_vel: Array = leaf("drone", 1)
-    """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
+    momentum: Array = leaf("drone", 1)
+    """Angular momentum of body and rotors at the last tick, body frame, N m s. (n_worlds, n_drones, 3)"""
     filter: Array = leaf("drone", 1)
     """Two states of the filter for each of its 12 signals. (n_worlds, n_drones, 24)"""
     started: Array = leaf("drone", 1)
@@ -158,13 +168,16 @@ def indi_control(
     wrench = matvec(params.mixing_matrix, curve(rotor_vel, allocation.rpm2thrust))
     push = matrix[..., 2] * wrench[..., :1] / p.mass
     fresh = memory.started == 0
-    torque_acc = (wrench[..., 1:] - cross(ang_vel, matvec(p.J, ang_vel))) / _moments(p.J)
-    ang_acc = jnp.where(fresh, torque_acc, (ang_vel - memory.ang_vel) * freq)
+    yaw = wrench[..., 3:]
+    momentum = matvec(p.J, ang_vel)
+    total = momentum - rotation.along_z((params.reaction * yaw)[..., 0])
+    known = wrench[..., 1:] - cross(ang_vel, momentum)
+    turn = jnp.where(fresh, known, (total - memory.momentum) * freq)
     acc = jnp.where(fresh, push + p.gravity_vec, (vel - memory.vel) * freq)
-    signals = jnp.concatenate([acc, push, ang_acc, wrench[..., 1:]], axis=-1)
+    signals = jnp.concatenate([acc, push, turn, wrench[..., 1:]], axis=-1)
     state = jnp.where(fresh, steady(signals, params.filter), memory.filter)
     signals, state = filtered(signals, state, params.filter)
-    acc, push, ang_acc, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
+    acc, push, turn, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
 
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
     disturbance = rotation.safe_clip(acc - push - p.gravity_vec, -DISTURBANCE_MAX, DISTURBANCE_MAX)
@@ -173,19 +186,15 @@ def indi_control(
     rotation_error, rate_error, ang_acc_des = attitude_errors(matrix, ang_vel, attitude)
     wanted = matvec(p.J, ang_acc_des) - p.kR * rotation_error - p.kw * rate_error
     limit = TORQUE_MAX * p.kR
-    torque = wanted - rotation.safe_clip(matvec(p.J, ang_acc) - torque, -limit, limit)
+    torque = wanted - rotation.safe_clip(turn - torque, -limit, limit)
 
     thrust = p.mass * dot(specific, matrix[..., 2])
-    command = prioritized_wrench(jnp.concatenate([thrust, torque], axis=-1), params=allocation)
+    drag = yaw + params.share * (torque[..., 2:] - yaw)
+    command = prioritized_wrench(jnp.concatenate([thrust, torque[..., :2], drag], axis=-1), params=allocation)
     desired = force_torque2rotor_vel(command, params=allocation)
     slowest = rotor_vel_of_thrust(allocation.thrust_min, allocation.rpm2thrust)
     driven = jnp.maximum(rotor_vel + params.lead * (desired - rotor_vel), jnp.maximum(slowest, 1.0))
-    return driven, INDIMemory(vel, ang_vel, state, jnp.ones_like(memory.started))
-
-
-def _moments(J: Array) -> Array:
-    """Return the diagonal of an inertia. (..., 3)"""
-    return jnp.stack([J[..., i, i] for i in range(3)], axis=-1)
+    return driven, INDIMemory(vel, total, state, jnp.ones_like(memory.started))
 
 
 class INDI(Controller):
