@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
-from crazysim.control.allocation import hover_rotor_vel, yaw_arm
+from crazysim.control.allocation import hover_rotor_vel, level_thrust, yaw_arm
 from crazysim.control.auto import Auto
-from crazysim.control.bandwidth import rotor_rate
+from crazysim.control.bandwidth import authority, precession, rotor_rate
 from crazysim.control.controllers import CASCADE, find_controller
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, supported_dynamics
+from crazysim.dynamics.models import require_freq
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import replacing
 
@@ -28,6 +29,14 @@ QUARTER_TURN = np.pi / 2
 """Angle of the turn whose largest rate and duration are stated, rad."""
 WEAK = 1.5
 """Thrust over weight below which a warning is given, 1."""
+SLUGGISH = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
+"""Angular acceleration in hover below which a warning is given, rad/s^2: the least of the airframes of the tests."""
+PRECESSION = 0.25
+"""Part of the authority that the net momentum of the rotors takes at 1 rad/s, above which a warning is given, 1."""
+SLOW = 0.2
+"""Time constant of rotors above which a warning is given, s: the longest of the airframes of the tests."""
+FREQ = 500
+"""Default rate of the physics, Hz."""
 
 
 def describe_airframe(airframe: Airframe) -> str:
@@ -70,9 +79,8 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
 
 
 def _ratio(airframe: Airframe) -> float:
-    return float(
-        airframe.n_rotors * airframe.value("rotors.thrust_max") / (airframe.value("rigid_body.mass") * GRAVITY)
-    )
+    """Return the largest thrust without a torque over the weight, 1."""
+    return level_thrust(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY)
 
 
 def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
@@ -169,5 +177,26 @@ def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
         yield "the middle of the rotors is beside the centre of mass: rotors differ in hover"
     if np.sum(airframe.value("rotors.yaw_torque_sign")):
         yield "more rotors turn one way than the other: their drag turns the drone in hover"
+    if Dynamics.first_principles in dynamics:
+        yield from _slow(airframe)
     if not dynamics:
         yield "no dynamics: expected the curves of the rotors, or a table [fitted.NAME]"
+
+
+def _slow(airframe: Airframe) -> Iterator[str]:
+    """Yield what makes flights slow, or steps of the default rate diverge."""
+    for (axis, least), acc in zip(SLUGGISH.items(), authority(airframe), strict=True):
+        if acc < least:
+            seconds = 2 * np.sqrt(QUARTER_TURN / acc)
+            yield f"{axis} has {acc:.2g} rad/s^2 in hover: a turn by 90 degrees takes {seconds:.2g} s at least"
+    if precession(airframe) > PRECESSION * np.min(authority(airframe)[:2]):
+        yield (
+            f"rotors turn one way more than the other: at 1 rad/s of roll or pitch their momentum takes "
+            f"{precession(airframe):.2g} of {np.min(authority(airframe)[:2]):.2g} rad/s^2 about the other axis"
+        )
+    if rotor_rate(airframe) * SLOW < 1:
+        yield f"rotors lag by {1 / rotor_rate(airframe):.2g} s: a drone that is thrown takes long to recover"
+    try:
+        require_freq(airframe, Dynamics.first_principles, FREQ)
+    except ConfigError as error:
+        yield str(error)

@@ -78,6 +78,16 @@ def reaction_time(airframe: Airframe) -> float:
     return float(np.mean(airframe.value("rotors.inertia") * RPM_TO_RAD_S / (k1 + 2 * k2 * hover)))
 
 
+def precession(airframe: Airframe) -> float:
+    """Return the angular acceleration about x or y that rotors exert in hover per rate about the other axis, 1/s.
+
+    It is their net angular momentum over the smaller inertia: zero where as many rotors turn one way as the other.
+    """
+    signs, hover = airframe.value("rotors.yaw_torque_sign"), RPM_TO_RAD_S * hover_rotor_vel(airframe)
+    momentum = np.sum(signs * airframe.value("rotors.inertia") * hover)
+    return float(abs(momentum) / np.min(np.diag(airframe.inertia)[:2]))
+
+
 def authority(airframe: Airframe) -> np.ndarray:
     """Return the angular acceleration that the rotors can give about each axis, either way, rad/s^2. (3,)
 

@@ -1,0 +1,151 @@
+"""Random airframes that can fly, and flights of many of them at once, as the drones of one simulation."""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from crazysim import Sim, load_airframe
+from crazysim.control.allocation import allocation_matrix
+from crazysim.control.bandwidth import authority, precession
+from crazysim.core.pipeline import remove_fn
+from crazysim.errors import ConfigError
+
+GRAVITY = 9.81
+LEAST = np.array([4.0, 4.0, 0.2])
+"""Angular acceleration in hover below which an airframe is not drawn, rad/s^2; ``airframe check`` warns below 0.2."""
+
+TURN = 2.0
+"""Body rate of the flights, rad/s, at which the net momentum of the rotors takes up to half of the authority."""
+
+
+def log_uniform(rng, low, high):
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def draw(rng, n, name):
+    """Return an airframe of n rotors: 20 g to 20 kg, thrust over weight 1.3 to 10, rotors of 2 to 200 ms.
+
+    Half of the bodies are asymmetric: rotors off their angles and radii, and a centre of mass beside their middle.
+    Rotors have a third to three times the usual inertia and spin down up to twice as slowly, or as quickly, as up.
+    """
+    while True:
+        mass, ratio, tau = log_uniform(rng, 0.02, 20), log_uniform(rng, 1.3, 10), log_uniform(rng, 0.002, 0.2)
+        arm, uneven = 0.17 * (mass / 0.5) ** 0.4 * rng.uniform(0.6, 1.4), rng.choice([0.0, 1.0])
+        angles = 2 * np.pi * (np.arange(n) + rng.choice([0.0, 0.5]) + uneven * rng.uniform(-0.15, 0.15, n)) / n
+        aspect, radii = rng.uniform(0.84, 1.18), arm * (1 + uneven * rng.uniform(-0.15, 0.15, n))
+        x, y = aspect * radii * np.cos(angles), radii * np.sin(angles) / aspect
+        x, y = (p - np.mean(p) + uneven * rng.uniform(-0.08, 0.08) * arm for p in (x, y))
+        signs = np.array([1, -1] * (n // 2) + [1] * (n % 2))
+        size = rng.uniform(0.3, 1.0) * mass
+        inertia = size * np.array([np.mean(y**2), np.mean(x**2), 0]) * rng.uniform(0.8, 1.25, 3)
+        inertia[2] = (inertia[0] + inertia[1]) * rng.uniform(0.65, 0.98)
+        # Propellers: thrust coefficient, and inertia of a rod of 15 g at 0.279 m, as in crazysim.drones.estimate.
+        diameter = 2 * arm * np.sin(np.pi / n) * rng.uniform(0.6, 1.0)
+        curve = rng.uniform(0.09, 0.15) * 1.225 * diameter**4 / 3600
+        rod = 0.015 * (diameter / 0.279) ** 2 * diameter**2 / 12
+        lift = np.linalg.pinv(np.stack([np.ones(n), y, -x, signs]))[:, 0]
+        most = ratio * mass * GRAVITY * np.max(lift)
+        hover = np.sqrt(mass * GRAVITY / n / curve)
+        up, down = 1 / tau, 1 / tau * rng.uniform(0.5, 1.0) ** rng.choice([-1, 1])
+        quadratic = rng.uniform(0.0, 0.8) * rng.choice([0, 1])
+        lag = [rate * part for rate in (up, down) for part in (1 - quadratic, quadratic / 2 / hover)]
+        if max(up, down) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift))) > 600:
+            continue  # too quick for steps of 2 ms
+        try:
+            airframe = load_airframe(
+                {
+                    "name": name,
+                    "rigid_body": {"mass": mass, "inertia": inertia.tolist()},
+                    "rotors": {
+                        "position": np.stack([x, y, 0 * x], axis=-1).tolist(),
+                        "yaw_torque_sign": signs.tolist(),
+                        "thrust_min": most * rng.uniform(0.01, 0.06),
+                        "thrust_max": most,
+                        "inertia": rod * log_uniform(rng, 1 / 3, 3),
+                        "thrust_curve": [0.0, 0.0, curve],
+                        "torque_curve": [0.0, 0.0, curve * log_uniform(rng, 0.002, 0.03) * max(1.0, arm / 0.2)],
+                        "lag": lag,
+                    },
+                    "drag": {"coefficients": (-mass * rng.uniform(0.05, 0.5, 3)).tolist()},
+                }
+            )
+        except ConfigError:
+            continue
+        acc = authority(airframe)
+        if np.all(acc > LEAST) and 2 * TURN * precession(airframe) < np.min(acc[:2]):
+            return airframe
+
+
+def fleet(n, count, seed=0):
+    """Return random airframes of n rotors."""
+    rng = np.random.default_rng([seed, n])
+    return [draw(rng, n, f"{n} rotors, number {k} of seed {seed}") for k in range(count)]
+
+
+def in_the_air(sim, pos=0.0, vel=0.0, quat=(0.0, 0.0, 0.0, 1.0), ang_vel=0.0):
+    """Put all drones into a state, with rotors that keep them level, without a floor."""
+    if "clip_floor_pos" in sim.step_pipeline:
+        remove_fn(sim.step_pipeline, "clip_floor_pos")
+        sim.build_step_fn()
+    s = sim.data.states
+    full = lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape)  # noqa: E731
+    weights = [GRAVITY * a.value("rigid_body.mass") for a in sim.airframes]
+    rotor_vel = [a.rotor_vel(w * allocation_matrix(a)[:, 0]) for a, w in zip(sim.airframes, weights, strict=True)]
+    states = s.replace(
+        pos=full(pos, s.pos),
+        vel=full(vel, s.vel),
+        quat=full(quat, s.quat),
+        ang_vel=full(ang_vel, s.ang_vel),
+        rotor_vel=full(np.stack(rotor_vel), s.rotor_vel),
+    )
+    sim.data = sim.data.replace(states=states)
+
+
+def directions(rng, *shape):
+    """Return random unit vectors. (..., 3)"""
+    vectors = rng.normal(size=(*shape, 3))
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def thrown(sim, seed, tilt=np.pi / 4, rate=2.0, speed=2.0, away=2.0, heading=np.pi):
+    """Throw all drones: a tilt, rad, about a random axis, body rates, rad/s, a speed, m/s, up to ``away`` m off."""
+    rng, shape = np.random.default_rng(seed), (sim.n_worlds, sim.n_drones)
+    axes = directions(rng, *shape) * [1, 1, 0]
+    axes *= tilt / np.linalg.norm(axes, axis=-1, keepdims=True)
+    yaws = Rotation.from_rotvec(rng.uniform(-heading, heading, (np.prod(shape), 1)) * [0, 0, 1])
+    quat = (Rotation.from_rotvec(axes.reshape(-1, 3)) * yaws).as_quat().reshape(*shape, 4)
+    pos = away * directions(rng, *shape) * rng.uniform(0, 1, (*shape, 1))
+    in_the_air(sim, pos, speed * directions(rng, *shape), quat, rate * directions(rng, *shape))
+
+
+def alternation(sim):
+    """Return the largest change of direction of a rotor's command in two ticks, over its speed in hover. (n_drones,)"""
+    commands = []
+    for _ in range(12):
+        sim.step()
+        commands.append(np.asarray(sim.data.controls.rotor_vel))
+    hover = [np.max(a.rotor_vel(GRAVITY * a.value("rigid_body.mass") / a.n_rotors)) for a in sim.airframes]
+    return np.abs(np.diff(commands, 2, axis=0)).max((0, 1, 3)) / hover
+
+
+def flights(airframes, controller, worlds, seconds, seed, **start):
+    """Return the distances from the setpoint and heights after each 0.1 s, m, and the alternation of rotors at the end.
+
+    (n_times, n_worlds, n_drones), the same, (n_drones,)
+    """
+    sim = Sim(worlds, drone=airframes, control="state", controller=controller)
+    thrown(sim, seed, **start)
+    sim.state_control(pos=[0.0, 0.0, 0.0])
+    track = []
+    for _ in range(round(10 * seconds)):
+        sim.step(50)
+        track.append(np.asarray(sim.data.states.pos))
+    track = np.array(track)
+    return np.linalg.norm(track, axis=-1), track[..., 2], alternation(sim)
+
+
+def settled(distances, limit):
+    """Return the time after which a distance stays below a limit, s; infinite if it does not. (n_worlds, n_drones)"""
+    above = distances > limit
+    last = len(above) - np.argmax(above[::-1], axis=0)
+    return np.where(above[-1], np.inf, np.where(above.any(0), 0.1 * last, 0.0))

@@ -1,0 +1,106 @@
+"""Hundreds of random airframes, thrown into the air: all controllers with gains from physics bring them home."""
+
+import numpy as np
+import pytest
+from random_airframes import GRAVITY, alternation, fleet, flights, in_the_air, settled, thrown
+from scipy.spatial.transform import Rotation
+
+from crazysim import Sim
+from crazysim.control import Auto
+from crazysim.control.bandwidth import authority
+
+STEPS = {
+    "attitude": ((0, 0.1), (0, 0.5), (1, -0.5), (2, 0.5), (2, 2.5)),
+    "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
+}
+"""Axes and sizes of the steps of the command at each level, rad or rad/s."""
+ROTORS = (4, 5, 6, 8, 12)
+MANY = [pytest.param(n, seed, 150, marks=pytest.mark.slow) for n in range(4, 13) for seed in (1, 2, 3)]
+FEW = [pytest.param(n, 0, 40) for n in ROTORS]
+
+
+@pytest.mark.parametrize(("n", "seed", "count"), [*FEW, *MANY])
+def test_setpoints_are_reached_from_any_throw(n, seed, count):
+    """45 degrees, 2 rad/s, 2 m/s and up to 2 m off: within 2 mm after the time that the bandwidth promises.
+
+    That is the far part of the way at the speed from which the drone can stop, 14 time constants of the position loop,
+    and half a turn of yaw.
+    """
+    airframes = fleet(n, count, seed)
+    distances, heights, alternating = flights(airframes, "auto", 4, 40, seed)
+    times = settled(distances, 2e-3)
+    for k, airframe in enumerate(airframes):
+        position = Auto().params(airframe).position
+        frequency, acc = float(np.sqrt(position.stiffness[0])), float(np.min(position.acc_max))
+        turn = 2 * np.sqrt(np.pi / authority(airframe)[2])
+        promised = distances[:, :, k].max(0) * frequency / acc + 14 / frequency + turn
+        assert np.all(times[:, k] < promised), (airframe.name, times[:, k], promised)
+        assert heights[:, :, k].max() < 4.0, airframe.name
+        assert alternating[k] < 1e-3, airframe.name
+
+
+@pytest.mark.parametrize(("n", "seed", "count"), [*FEW, *MANY])
+@pytest.mark.parametrize("level", ["attitude", "body_rate"])
+def test_commands_below_are_followed_without_overshoot(level, n, seed, count):
+    """Steps overshoot by at most 10%, and thrown drones follow random commands after 36 s, which weak yaw needs."""
+    airframes, steps, throws = fleet(n, count, seed), STEPS[level], 4
+    rng = np.random.default_rng(seed)
+    sim = Sim(len(steps) + throws, drone=airframes, control=level)
+    thrown(sim, seed)
+    s = sim.data.states
+    rest = np.arange(sim.n_worlds) < len(steps)
+    quat, ang_vel = np.array(s.quat), np.array(s.ang_vel)
+    quat[rest], ang_vel[rest] = [0, 0, 0, 1], 0
+    in_the_air(sim, s.pos, s.vel * ~rest[:, None, None], quat, ang_vel)
+    command = np.zeros((sim.n_worlds, count, 4), np.float32)
+    if level == "attitude":
+        command[..., :3] = rng.uniform(-1, 1, command[..., :3].shape) * [0.5, 0.5, 3]
+    else:  # about one axis: two rates at once need a gyroscopic torque about the third, which yaw may not have
+        command[..., :3] = np.eye(3)[rng.integers(0, 3, command.shape[:2])] * rng.uniform(
+            -2, 2, (*command.shape[:2], 1)
+        )
+    command[..., 3] = [GRAVITY * a.value("rigid_body.mass") for a in airframes]
+    for k, (axis, size) in enumerate(steps):
+        command[k, :, :3] = size * np.eye(3)[axis]
+    getattr(sim, f"{level}_control")(command)
+
+    highest = np.zeros((len(steps), count))
+    for _ in range(400):
+        sim.step(10)
+        now = angles(sim) if level == "attitude" else np.asarray(sim.data.states.ang_vel)
+        found = np.stack([now[k, :, axis] / size for k, (axis, size) in enumerate(steps)])
+        highest = np.maximum(highest, found)
+    sim.step(14000)
+    assert highest.max() < 1.1, airframes[int(highest.max(0).argmax())].name
+    if level == "attitude":
+        wanted = Rotation.from_euler("xyz", command[..., :3].reshape(-1, 3))
+        present = Rotation.from_quat(np.asarray(sim.data.states.quat).reshape(-1, 4))
+        error = (wanted.inv() * present).magnitude().reshape(sim.n_worlds, count)
+    else:
+        error = np.linalg.norm(np.asarray(sim.data.states.ang_vel) - command[..., :3], axis=-1)
+    assert error.max() < 0.02, airframes[int(error.max(0).argmax())].name
+    assert alternation(sim).max() < 1e-3
+
+
+def angles(sim):
+    quat = np.asarray(sim.data.states.quat)
+    return Rotation.from_quat(quat.reshape(-1, 4)).as_euler("xyz").reshape(*quat.shape[:2], 3)
+
+
+OTHERS = {
+    "geometric": {},
+    "indi": {},
+    "lqr": {"tilt": 0.35, "rate": 1.0, "speed": 0.5, "away": 0.5, "heading": 0.5},
+}
+"""Throws that other controllers catch, where they differ from those of the default one."""
+
+
+@pytest.mark.parametrize("n", [4, 6, pytest.param(5, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("controller", OTHERS)
+def test_other_controllers_by_bandwidth_catch_their_drones(controller, n):
+    """99% of the flights end within 5 cm after 60 s, as position loops above slow rotors are slow; none alternates."""
+    airframes = fleet(n, 40, 0)
+    distances, heights, alternating = flights(airframes, controller, 4, 60, 0, **OTHERS[controller])
+    assert np.mean(distances[-10:].max(0) < 0.05) >= 0.99, controller
+    assert heights.max() < 4.0
+    assert alternating.max() < 0.01
