@@ -8,7 +8,6 @@ from jax import Array
 
 from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
-from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec, safe_clip
@@ -21,8 +20,6 @@ class AllocationParams(PyTree):
     """Minimum thrust of a rotor that is on, N. (1,)"""
     thrust_max: Array = leaf("parameter", 1)
     """Maximum thrust of one rotor, N. (1,)"""
-    weight: Array = leaf("parameter", 1)
-    """Weight that the rotors carry in hover, N. (1,)"""
     arms: Array = leaf("parameter", 1)
     """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
     rpm2thrust: Array = leaf("parameter", 2)
@@ -31,6 +28,9 @@ class AllocationParams(PyTree):
     """Allocation matrix, wrench over the arms to rotor thrusts, 1. (n_rotors, 4)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
     """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
+    weight: Array | None = leaf("parameter", 1, (1,), default=None)
+    """Weight, up to which roll and pitch torque may raise the collective thrust, N; None where clipping is not by
+    priority. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:
@@ -45,7 +45,6 @@ class AllocationParams(PyTree):
         return AllocationParams(
             thrust_min=as_parameter(airframe.value("rotors.thrust_min", ())),
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),
-            weight=as_parameter(-GRAVITY[2] * airframe.value("rigid_body.mass", ())),
             arms=as_parameter(torque_arms(airframe)),
             rpm2thrust=as_parameter(curve.reshape(-1, 3)),
             allocation_matrix=as_parameter(allocation_matrix(airframe)),

@@ -1,14 +1,21 @@
-"""Gains by bandwidth: what the lag of an airframe's rotors and the rate of a controller allow.
+"""Gains by bandwidth: what rotors, their lag and the rate of a controller allow.
 
 A drone with rotors of lag rate ``a`` turns under a feedback of attitude and body rate, with gains per inertia kp and
 kd, as ``s^3 / a + s^2 + kd s + kp``. The rule here is
 
-    kd = a,   kp = 0.3 a^2,   and half of these rates about yaw, where rotors have less authority,
+    kd = a,   kp = 0.3 a^2,   and at most half of these rates about yaw, where rotors have less authority,
 
 which puts the slowest mode of the attitude at about 0.4 a. The position loop is critically damped with a natural
-frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more (``test_bandwidth.py`` computes
+frequency of 0.12 a: together the five modes then have damping ratios of 0.39 and more (``test_geometric.py`` computes
 them). A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
 counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
+
+Two limits lower these rates. A large error e turns the drone along the line on which kp e + kd e' = 0, so the rotors
+have to brake it with (kp / kd)^2 e. Beyond what they can give (``authority``) the drone turns faster than it can stop:
+``turn_rates`` bounds kp / kd. And a rotor that speeds up turns the body the other way, at once: with rotors of the lag
+rate r whose momentum changes by z over their drag torque (``reaction_time``), a demand of yaw torque has 1 + r z times
+its effect in the first tick. A controller that leaves this out of account may take away no more than ``REACTION`` of an
+error of the yaw rate in a tick.
 """
 
 from __future__ import annotations

@@ -71,7 +71,8 @@ def _prioritized(wrench: Array, params: AllocationParams) -> tuple[Array, Array,
     most = where_present(p.rotors, p.thrust_max / lift, BOUNDLESS)
     still_low, still_high = _of_all(jnp.maximum, least), _of_all(jnp.minimum, most)
     full_low, full_high = _of_all(jnp.maximum, least - ratio), _of_all(jnp.minimum, most - ratio)
-    limit = jnp.maximum(wrench[..., :1], jnp.maximum(p.weight, still_low))
+    weight = still_high if p.weight is None else p.weight
+    limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, still_low))
 
     # The room between the bounds is concave in s, so it is at least the chord from s = 0, where it is positive, to 1.
     still, full = jnp.minimum(still_high, limit) - still_low, jnp.minimum(full_high, limit) - full_low

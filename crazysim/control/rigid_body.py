@@ -33,10 +33,11 @@ def rigid_body(airframe: Airframe) -> dict[str, Any]:
     Raises:
         ConfigError: If the airframe lacks a value.
     """
+    mass = airframe.value("rigid_body.mass")
     return {
-        "mass": as_parameter(airframe.value("rigid_body.mass")),
+        "mass": as_parameter(mass),
         "gravity_vec": as_parameter(GRAVITY),
         "J": as_parameter(airframe.inertia),
         "drag_matrix": as_parameter(airframe.matrix("drag.coefficients")),
-        "allocation": AllocationParams.create(airframe),
+        "allocation": AllocationParams.create(airframe).replace(weight=as_parameter(-GRAVITY[2] * mass)),
     }

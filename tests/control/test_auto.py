@@ -228,7 +228,6 @@ def test_gains_by_hand():
     assert AutoParams.create(airframe, 50, 50).lead < p.lead  # half of what is missing in a tick of 20 ms
 
 
-@pytest.mark.fast
 def test_authority_by_hand():
     """A quadrotor in X of 1 kg with arms of 0.1 m, 0.1 to 10 N a rotor, 20 mm of drag torque over thrust.
 
@@ -260,7 +259,6 @@ def test_authority_by_hand():
     np.testing.assert_allclose((p.stiffness / p.damping) ** 2 * [2, 2, 1], [roll, roll, yaw], rtol=1e-5)
 
 
-@pytest.mark.fast
 def test_heavy_rotors_give_yaw_torque_by_their_acceleration():
     """The transfer function of the module's docstring, in discrete time, never exceeds one, nor its own limit."""
     lag, reaction = 25.0, 0.8

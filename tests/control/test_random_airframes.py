@@ -14,9 +14,11 @@ STEPS = {
     "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
 }
 """Axes and sizes of the steps of the command at each level, rad or rad/s."""
-ROTORS = (4, 5, 6, 8, 12)
-MANY = [pytest.param(n, seed, 150, marks=pytest.mark.slow) for n in range(4, 13) for seed in (1, 2, 3)]
-FEW = [pytest.param(n, 0, 40) for n in ROTORS]
+SLOW = pytest.mark.slow
+MANY = [pytest.param(n, seed, 150, marks=SLOW) for n in range(4, 13) for seed in (1, 2, 3)]
+FEW = [pytest.param(n, 0, 40) for n in (4, 5, 6, 8, 12)]
+LEVELS = [("attitude", n, 0, 40) for n in (5, 8)] + [("body_rate", n, 0, 40) for n in (4, 6)]
+LEVELS += [pytest.param(level, *each.values, marks=SLOW) for level in STEPS for each in MANY]
 
 
 @pytest.mark.parametrize(("n", "seed", "count"), [*FEW, *MANY])
@@ -39,8 +41,7 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
         assert alternating[k] < 1e-3, airframe.name
 
 
-@pytest.mark.parametrize(("n", "seed", "count"), [*FEW, *MANY])
-@pytest.mark.parametrize("level", ["attitude", "body_rate"])
+@pytest.mark.parametrize(("level", "n", "seed", "count"), LEVELS)
 def test_commands_below_are_followed_without_overshoot(level, n, seed, count):
     """Steps overshoot by at most 10%, and thrown drones follow random commands after 36 s, which weak yaw needs."""
     airframes, steps, throws = fleet(n, count, seed), STEPS[level], 4
@@ -95,8 +96,10 @@ OTHERS = {
 """Throws that other controllers catch, where they differ from those of the default one."""
 
 
-@pytest.mark.parametrize("n", [4, 6, pytest.param(5, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("controller", OTHERS)
+ALL = [pytest.param(name, n, marks=SLOW) for name in OTHERS for n in (4, 5, 6, 8)]
+
+
+@pytest.mark.parametrize(("controller", "n"), [("geometric", 4), ("indi", 6), ("lqr", 4), *ALL])
 def test_other_controllers_by_bandwidth_catch_their_drones(controller, n):
     """99% of the flights end within 5 cm after 60 s, as position loops above slow rotors are slow; none alternates."""
     airframes = fleet(n, 40, 0)
