@@ -134,3 +134,41 @@ def test_what_estimates_assume_is_in_the_file(tmp_path):
     assert main(["airframe", "new", str(path), *NUMBERS, "--arm", "0.12"]) == 0
     sources = tomllib.loads(path.read_text(encoding="utf-8"))["sources"]
     assert "figure of merit of 0.44" in sources["torque_curve"]
+
+
+def test_what_makes_flights_slow_is_warned_of_with_its_figure():
+    """Weak yaw: 9.81 / 4 - 0.5 N of spare thrust, 0.1 mm of drag torque over thrust, four times, over 0.02 kg m^2."""
+    quad = {
+        "rigid_body": {"mass": 1.0, "inertia": [0.01, 0.01, 0.02]},
+        "rotors": {
+            "position": [[0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0], [0.1, 0.1, 0]],
+            "yaw_torque_sign": [-1, 1, -1, 1],
+            "thrust_min": 0.5,
+            "thrust_max": 10.0,
+            "inertia": 1e-5,
+            "thrust_curve": [0, 0, 1e-8],
+            "torque_curve": [0, 0, 1e-12],
+            "lag": [4, 0, 4, 0],
+        },
+        "drag": {"coefficients": [-0.1, -0.1, -0.1]},
+    }
+    rotors = quad["rotors"]
+    assert warnings_of(quad) == [
+        "yaw has 0.039 rad/s^2 in hover: a turn by 90 degrees takes 13 s at least",
+        "rotors lag by 0.25 s: a drone that is thrown takes long to recover",
+    ]
+    quick = warnings_of(quad | {"rotors": rotors | {"torque_curve": [0, 0, 2e-10], "lag": [900, 0, 900, 0]}})
+    assert len(quick) == 1
+    assert "Use freq=600 or more" in quick[0]
+    # Five rotors, of which one has no partner: 2e-4 kg m^2 at 1,467 rad/s over 0.01 kg m^2.
+    places = [[0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0], [0.1, 0.1, 0], [0, 0, 0.1]]
+    five = rotors | {"position": places, "yaw_torque_sign": [-1, 1, -1, 1, 1], "torque_curve": [0, 0, 2e-10]}
+    heavy = warnings_of(quad | {"rotors": five | {"inertia": 2e-4, "lag": [20, 0, 20, 0], "thrust_min": 0.1}})
+    assert len(heavy) == 2
+    assert "their drag turns" in heavy[0]
+    assert "at 1 rad/s of roll or pitch their momentum takes 29 of" in heavy[1]
+
+
+def warnings_of(airframe):
+    lines = describe_airframe(load_airframe(airframe)).splitlines()
+    return [line[22:] for line in lines if line.startswith("warning")]

@@ -1,13 +1,16 @@
 """Hundreds of random airframes, thrown into the air: all controllers with gains from physics bring them home."""
 
+import tomllib
+
 import numpy as np
 import pytest
 from random_airframes import GRAVITY, alternation, fleet, flights, in_the_air, settled, thrown
 from scipy.spatial.transform import Rotation
 
-from crazysim import Sim
+from crazysim import Sim, load_airframe
 from crazysim.control import Auto
 from crazysim.control.bandwidth import authority
+from crazysim.drones import estimate_airframe
 
 STEPS = {
     "attitude": ((0, 0.1), (0, 0.5), (1, -0.5), (2, 0.5), (2, 2.5)),
@@ -107,3 +110,63 @@ def test_other_controllers_by_bandwidth_catch_their_drones(controller, n):
     assert np.mean(distances[-10:].max(0) < 0.05) >= 0.99, controller
     assert heights.max() < 4.0
     assert alternating.max() < 0.01
+
+
+HUMMINGBIRD = {
+    "name": "hummingbird",  # of RotorPy
+    "rigid_body": {"mass": 0.5, "inertia": [3.65e-3, 3.68e-3, 7.03e-3]},
+    "rotors": {
+        "position": [[0.12, 0.12, 0], [0.12, -0.12, 0], [-0.12, -0.12, 0], [-0.12, 0.12, 0]],
+        "yaw_torque_sign": [1, -1, 1, -1],
+        "thrust_min": 0.05,
+        "thrust_max": 12.5,
+        "inertia": 1e-6,
+        "thrust_curve": [0, 0, 6.108e-8],
+        "torque_curve": [0, 0, 1.4914e-9],
+        "lag": [200, 0, 200, 0],
+    },
+    "drag": {"coefficients": [-0.05, -0.05, -0.1]},
+}
+RACER = {
+    "name": "racer",  # of gym-pybullet-drones, with heavy rotors
+    "rigid_body": {"mass": 0.83, "inertia": [3.113e-3, 3.113e-3, 3.113e-3]},
+    "rotors": {
+        "position": [[0.085, -0.0675, 0], [-0.085, -0.0675, 0], [-0.085, 0.0675, 0], [0.085, 0.0675, 0]],
+        "yaw_torque_sign": [-1, 1, -1, 1],
+        "thrust_min": 0.05,
+        "thrust_max": 8.49,
+        "inertia": 5e-6,
+        "thrust_curve": [0, 0, 8.47e-9],
+        "torque_curve": [0, 0, 2.13e-11],
+        "lag": [25, 0, 25, 0],
+    },
+    "drag": {"coefficients": [-0.05, -0.05, -0.05]},
+}
+
+
+def heavy(inertia, torque):
+    """Return an estimated drone of 4 kg with factors on the inertia of its rotors and on their drag torque."""
+    numbers = tomllib.loads(estimate_airframe(4.0, 0.38, arm=0.3, thrust_to_weight=2.5))
+    rotors = {key: entry["value"] for key, entry in numbers["rotors"].items()}
+    rotors |= {"inertia": rotors["inertia"] * inertia, "torque_curve": [torque * k for k in rotors["torque_curve"]]}
+    return numbers | {"name": f"{inertia} inertia, {torque} torque", "rotors": rotors}
+
+
+@pytest.mark.parametrize("controller", ["auto", "indi"])
+def test_quick_and_heavy_rotors_hover_and_reach_far_setpoints(controller):
+    """Within 2 mm, with rotors at constant speeds: near, 30 m aside, which nothing lifts, and 30 m below."""
+    sources = [HUMMINGBIRD, RACER, *(heavy(*each) for each in ((1, 1), (2, 1), (3, 1), (5, 1), (1, 0.25), (3, 0.25)))]
+    sim = Sim(3, drone=[load_airframe(source) for source in sources], control="state", controller=controller)
+    in_the_air(sim)
+    goals = np.array([[1.0, 0.0, 1.0], [30.0, 0.0, 0.0], [0.0, 0.0, -30.0]])[:, None]
+    if controller == "indi":
+        goals[1:] /= 10  # its errors are not limited
+    sim.state_control(pos=goals)
+    highest = -np.inf
+    for _ in range(200):
+        sim.step(50)
+        highest = max(highest, float(sim.data.states.pos[..., 2].max()))
+    sim.step(10000)
+    np.testing.assert_allclose(np.asarray(sim.data.states.pos), np.broadcast_to(goals, (3, 8, 3)), atol=2e-3)
+    assert highest < 1.5
+    assert alternation(sim).max() < 1e-3
