@@ -113,9 +113,9 @@ def seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def medians(measures: dict[str, Callable[[], float]], repeats: int) -> dict[str, float]:
+def medians(measures: dict[Any, Callable[[], float]], repeats: int) -> dict[Any, float]:
     """Return the median of each measurement, alternating between them so that noise affects all equally."""
-    found: dict[str, list[float]] = {name: [] for name in measures}
+    found: dict[Any, list[float]] = {name: [] for name in measures}
     begin = time.perf_counter()
     for done in range(repeats):
         if done >= 3 and time.perf_counter() - begin > PATIENCE:

@@ -1,9 +1,10 @@
-"""Physics steps per second: one JSON line for each engine, command level, integrator, size and steps per call.
+"""Physics steps per second: one JSON line for each engine, controller, level, integrator, size and steps per call.
 
-    python benchmarks/step.py [--engine auto plain lanes fused] [--device gpu] [--worlds 1024 16384] [--steps 10 100]
+    python benchmarks/step.py [--engine auto plain lanes fused] [--controllers auto crazyflow] [--device gpu]
+        [--worlds 1024 16384] [--steps 10 100]
 
-Engines alternate. ``compile_s`` of ``fused`` includes the kernel only the first time that a process needs it;
-``scaling.py`` runs each size in its own process. Other scripts: ``compile.py``, ``scaling.py``,
+Engines and controllers alternate. ``compile_s`` of ``fused`` includes the kernel only the first time that a process
+needs it; ``scaling.py`` runs each size in its own process. Other scripts: ``compile.py``, ``scaling.py``,
 ``limits.py``, ``flight_stack.py``, ``versus_crazyflow.py``.
 """
 
@@ -25,6 +26,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
+    parser.add_argument("--controllers", nargs="+", default=["crazyflow"])
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384])
     parser.add_argument("--drones", type=int, nargs="+", default=[1], help="drones per world")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
@@ -40,17 +42,19 @@ def main() -> None:
 
 def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: int, n_drones: int) -> None:
     """Print one line for each engine and number of steps; all numbers share one compilation."""
-    sims = {engine: build(args, engine, control, integrator, n_worlds, n_drones) for engine in args.engine}
-    compile_s: dict[str, float] = {}
+    cases = list(itertools.product(args.engine, args.controllers))
+    sims = {case: build(args, *case, control, integrator, n_worlds, n_drones) for case in cases}
+    compile_s: dict[tuple[str, str], float] = {}
     for n_steps in args.steps:
-        flights = {engine: Flight(sim, control, n_steps, args.device) for engine, sim in sims.items()}
-        taken = medians({engine: flight.seconds for engine, flight in flights.items()}, args.repeats)
-        for engine, flight in flights.items():
+        flights = {case: Flight(sim, control, n_steps, args.device) for case, sim in sims.items()}
+        taken = medians({case: flight.seconds for case, flight in flights.items()}, args.repeats)
+        for case, flight in flights.items():
             flight.require_flying()
             report(
                 args.device,
                 benchmark="step",
-                engine=engine_of(sims[engine]),
+                engine=engine_of(sims[case]),
+                controller=case[1],
                 control=control,
                 integrator=integrator,
                 n_worlds=n_worlds,
@@ -58,21 +62,23 @@ def measure(args: argparse.Namespace, control: str, integrator: str, n_worlds: i
                 n_steps=n_steps,
                 randomised=args.randomised,
                 drag=not args.no_drag,
-                compile_s=compile_s.setdefault(engine, round(flight.first_s - taken[engine], 2)),
-                call_s=digits(taken[engine]),
-                steps_per_s=digits(n_worlds * n_drones * n_steps / taken[engine]),
+                compile_s=compile_s.setdefault(case, round(flight.first_s - taken[case], 2)),
+                call_s=digits(taken[case]),
+                steps_per_s=digits(n_worlds * n_drones * n_steps / taken[case]),
                 crazysim=__version__,
             )
 
 
-def build(args: argparse.Namespace, engine: str, control: str, integrator: str, n_worlds: int, n_drones: int) -> Sim:
+def build(
+    args: argparse.Namespace, engine: str, controller: str, control: str, integrator: str, n_worlds: int, n_drones: int
+) -> Sim:
     """Return the simulation given by the options."""
     sim = Sim(
         n_worlds,
         n_drones,
         control=control,
         integrator=integrator,
-        controller="crazyflow",
+        controller=controller,
         device=args.device,
         engine=engine,
     )
