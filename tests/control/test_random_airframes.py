@@ -17,7 +17,7 @@ STEPS = {
     "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
 }
 """Axes and sizes of the steps of the command at each level, rad or rad/s."""
-SLOW = pytest.mark.slow
+SLOW = pytest.mark.slow("many more airframes of the same kind")
 MANY = [pytest.param(n, seed, 150, marks=SLOW) for n in range(4, 13) for seed in (1, 2, 3)]
 FEW = [pytest.param(n, 0, 40) for n in (4, 5, 6, 8, 12)]
 LEVELS = [("attitude", n, 0, 40) for n in (5, 8)] + [("body_rate", n, 0, 40) for n in (4, 6)]
