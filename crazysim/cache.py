@@ -79,7 +79,9 @@ def _root() -> Path | None:
     try:
         return Path(chosen).expanduser()
     except RuntimeError:
-        raise ConfigError(f"expected a folder in {VARIABLE}, got {chosen!r}, whose user has no home folder.") from None
+        raise ConfigError(
+            f"expected a folder in {VARIABLE}, got {chosen!r}, whose user has no home folder. Use an absolute path."
+        ) from None
 
 
 def cpu_features() -> str:
@@ -113,7 +115,7 @@ def _usable(*environment: str | None) -> Path | None:
             _prepare(path.parent, path)
     except ConfigError as error:
         message = f"compiled programs are not kept: {error}"
-        print(message if VARIABLE in message else f"{message} {VARIABLE} names another.", file=sys.stderr)
+        print(message if VARIABLE in message else f"{message} Set {VARIABLE} to its path, or to off.", file=sys.stderr)
         return None
     return path
 

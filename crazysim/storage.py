@@ -191,7 +191,9 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
         ConfigError: If its name has another end, the folder does not exist, or it cannot be written.
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
-        raise ConfigError(f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}")
+        raise ConfigError(
+            f"expected the name of a file that ends with {' or '.join(suffixes)}, got {str(path)!r}. Use another name."
+        )
     with suppress(_NothingToWriteError), replacing(path):
         raise _NothingToWriteError
 
@@ -266,7 +268,7 @@ def _array(content: bytes, place: str) -> NDArray:
     stated, left = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
     if min(shape, default=0) < 0 or (stated > left and not dtype.hasobject):
         raise ConfigError(
-            f"expected an array of {left} bytes, as they follow, got a header of shape {shape} in {place}. "
+            f"expected an array of the {left} bytes that follow its header, got a header of shape {shape} in {place}. "
             "Write the file again."
         )
     file.seek(0)

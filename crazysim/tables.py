@@ -60,12 +60,12 @@ class Key(NamedTuple):
 
 def bounds(low: float = -np.inf, high: float = np.inf, positive: bool = False) -> Range:
     """Return the range of finite numbers between two bounds, or of positive ones."""
-    most = "" if high > LARGEST else f" to {high:.4g}"
+    most = "" if high > LARGEST else f" to {high:.6g}"
     if positive:
-        return Range(f"positive{most and f', at most {high:.4g}'}", 1 / LARGEST, min(high, LARGEST))
+        return Range(f"positive{most and f', at most {high:.6g}'}", 1 / LARGEST, min(high, LARGEST))
     if low < -LARGEST:
-        return ANY if not most else Range(f"finite and at most {high:.4g}", -LARGEST, high)
-    return Range(f"from {low:.4g}{most}" if most else f"finite and at least {low:.4g}", low, min(high, LARGEST))
+        return ANY if not most else Range(f"finite and at most {high:.6g}", -LARGEST, high)
+    return Range(f"from {low:.6g}{most}" if most else f"finite and at least {low:.6g}", low, min(high, LARGEST))
 
 
 def numbers(

@@ -224,7 +224,7 @@ class Plugin:
     def replaced_terms(self) -> tuple[str, ...]:
         """Terms of the model that the plugin replaces, such as ``"drag"``, or adds where the model has none.
 
-        Two plugins that replace the same term are refused, as it would count twice.
+        Two plugins that replace the same term are refused.
         """
         return ()
 

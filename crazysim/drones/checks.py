@@ -45,7 +45,7 @@ def check_airframe(airframe: Airframe) -> None:
     n = len(position)
     if n > MAX_ROTORS:
         raise ConfigError(
-            f"{owner}: expected at most {MAX_ROTORS} rotors, got {n}. Leave rotors.position of others out."
+            f"{owner}: expected at most {MAX_ROTORS} rotors, got {n}. Leave the others out of rotors.position."
         )
     for path, value in airframe.values.items():
         check_numbers(owner, path, value, LAYOUT.keys[path], n)
@@ -73,7 +73,8 @@ def _inertia(airframe: Airframe) -> str | None:
     if excess > EXCESS:
         return found
     if excess > ROUNDING:
-        text = f"airframe {airframe.name!r}: {found}: {100 * excess:.1f}% more. Measure the moments again, or lower it."
+        remedy = "Measure the moments again, or lower the largest."
+        text = f"airframe {airframe.name!r}: {found}: {100 * excess:.1f}% more. {remedy}"
         warnings.warn(text, AirframeWarning, stacklevel=2)
     return None
 

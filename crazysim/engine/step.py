@@ -278,6 +278,6 @@ def _check_steps(n_steps: Any) -> None:
     if isinstance(n_steps, jax.core.Tracer):
         return
     if int(n_steps) < 0:
-        raise ConfigError(f"expected a number of steps of at least 0, got {n_steps}. Steps cannot be taken back.")
+        raise ConfigError(f"expected a number of steps of at least 0, got {n_steps}. To go back, keep earlier data.")
     if int(n_steps) > MAX_STEPS:
         raise ConfigError(f"expected at most {MAX_STEPS} steps in a call, got {n_steps}. Use several calls.")

@@ -52,7 +52,7 @@ def require_finite_start(task: Task, state: EnvState) -> None:
             world = int(np.argwhere(~np.isfinite(value))[0, 0])
             raise ConfigError(
                 f"task {task.name!r}: expected spawn to return finite states, got {field.name} with NaN or infinity in "
-                f"world {world}. Check its settings and random numbers."
+                f"world {world}. Check the settings of the task and the numbers that spawn draws."
             )
 
 

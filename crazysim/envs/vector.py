@@ -102,7 +102,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             )
         before = self.state
         if mask is not None and seed is not None:
-            raise ConfigError("expected a seed or a reset_mask, got both. A seed is that of all worlds.")
+            raise ConfigError(
+                "expected a seed or a reset_mask, got both. Leave the seed out: it is that of all worlds."
+            )
         if mask is not None and before is None:
             raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
         super().reset(seed=None if seed is None else int(seed))

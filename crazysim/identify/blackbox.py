@@ -75,7 +75,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     if missing:
         raise ConfigError(
             f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)[:300]}. "
-            "Log gyro and motors in Betaflight."
+            "Log these fields in Betaflight."
         )
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = [*file][start + 1 :]

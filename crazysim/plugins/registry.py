@@ -189,7 +189,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             if both := set(plugin.replaced_terms) & set(other.replaced_terms):
                 raise ConfigError(
                     f"expected one plugin for {' and '.join(sorted(both))}, got {type(other).__name__} {other.name!r} "
-                    f"and {type(plugin).__name__} {plugin.name!r}, which would count it twice. Use one of the two: "
+                    f"and {type(plugin).__name__} {plugin.name!r}, which would both provide it. Use one of the two: "
                     f"sim.remove({other.name!r}) removes the first."
                 )
 

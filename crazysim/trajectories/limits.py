@@ -55,12 +55,14 @@ class Limits:
         """Check the limits.
 
         Raises:
-            ConfigError: If a limit is not positive, the weight is not within those of the thrust, or the floor is not
-                below the largest height.
+            ConfigError: If a limit other than the floor is not positive, the weight is not within those of the thrust,
+                or the floor is not below the largest height.
         """
         check_settings(self)
         if self.floor is not None and self.height is not None and self.floor >= self.height:
-            raise ConfigError(f"expected a floor below the height of {self.height} m, got {self.floor} m. Set floor=.")
+            raise ConfigError(
+                f"expected a floor below the height of {self.height} m, got {self.floor} m. Lower it, or raise height."
+            )
         if self.thrust is not None and self.thrust <= 1:
             raise ConfigError(
                 f"expected a largest thrust of more than 1 weight, got {self.thrust}. A drone with less cannot hover."

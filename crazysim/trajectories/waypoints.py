@@ -181,9 +181,10 @@ def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
     bounds = -np.inf if low is None else low, np.inf if high is None else high
     for k, z in enumerate(heights):
         if not bounds[0] - CLOSE <= z <= bounds[1] + CLOSE:
+            beyond, name, limit = ("above", "floor", low) if z < bounds[0] else ("below", "height", high)
             raise ConfigError(
-                f"expected waypoints from the floor of {low} m to the height of {high} m, got number {k} at {z:g} m. "
-                f"Move it, or set floor= and height= of the limits."
+                f"expected waypoints {beyond} the {name} of {limit} m, got number {k} at {z:g} m. Move it, or set "
+                f"Limits({name}=...)."
             )
     return bounds
 

@@ -334,7 +334,7 @@ def test_wrong_settings_are_refused():
         (lambda: Betaflight(ports=(0, 9003, 9004), rc_freq=-5.0), "rc_freq to be positive, got -5"),
         (lambda: Betaflight(ports=(0, 9003, 9004), rc_freq=np.nan), "rc_freq to be positive, got nan"),
         (lambda: Origin(500.0, 0.0, 0.0), "latitude of Origin to be from -89 to 89, got 500"),
-        (lambda: Origin(47.0, 8.0, np.nan), "altitude of Origin to be from -1000 to 1.1e[+]04, got nan"),
+        (lambda: Origin(47.0, 8.0, np.nan), "altitude of Origin to be from -1000 to 11000, got nan"),
     ],
 )
 def test_law_09_arguments_of_links_are_checked(call, message):
@@ -349,12 +349,12 @@ def test_law_09_channels_times_and_links_are_checked():
         for values, message in (
             ([1500.5] * 16, "channels as whole numbers, us, got"),
             ([1500] * 3, r"channels of shape \(16,\), got \(3,\)"),
-            ([-1] * 16, "channels to be from 0 to 6"),
+            ([-1] * 16, "channels to be from 0 to 65535"),
         ):
             with pytest.raises(ConfigError, match=message):
                 link.channels = values
         link.channels[4] = 70000
-        with pytest.raises(ConfigError, match="channels to be from 0 to 6"):
+        with pytest.raises(ConfigError, match="channels to be from 0 to 65535"):
             link.send(SoftwareInTheLoop(Sim(control="rotor_vel"), link).measure()[0])
         with pytest.raises(ConfigError, match="a link of its own for each of 2 drones, got one twice"):
             SoftwareInTheLoop(Sim(n_drones=2, control="rotor_vel"), [link, link])

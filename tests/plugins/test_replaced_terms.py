@@ -42,7 +42,7 @@ def test_law_09_two_plugins_that_replace_the_same_term_are_refused_by_name(sim, 
     sim.add(first)
     kinds = type(first).__name__, type(second).__name__
     before = dict(sim.step_pipeline)
-    with pytest.raises(ConfigError, match=rf"{kinds[0]} '{first.name}' and {kinds[1]} 'second'.*count it twice"):
+    with pytest.raises(ConfigError, match=rf"{kinds[0]} '{first.name}' and {kinds[1]} 'second'.*both provide it"):
         sim.add(second)
     assert list(sim.step_pipeline) == list(before)
     sim.replace(first)

@@ -61,7 +61,9 @@ class Betaflight(FirmwareLink):
         self.gazebo, self.origin, self._rc_rate = flag("gazebo", gazebo), as_origin(origin), Rate("rc_freq", rc_freq)
         self._start: tuple[float, float] | None = None
         if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
-            raise ConfigError(f"expected ports of the motors, the state and the remote control, got {shown(ports)}")
+            raise ConfigError(
+                f"expected ports of the motors, the state and the remote control, got {shown(ports)}. Use {PORTS}."
+            )
         motors, self._state, self._rc = ports
         for port in (self._state, self._rc):
             check_address(host, port, least=1)

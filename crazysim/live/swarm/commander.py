@@ -47,7 +47,7 @@ class Commander:
 
         Args:
             control: Command level of the simulation.
-            report: Called with a text where a command has no effect yet; None for nothing.
+            report: Function that is called with a message when a command has no effect yet; None for none.
         """
         self.control = control
         self._report = report
@@ -361,8 +361,8 @@ class Commander:
             return self.goal()
         if math.isinf(self._released) and self._report is not None:
             self._report(
-                f"expected streamed setpoints to have stopped before {command}, got some that are in force: it begins "
-                f"after notify_setpoints_stop, and the next streamed setpoint discards it. Call that first."
+                f"expected no streamed setpoints in force before {command}, got some: it begins after "
+                f"notify_setpoints_stop, and the next streamed setpoint discards it. Call notify_setpoints_stop first."
             )
         return self._motion()
 

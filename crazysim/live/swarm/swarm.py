@@ -248,7 +248,7 @@ class Swarm(Closing):
             self._stopped.wait(max(due - time.perf_counter(), 0.0))
 
     def _refused(self, name: str, text: str) -> None:
-        """Report a command to a drone that has no effect."""
+        """Report that a command to a drone has no effect."""
         self.reports.add("refused", name, self.time, text)
 
     # State and commands ---------------------------------------------------------------------------------------------

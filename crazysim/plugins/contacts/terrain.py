@@ -95,7 +95,9 @@ class Terrain(Plugin):
             )
         heights = size[2] * read_image(given) if isinstance(given, (str, Path)) else np.asarray(given, np.float64)
         if heights.ndim != 2 or min(heights.shape) < 2:
-            raise ConfigError(f"expected heights of two or more rows and columns, m, got shape {np.shape(heights)}")
+            raise ConfigError(
+                f"expected heights of two or more rows and columns, m, got shape {np.shape(heights)}. Use a 2-D array."
+            )
         if self.floor and heights.min() + pos[2] < 0:
             raise ConfigError(
                 f"expected heights of at least 0 m above the flat floor, got {heights.min() + pos[2]:.4g} m. Use "

@@ -74,7 +74,9 @@ class Radar(Plugin):
         pos = np.asarray(self.pos, np.float64)
         pos = pos[None] if pos.ndim == 1 else pos
         if pos.ndim != 2 or pos.shape[1] != 3 or not len(pos):
-            raise ConfigError(f"expected pos as positions (3,) or (n_radars, 3), m, got {self.pos!r}")
+            raise ConfigError(
+                f"expected pos as positions (3,) or (n_radars, 3), m, got {self.pos!r}. Use pos=(0, 0, 1), say."
+            )
         dtype = sim.data.states.pos.dtype
         found = {}
         for name in ("max_range", "exponent", "height_scale", "tilt"):

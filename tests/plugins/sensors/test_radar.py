@@ -81,7 +81,7 @@ def test_the_lobe_is_drawn_in_red_where_it_detects():
     ({"pos": (0, 0, 0), "max_range": -1.0}, "max_range of Radar to be positive"),
     ({"pos": (0, 0, 0), "max_range": (1.0, 2.0)}, "max_range of shape"),
     ({"pos": (0, 0, 0), "exponent": -1.0}, "exponent"),
-    ({"pos": (0, 0, 0), "tilt": 30.0}, "tilt of Radar to be from -1.571 to 1.571"),
+    ({"pos": (0, 0, 0), "tilt": 30.0}, "tilt of Radar to be from -1.5708 to 1.5708"),
 ])  # fmt: skip
 def test_law_09_wrong_settings(kwargs, message):
     with pytest.raises(ConfigError, match=message):
