@@ -195,7 +195,7 @@ class keep_programs(contextlib.ContextDecorator):
     _entered = threading.local()
 
     def __init__(self, when: bool = True):
-        """Take whether the block keeps programs at all."""
+        """Choose whether the block keeps programs."""
         self._when = when
 
     def __enter__(self) -> None:

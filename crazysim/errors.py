@@ -57,7 +57,7 @@ class RenderError(RuntimeError):
 
 
 class AirframeWarning(UserWarning):
-    """Numbers of an airframe that no drone has exactly, but that are near enough to fly with."""
+    """Warning about numbers of an airframe that no real drone has, but that are close enough to fly with."""
 
 
 class EngineWarning(UserWarning):

@@ -152,7 +152,7 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
 
 
 def _levels(lacks: Mapping[str, str]) -> str:
-    """Return the levels that nothing is lacking for, and the reasons why others are not among them."""
+    """Return the levels for which nothing is missing, and the reasons why others are not followed."""
     followed = ", ".join(levels for levels, lack in lacks.items() if not lack)
     reasons = [f"not {levels}: {lack}" for levels, lack in lacks.items() if lack]
     return "; ".join([followed or "none", *reasons])

@@ -192,7 +192,7 @@ def load(library: str | Path) -> str:
 def _fault(library: Path) -> str:
     """Return the reason why a library cannot be loaded, empty if it can.
 
-    A process of its own tries it: the system ends a process that loads one half of a library.
+    A process of its own tries it, because the system kills a process that loads a truncated library.
     """
     command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
     try:

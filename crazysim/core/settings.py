@@ -126,7 +126,7 @@ def color(n: bool = False) -> Any:
 def settings_of(kind: type) -> dict[str, Setting]:
     """Return what the fields of a class declare by ``setting`` or ``parameter``.
 
-    A field that replaces one of a base class, with another default, has the declaration of that unless it has its own.
+    A field that overrides one of a base class keeps the declaration of that one, unless it has its own.
     """
     found = {}
     for base in reversed(kind.__mro__):
@@ -139,9 +139,9 @@ def check_settings(settings: Any) -> None:
     """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
-    finite numbers in the range of ``setting`` or ``parameter``; fields of classes, instances of them. None is a value
-    of fields whose annotation or default has it. Shapes that depend on the simulation, as those of parameters do, are
-    checked with it.
+    finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them. None is
+    accepted where the annotation or the default allows it. Shapes that depend on the simulation, as those of parameters
+    do, are checked with it.
 
     Raises:
         ConfigError: If a field has anything else.
@@ -173,7 +173,7 @@ def check_settings(settings: Any) -> None:
 
 @functools.cache
 def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
-    """Return the types that each field may have; none for a field whose annotation is not one of checked types.
+    """Return the types that each field may have; an empty tuple where the annotation cannot be checked.
 
     An array stands for ``ArrayLike`` and sequences of numbers.
     """
@@ -187,7 +187,7 @@ def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
 
 
 def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
-    """Return the types of an annotation; none if it has others than classes, numbers and mappings of them."""
+    """Return the types of an annotation; an empty tuple if it has others than classes, numbers and mappings of them."""
     if isinstance(hint, str):
         try:
             hint = eval(hint, dict(names))

@@ -24,8 +24,8 @@ MAX_ROTOR_VEL = 1e6
 MIN_LEVERAGE = 1e-3
 """Smallest singular value of the mixing matrix; that of a quadrotor in X is 2."""
 EXCESS, ROUNDING = 0.05, 1e-5
-"""Relative excess of the largest moment of inertia over the sum of the others up to which it is a warning, as of
-moments that were measured one by one, and up to which it is rounding. RotorPy's Crazyflie has 1%."""
+"""Relative excess of the largest moment of inertia over the sum of the others that is a warning at most, as in moments
+that were measured one by one, and that counts as rounding. RotorPy's Crazyflie has 1%."""
 
 
 def check_airframe(airframe: Airframe) -> None:

@@ -31,8 +31,8 @@ DRAG_RATE = 0.45
 ROTOR_TIME = 0.05
 """Time constant of rotors up to 10 inches, s."""
 TABLE_ERROR = 0.05
-"""Part of the largest thrust or torque of a motor table by which it may fall with the speed, or two columns may differ:
-an assumption about the errors of data sheets."""
+"""Part of the largest thrust or torque of a motor table by which it may fall where the speed rises, or by which two
+columns of one quantity may differ: an assumption about the errors of data sheets."""
 IDLE = 0.05
 """Smallest over largest thrust of a rotor that is on, 1."""
 MOTOR_EFFICIENCY = 0.75

@@ -99,7 +99,7 @@ class ZerosCache:
 
 
 def _fixed(arrays: list[Any]) -> list[Any]:
-    """Return the arrays, without those of NumPy: their owner may write into them, so they are never the same."""
+    """Return the arrays, None in place of those of NumPy: their owner may change them, so they never count as equal."""
     return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 

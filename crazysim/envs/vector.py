@@ -155,7 +155,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return self._handed((obs, reward, terminated, truncated, self._with_final_info(info)))
 
     def _with_final_info(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return the info with that of episodes that are over beside their last observation, as Gymnasium has it."""
+        """Return the info with ``final_info``, that of the episodes that have ended, as Gymnasium defines it."""
         over = info.get("_final_obs")
         if over is None:
             return info

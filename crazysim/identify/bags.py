@@ -38,10 +38,10 @@ MAX_METADATA = 2**24
 
 
 class _BagFile(io.BufferedReader):
-    """File whose ``read`` makes no room for more bytes than are left, whatever size a damaged record states."""
+    """File whose ``read`` allocates no more bytes than are left, whatever size a damaged record states."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return bytes, at most so many."""
+        """Return at most ``size`` bytes; all that are left by default."""
         if size is None or size < 0:
             return super().read()
         return super().read(min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0)))

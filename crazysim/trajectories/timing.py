@@ -15,8 +15,8 @@ from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 MARGIN = 1e-4
-"""Part of a limit that is left unused, for the rounding of trajectories in float32. Of heights, which waypoints may be
-at, half of it may be exceeded instead."""
+"""Part of a limit that is left unused, for the rounding of trajectories in float32. Heights, on which
+waypoints may lie, may be exceeded by half of it instead."""
 PRECISION = 1e-5
 """Relative precision of the factor of time."""
 STEP = 1.25

@@ -43,7 +43,7 @@ class ArduPilot(FirmwareLink):
             port: Port.
 
         Raises:
-            ConfigError: If the port is none, or in use.
+            ConfigError: If the port has no valid number, or is in use.
         """
         self._link = Datagrams(host, port)
 
@@ -68,7 +68,7 @@ class ArduPilot(FirmwareLink):
 
 
 def _commands(packet: bytes) -> NDArray | None:
-    """Return the motor commands of a packet, None of one of another format. (4,)"""
+    """Return the motor commands of a packet, or None for another format. (4,)"""
     form = FORMATS.get(int.from_bytes(packet[:2], "little"))
     if form is None or len(packet) != struct.calcsize(form):
         return None

@@ -120,7 +120,7 @@ def _pulses(channels: ArrayLike) -> NDArray[np.int64]:
 
 
 def _commands(packet: bytes) -> NDArray | None:
-    """Return the motor commands of a packet, None of one of another format. (4,)"""
+    """Return the motor commands of a packet, or None for another format. (4,)"""
     if len(packet) != struct.calcsize("<4f"):
         return None
     commands = np.frombuffer(packet, "<f4")

@@ -23,7 +23,7 @@ LARGEST = 65535
 LAST_PORT = 65535
 """Largest number of a port."""
 DRAINING = 0.1
-"""Longest time for packets that are there after the time to wait for one, s, however fast others arrive."""
+"""Longest time for reading the packets that are there once the time to wait is over, s, however fast others arrive."""
 TIMEOUT = bounds(high=1e6, positive=True)
 """Range of a time to wait, s."""
 
@@ -87,7 +87,7 @@ def check_address(host: str, port: int, least: int = 0) -> None:
         least: Least port; 0 allows any free one.
 
     Raises:
-        ConfigError: If the host is no text, or the port no whole number up to 65535.
+        ConfigError: If the host is not text, or the port is not a whole number up to 65535.
     """
     if not isinstance(host, str):
         raise ConfigError(f"expected host as text, got {shown(host)}. Use '127.0.0.1'.")
@@ -101,7 +101,7 @@ class Datagrams(Closing):
         """Bind the socket to a port of this machine.
 
         Raises:
-            ConfigError: If the port is none, or in use.
+            ConfigError: If the port has no valid number, or is in use.
         """
         check_address(host, port)
         self._host = host
@@ -129,7 +129,7 @@ class Datagrams(Closing):
 
         Args:
             timeout: Time to wait for one, s; 0 for those that are there.
-            read: Returns the contents of a packet, None of one of another format, which is skipped.
+            read: Function that returns the contents of a packet, or None for another format, which is skipped.
         """
         found, now = None, time.monotonic()
         deadline, end = now + timeout, now + timeout + DRAINING
