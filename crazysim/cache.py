@@ -77,7 +77,7 @@ def _root() -> Path | None:
     if not chosen:
         return caches_folder() / "jax"
     try:
-        return Path(chosen).expanduser()
+        return Path(chosen).expanduser().absolute()  # the working directory may change
     except RuntimeError:
         raise ConfigError(
             f"expected a folder in {VARIABLE}, got {chosen!r}, whose user has no home folder. Use an absolute path."
@@ -174,7 +174,7 @@ def enable_cache(
         ConfigError: If the folder cannot be made or written, belongs to another user, can be written by others, or its
             disk is full.
     """
-    path = default_cache() if cache_path is None else Path(cache_path)
+    path = default_cache() if cache_path is None else Path(cache_path).absolute()
     if path is None:
         return None
     _prepare(path if cache_path is not None else path.parent, path)

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -366,8 +367,8 @@ def cache_folder() -> str | None:
 def compilation_cache(folder: str) -> Iterator[None]:
     """Let JAX keep the programs that this thread compiles in a block; its configuration stays as it is.
 
-    JAX opens the cache once a process. So that a folder which is configured later is used, it is closed in the end.
-    Without these names of JAX nothing is kept.
+    JAX opens the cache once a process. So that a folder which is configured later is used, the last of the blocks that
+    overlap, those of other threads included, closes it. Without these names of JAX nothing is kept.
     """
     try:
         from jax._src import compilation_cache as cache
@@ -385,11 +386,30 @@ def compilation_cache(folder: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         for setting in settings:
             stack.enter_context(setting)
-        close()
-        try:
-            yield
-        finally:
+        stack.enter_context(_closed_outside(close))
+        yield
+
+
+_blocks = 0
+"""Number of blocks with a compilation cache that are open now, of all threads."""
+_BLOCKS_LOCK = threading.Lock()
+
+
+@contextlib.contextmanager
+def _closed_outside(close: Callable[[], None]) -> Iterator[None]:
+    """Close JAX's cache before the first and after the last of the blocks that overlap: it does so without a lock."""
+    global _blocks
+    with _BLOCKS_LOCK:
+        if not _blocks:
             close()
+        _blocks += 1
+    try:
+        yield
+    finally:
+        with _BLOCKS_LOCK:
+            _blocks -= 1
+            if not _blocks:
+                close()
 
 
 def ffi_include_folder() -> str:

@@ -137,9 +137,10 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     path = Path(path)
     if not path.parent.is_dir():
         raise ConfigError(f"expected an existing folder, got {str(path.parent)!r} for {path.name!r}")
-    if path.is_dir():
+    if path.exists() and not path.is_file():
+        kind = "folder" if path.is_dir() else "device or pipe"
         raise ConfigError(
-            f"expected a file that can be written, got the folder {str(path)!r}. Give the name of a file."
+            f"expected a file that can be written, got the {kind} {str(path)!r}. Give the name of a file."
         )
     unfinished = unfinished_path(path)
     try:

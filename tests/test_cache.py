@@ -10,6 +10,7 @@ import time
 import jax
 import jax.numpy as jnp
 import pytest
+from jax._src import compilation_cache
 
 from crazysim import cache
 from crazysim.cache import announce, announced, default_cache, enable_cache, enable_for_command, keep_programs, trim
@@ -54,6 +55,17 @@ def test_the_folder_is_that_of_the_variable_or_in_the_folder_of_caches(settings,
     assert jax.config.jax_compilation_cache_dir == str(default_cache())
 
 
+def test_a_relative_folder_does_not_follow_the_working_directory(settings, monkeypatch, tmp_path):
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(cache.VARIABLE, "kept")
+    used = cache.folder()
+    assert enable_cache("own") == tmp_path / "own"
+    jax.config.update("jax_compilation_cache_dir", None)
+    monkeypatch.chdir(tmp_path / "other")
+    assert cache.folder() == used == tmp_path / "kept" / used.name
+
+
 def test_each_kind_of_cpu_has_a_folder_of_its_own(settings, monkeypatch, tmp_path):
     """XLA's programs are machine code whose key does not hold the features of the CPU."""
     info = tmp_path / "cpuinfo"
@@ -90,6 +102,29 @@ def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkey
         jax.jit(_of_user)(jnp.ones(7))
     assert [path.name.split("-")[0] for path in own.glob("jit__of_user*-cache")] == ["jit__of_user"]
     assert "jit__of_user" not in kept()
+
+
+def test_a_block_leaves_the_cache_of_a_block_of_another_thread_open(settings, monkeypatch, tmp_path):
+    """JAX closes its cache without a lock: another thread that opens it meanwhile would fail."""
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+
+    def enter():
+        with keep_programs():
+            pass
+
+    with keep_programs():
+        jax.jit(_shared)(jnp.ones(7))
+        opened = compilation_cache._cache
+        thread = threading.Thread(target=enter)
+        thread.start()
+        thread.join()
+        assert opened is not None
+        assert compilation_cache._cache is opened
+    assert compilation_cache._cache is None
+
+
+def _shared(x):
+    return jnp.cos(x) * 6
 
 
 def _inner(x):

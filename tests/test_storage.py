@@ -1,6 +1,7 @@
 """Files are written whole or not at all, and damaged ones are refused with their name."""
 
 import io
+import os
 import tracemalloc
 import zipfile
 
@@ -123,3 +124,13 @@ def test_a_file_is_tried_without_a_change(tmp_path):
             check_writable(path)
     with pytest.raises(ConfigError, match=r"ends with \.md, got"):
         check_writable(tmp_path / "a.txt", (".md",))
+
+
+def test_a_device_or_a_pipe_is_not_replaced(tmp_path):
+    """What may write to the folder of devices would otherwise replace /dev/null by a file."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(ConfigError, match="got the device or pipe"):
+        write_file(pipe, "text")
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]

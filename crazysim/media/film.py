@@ -72,6 +72,7 @@ class Film:
         """
         self.path, self.view = Path(path), View() if view is None else view
         check_writable(self.path, tuple(ENCODERS))
+        self._file = self.path.absolute()  # the working directory may change; no option, as -y.mp4 would be
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")
@@ -175,9 +176,9 @@ class Film:
             ffmpeg.stdin.close()
         message = ffmpeg.stderr.read().decode(errors="replace").strip()
         ffmpeg.stderr.close()
-        unfinished = unfinished_path(self.path)
+        unfinished = unfinished_path(self._file)
         if ffmpeg.wait() == 0:
-            unfinished.replace(self.path)
+            unfinished.replace(self._file)
         else:
             unfinished.unlink(missing_ok=True)
             raise RenderError(
@@ -191,7 +192,7 @@ class Film:
             raise ImportError(not_installed("films need", "imageio-ffmpeg", "demo")) from error
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps:g}", "-i", "-"]
         encoder = [*ENCODERS[self.path.suffix.lower()], "-g", f"{math.ceil(self.fps)}"]  # a key frame every second
-        target = str(unfinished_path(self.path.absolute()))  # not an option, as -y.mp4 would be
+        target = str(unfinished_path(self._file))
         kind = ["-f", self.path.suffix[1:].lower()]
         return [get_ffmpeg_exe(), "-loglevel", "error", *raw, *encoder, *kind, "-y", target]
 

@@ -56,6 +56,15 @@ def test_a_film_shows_the_drone_go_from_left_to_right(sim, tmp_path, suffix):
     np.testing.assert_allclose(columns[5] + 0.5, WIDTH / 2, atol=1.5)
 
 
+def test_a_film_stays_in_its_folder_when_the_working_directory_changes(tmp_path, monkeypatch):
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with Film("flight.gif", view()) as film:
+        film.write(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        monkeypatch.chdir(tmp_path / "other")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["flight.gif", "other"]
+
+
 @pytest.mark.parametrize(("fps", "speed", "n_frames"), [(10, 1.0, 11), (25, 1.0, 26), (10, 0.25, 41), (10, 5.0, 3)])
 def test_frames_go_with_simulated_time(sim, tmp_path, fps, speed, n_frames):
     """Whatever the rate of calls, a second makes fps / speed frames and the first; too few calls repeat an image."""
