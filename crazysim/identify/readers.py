@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.identify.columns import Columns, plain, plausible
-from crazysim.identify.repairs import PERIODS, continuous
+from crazysim.identify.repairs import PERIODS, continuous, unwrapped
 
 LONGEST_HOLD = 3.0
 """Intervals of a stream, after which its interpolated values count as a gap."""
@@ -75,7 +75,7 @@ def at_equal_times(
             turned = continuous(np.stack([values[c] for c in quat], axis=-1))
             values |= dict(zip(quat, turned.T, strict=True))
         turn = 2 * np.pi / abs(columns.rad_per_angle)
-        values |= {c: np.unwrap(values[c], period=turn) for c in angles if c in values}
+        values |= {c: unwrapped(values[c], turn) for c in angles if c in values}
         sorted_streams[key] = Stream(stream.t[order], values)
     if not sorted_streams:
         raise ConfigError(f"{name}: expected messages every {PERIODS[1]:g} s or more often, got none. Log them faster.")

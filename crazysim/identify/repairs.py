@@ -252,6 +252,14 @@ def unit(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
     return quat / norm[:, None]
 
 
+def unwrapped(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
+    """Return angles that do not jump by a period, which interpolation needs; those that are missing stay NaN. (n,)"""
+    good = np.isfinite(angles)
+    angles = np.where(good, angles, np.nan)
+    angles[good] = np.unwrap(angles[good], period=period)
+    return angles
+
+
 def continuous(quat: NDArray) -> NDArray:
     """Return quaternions whose neighbours have one sign, as interpolation needs: q and -q are one attitude. (n, 4)"""
     return quat * np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])[:, None]

@@ -19,6 +19,7 @@ from crazysim import rotation
 from crazysim.errors import ConfigError, DamagedFileError
 from crazysim.identify.columns import plausible
 from crazysim.identify.readers import Stream, at_equal_times
+from crazysim.identify.repairs import unwrapped
 
 TOPICS = (
     "vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity", "esc_status", "actuator_motors",
@@ -95,9 +96,9 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     wanted = found.get("vehicle_attitude_setpoint", {})
     if "q_d[0]" in wanted and "thrust_body[2]" in wanted:
         aim = np.stack([wanted[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
-        angles = np.unwrap(np.asarray(jax.jit(rotation.to_rpy)(aim), np.float64), axis=0)
+        angles = np.asarray(jax.jit(rotation.to_rpy)(aim), np.float64)
         names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
-        values = [*angles.T, -wanted["thrust_body[2]"]]
+        values = [*map(unwrapped, angles.T), -wanted["thrust_body[2]"]]
         columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
     if "battery_status" in found:
         columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}

@@ -6,7 +6,7 @@ from log_files import ANGLE, COLUMNS, RATE, SIDE, N, T, bag, blackbox, crazyflie
 
 from crazysim.errors import ConfigError
 from crazysim.identify import Columns, read_log
-from crazysim.identify.readers import decompressed
+from crazysim.identify.readers import Stream, at_equal_times, decompressed
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -30,6 +30,18 @@ def test_pauses_of_a_stream_are_gaps(tmp_path):
     assert len(log.gaps) == 1
     assert np.diff(log.t)[log.gaps[0] - 1] == pytest.approx(0.72, abs=0.02)
     assert "1 gap," in log.repairs[0]
+
+
+def test_angles_after_a_sample_that_is_missing_are_kept():
+    angle = np.linspace(0, 300, 200)
+    logged = (angle + 180) % 360 - 180
+    logged[20] = 1e30
+    table = {"x": angle, "y": angle, "z": angle, "roll": 0 * angle, "pitch": 0 * angle, "yaw": logged}
+    columns = Columns(rpy=("roll", "pitch", "yaw"), rad_per_angle=np.pi / 180)
+    found = at_equal_times("log", {"a": Stream(0.01 * np.arange(200), table)}, [], columns)["yaw"]
+    bad = np.isnan(found)
+    assert 0 < np.sum(bad) < 3
+    np.testing.assert_allclose(found[~bad], angle[: len(found)][~bad], atol=1e-6)
 
 
 def test_compressed_attitudes_are_unpacked():

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.control.lqr import as_weights, solve_on_host
 from crazysim.control.riccati import gain_discrete
+from crazysim.core.settings import setting
 from crazysim.plugins.vehicles.following import PathController, PathState, motor_reference
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel
@@ -48,7 +49,7 @@ class PathLQR(PathController):
 
     Q: ArrayLike = (100.0, 0.1, 10.0, 0.1)
     """Weights of offset, sideways velocity, heading error and yaw rate. (4,) or (4, 4)"""
-    R: float = 20.0
+    R: float = setting(default=20.0, low=0.0)
     """Weight of the steering angle."""
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> PathLQRGains:

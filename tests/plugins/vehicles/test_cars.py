@@ -232,6 +232,11 @@ def test_cars_roll_down_a_slope():
     assert record.body_vel[0, 0, 0] == pytest.approx(speed, rel=0.01)
 
 
+def test_a_negative_weight_is_an_error():
+    with pytest.raises(ConfigError, match=r"expected R of PathLQR to be finite and at least 0, got -1\.0"):
+        PathLQR(R=-1.0)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
