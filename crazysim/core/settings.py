@@ -204,7 +204,8 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
         return (np.ndarray,) if NUMERIC.issuperset(inner) else ()
     if hint is None:
         return (type(None),)
-    is_class = inspect.isclass(hint) and hint not in (Any, object) and not typing.get_args(hint)
+    # A JAX array may be one of NumPy, of any type.
+    is_class = inspect.isclass(hint) and hint not in (Any, object, Array) and not typing.get_args(hint)
     return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()
 
 

@@ -230,6 +230,8 @@ def make_vector(
         options: Options of ``crazysim.envs.make``.
     """
     if max_episode_steps is not None:
-        options["seconds"] = positive("max_episode_steps", max_episode_steps) / options.get("freq", 50)
+        options["seconds"] = positive("max_episode_steps", max_episode_steps) / positive(
+            "freq", options.get("freq", 50)
+        )
     env: DroneEnv = make(task, num_envs, **options)
     return DroneVectorEnv(env, autoreset_mode, render_mode, render_worlds, render_size, numpy)

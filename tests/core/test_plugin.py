@@ -416,3 +416,16 @@ def test_law_09_a_plugin_has_a_name():
 
         class Anonymous(Plugin):
             """A plugin without a name."""
+
+
+class Chosen(Plugin):
+    """A plugin with an array of any type."""
+
+    which: jax.Array | None = None
+    name: str = "chosen"
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("values", [[True, False], [1.0, 2.0]])
+def test_arrays_of_both_libraries_are_settings(xp, values):
+    np.testing.assert_array_equal(Chosen(xp.asarray(values)).which, values)

@@ -204,6 +204,7 @@ def test_wrong_resets(next_step, kwargs, error, message):
         ({"render_worlds": 0}, "expected render_worlds as a list of worlds from 0 to 1, got 0"),
         ({"color": "red"}, "task 'hover' has no option 'color'"),
         ({"n_world": 2}, "did you mean n_worlds"),
+        ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'; it must be a positive whole number"),
         ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
     ],
 )
