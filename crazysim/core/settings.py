@@ -273,28 +273,18 @@ def find_device(device: str | jax.Device) -> jax.Device:
         ) from None
 
 
-def as_rgba(rgba: object, n: int | None = None, name: str = "rgba") -> NDArray[np.float64]:
-    """Return a colour. (4,)
+def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
+    """Return a colour, read-only. (4,) or (n, 4)
 
     Args:
         rgba: Red, green, blue and opacity, 0 to 1.
         n: Number of things that may have a colour each, for (n, 4); None for one colour.
-        name: Name of the setting, for messages.
 
     Raises:
         ConfigError: If it is anything else, such as a name.
     """
-    try:
-        array = np.asarray(rgba)
-    except ValueError:
-        array = np.array(None)
-    shapes = [(4,)] if n is None else [(4,), (n, 4)]
-    if array.dtype.kind not in "iuf" or array.shape not in shapes or not np.all((array >= 0) & (array <= 1)):
-        raise ConfigError(
-            f"expected {name} as numbers from 0 to 1 of shape {' or '.join(map(str, shapes))}, got {shown(rgba)}. Use "
-            f"(1, 0, 0, 1) for red."
-        )
-    return array.astype(np.float64)
+    shapes = ((4,),) if n is None else ((4,), (n, 4))
+    return numbers("rgba", rgba, bounds(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
 
 
 def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Array | None:
