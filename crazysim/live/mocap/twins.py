@@ -26,6 +26,7 @@ from crazysim.live.mocap.source_events import Reports
 from crazysim.live.mocap.tracker import Rules, Tracker
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
+from crazysim.tables import numbers
 
 NOWHERE = (0.0, 0.0, -100.0)
 """Position of an object before its first pose, world frame, m: below every floor."""
@@ -65,6 +66,9 @@ class Twin:
             ConfigError: If one is not finite, or has another shape or sign.
         """
         check_settings(self)
+        is_row = isinstance(self.fixed, Sequence) and not isinstance(self.fixed, str)
+        angles = [0.0 if x is None else x for x in self.fixed] if is_row else self.fixed
+        numbers("fixed of Twin", angles, shapes=((3,),), remedy="Use None for angles that are measured.")
 
     @staticmethod
     def drone(airframe: str = "crazyflie", **settings: Any) -> Twin:

@@ -86,6 +86,12 @@ def test_poses_reach_every_world_in_one_write(sim):
     np.testing.assert_allclose(twins.pose("cf1")[2], [2, 0, 0])
 
 
+@pytest.mark.parametrize("fixed", [(0.0, None), ("level", None, None), (np.nan, None, None), 0.0, "abc"])
+def test_wrong_fixed_angles_are_errors(fixed):
+    with pytest.raises(ConfigError, match="expected fixed of Twin"):
+        Twin("box", fixed=fixed)
+
+
 def test_offset_turn_and_fixed_angles(sim):
     source = Given()
     kinds = {
