@@ -71,7 +71,7 @@ def run(block: Block, page: Path, namespace: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def _as_file(block: Block) -> Iterator[dict[str, Any] | None]:
-    """Save a block that is a file and yield its namespace; unload modules that it imported from its folder at the end."""
+    """Save a block that is a file and yield its namespace; at the end, unload modules imported from its folder."""
     if block.file is None:
         yield None
         return
