@@ -32,7 +32,8 @@ where unknown torques are estimated.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+import dataclasses
+from typing import Any, ClassVar, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -94,11 +95,11 @@ class AutoParams(RigidBodyParams):
     """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
     share: Array = leaf("parameter", 1, (1,))
     """Part of the missing yaw torque that the rotors' drag is to give; the reaction to them gives the rest, 1. (1,)"""
-    position: PositionParams
-    """Gains and limits of the position loop."""
+    position: PositionParams | None
+    """Gains and limits of the position loop; None without one."""
 
     @staticmethod
-    def create(airframe: Airframe, freq: int, outer_freq: int) -> AutoParams:
+    def create(airframe: Airframe, freq: int, outer_freq: int | None) -> AutoParams:
         """Return the shared parameters of an airframe.
 
         A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
@@ -107,7 +108,7 @@ class AutoParams(RigidBodyParams):
         Args:
             airframe: The airframe.
             freq: Rate of the controller, Hz.
-            outer_freq: Rate of its position loop, Hz, whose command is half a period old on average.
+            outer_freq: Rate of its position loop, Hz, whose command is half a period old on average; None without one.
 
         Raises:
             ConfigError: If the airframe lacks a value.
@@ -121,6 +122,9 @@ class AutoParams(RigidBodyParams):
         delay, reaction = DAMPING / STIFFNESS / np.min(rates[:2]), reaction_time(airframe)
         body = rigid_body(airframe)
         allocation: AllocationParams = body.pop("allocation")
+        position = None
+        if outer_freq is not None:
+            position = PositionParams.create(airframe, delay + 0.5 / outer_freq, outer_freq)
         return AutoParams(
             **body,
             allocation=allocation.replace(arms=as_parameter(hover_arms(airframe))),
@@ -132,12 +136,12 @@ class AutoParams(RigidBodyParams):
             lead=as_parameter(lead),
             reaction=as_parameter(reaction),
             share=as_parameter(1 / (1 + lead * lag * reaction)),
-            position=PositionParams.create(airframe, delay + 0.5 / outer_freq, outer_freq),
+            position=position,
         )
 
 
-class AutoMemory(PyTree):
-    """Memory of the default controller: what it expects of this tick, its estimates, and the attitude to hold."""
+class AutoTarget(PyTree):
+    """What the position loop demands of the loops below it, and its memory."""
 
     position: PositionMemory
     """Memory of the position loop."""
@@ -147,16 +151,33 @@ class AutoMemory(PyTree):
     """Body rates of that attitude, body frame, rad/s. (n_worlds, n_drones, 3)"""
     thrust: Array = leaf("drone", 1)
     """Collective thrust that leads to the setpoint once the attitude is reached, N. (n_worlds, n_drones, 1)"""
+
+    @staticmethod
+    def at_rest() -> AutoTarget:
+        """Return the target of one drone before the first setpoint."""
+        level, zeros = as_parameter([0.0, 0.0, 0.0, 1.0]), as_parameter(np.zeros(3))
+        return AutoTarget(PositionMemory.at_rest(), level, zeros, as_parameter(np.zeros(1)))
+
+
+class AutoMemory(PyTree):
+    """Memory of the default controller: what it expects of this tick, and its estimates."""
+
+    target: AutoTarget | None
+    """Result of the position loop; None at command levels below ``state``, which have none."""
     momentum: Array = leaf("drone", 1)
     """Angular momentum expected at this tick from the known torques, body frame, N m s. (n_worlds, n_drones, 3)"""
     torque: Array = leaf("drone", 1)
     """Estimated unknown torque, body frame, N m. (n_worlds, n_drones, 3)"""
 
     @staticmethod
-    def at_rest() -> AutoMemory:
-        """Return the memory of one drone before the first tick."""
-        level, zeros = as_parameter([0.0, 0.0, 0.0, 1.0]), as_parameter(np.zeros(3))
-        return AutoMemory(PositionMemory.at_rest(), level, zeros, as_parameter(np.zeros(1)), zeros, zeros)
+    def at_rest(follows_setpoints: bool) -> AutoMemory:
+        """Return the memory of one drone before the first tick.
+
+        Args:
+            follows_setpoints: True at the command level ``state``.
+        """
+        zeros = as_parameter(np.zeros(3))
+        return AutoMemory(AutoTarget.at_rest() if follows_setpoints else None, zeros, zeros)
 
 
 def error_of_quat(quat: Array) -> Array:
@@ -193,21 +214,25 @@ class Auto(Controller):
     output: ClassVar[Control] = Control.rotor_vel
     freq: int = 500
     """Rate, Hz."""
-    outer_freq: int = 100
-    """Rate at which setpoints take effect, Hz; ``state_freq`` of a simulation replaces it."""
+    outer_freq: int | None = 100
+    """Rate at which setpoints take effect, Hz; ``state_freq`` of a simulation replaces it. None without setpoints."""
     yaw_rate: bool = False
     """True if the third entry of an attitude command is a yaw rate, rad/s, instead of a yaw."""
 
     def adapted(self, control: Control, fitted: str | None) -> Controller | None:
-        """Return this controller; for fitted dynamics its position loop; None where the command is passed through.
+        """Return this controller, without its position loop below the level ``state``; for fitted dynamics that loop.
+
+        None where the command is passed through.
 
         Args:
             control: Command level.
             fitted: Name of the fitted model, which contains the response to attitudes; None for dynamics with rotors.
         """
+        if fitted is None and control in self.levels:
+            return self if control == Control.state else dataclasses.replace(self, outer_freq=None)
         if fitted is None:
-            return self if control in self.levels else None
-        return FittedAuto(Dynamics(fitted), self.outer_freq) if control == Control.state else None
+            return None
+        return FittedAuto(Dynamics(fitted), cast(int, self.outer_freq)) if control == Control.state else None
 
     def outer(self, data: DroneData, command: Setpoint, memory: AutoMemory, params: AutoParams) -> AutoMemory:
         """Return the memory with attitude, body rates and thrust that lead to a setpoint.
@@ -221,9 +246,15 @@ class Auto(Controller):
         drag = matvec(matrix, matvec(p.drag_matrix, matvec(to_body, s.vel))) / p.mass
         push = jnp.sum(curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
         known = drag + push * matrix[..., 2]
-        specific, position = specific_force(s.pos, s.vel, known, sp, memory.position, self.outer_freq, p.position)
+        # There is an outer loop, so none of these is None.
+        freq, loop, target = (
+            cast(int, self.outer_freq),
+            cast(PositionParams, p.position),
+            cast(AutoTarget, memory.target),
+        )
+        specific, position = specific_force(s.pos, s.vel, known, sp, target.position, freq, loop)
         # The attitude is held for a period, in whose middle the setpoint's acceleration has changed by half a step.
-        specific = upright(specific - drag + 0.5 / self.outer_freq * sp.jerk, sp, p.position)
+        specific = upright(specific - drag + 0.5 / freq * sp.jerk, sp, loop)
 
         # The heading of a state command is that of its quaternion, which needs no angles.
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
@@ -239,12 +270,8 @@ class Auto(Controller):
         turned = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
         yaw_rate = turned / jnp.maximum(x_ahead, HORIZONTAL)
         ang_vel = cross(z, z_rate) + safe_clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
-        return memory.replace(
-            position=position,
-            quat=rotation.quat_from_axes(cross(y, z), y, z),
-            ang_vel=matvec(to_body, ang_vel),
-            thrust=p.mass * squared * inverse,
-        )
+        attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * squared * inverse
+        return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
 
     def params(self, airframe: Airframe) -> AutoParams:
         """Return gains and constants for an airframe."""
@@ -252,7 +279,7 @@ class Auto(Controller):
 
     def memory(self, airframe: Airframe) -> AutoMemory:
         """Return the memory before the first tick."""
-        return AutoMemory.at_rest()
+        return AutoMemory.at_rest(follows_setpoints=self.has_outer)
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: AutoMemory, params: AutoParams
@@ -260,10 +287,11 @@ class Auto(Controller):
         """Return the rotor speeds, and the memory."""
         s, p = data.states, params
         if isinstance(command, Setpoint):
-            error = rotation.multiply(rotation.conjugate(s.quat), memory.quat)
+            target = cast(AutoTarget, memory.target)
+            error = rotation.multiply(rotation.conjugate(s.quat), target.quat)
             z, w = error[..., 2:3], error[..., 3:]
-            thrust = memory.thrust * (2 * (w * w + z * z) - 1)  # its part along the present z axis
-            error, rate = error_of_quat(error), memory.ang_vel
+            thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its part along the present z axis
+            error, rate = error_of_quat(error), target.ang_vel
             on: Any = True
         else:
             thrust = command[..., 3:]

@@ -119,7 +119,7 @@ def train(
             files = jax.device_put(files, base.sim.device)
             return files["learner"], files["kept"]
         learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
-        require_finite_start(base.task, learner.state)
+        require_finite_start(base.task, learner.env)
         return learner, learner.as_policy()
 
     @keep_programs()
