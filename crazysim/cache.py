@@ -91,7 +91,7 @@ def cpu_features() -> str:
     except OSError:
         lines = []
     listed = next((line for line in lines if line.split(":")[0].strip().lower() in ("flags", "features")), "")
-    return f"{platform.machine()} {platform.processor()} {listed}"
+    return f"{platform.machine()} {listed}"
 
 
 def folder() -> Path | None:

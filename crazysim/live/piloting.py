@@ -17,7 +17,7 @@ Sticks = Callable[[Live], NDArray]
 
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
 """Keys of forward and back, left and right, up and down, turn left and right."""
-LEAD = 0.5
+LEAD = 0.7
 """Most time by which the setpoint leads the drone at full speed, s: after a stick is released, or a drone is held
 back, the setpoint is not far away."""
 

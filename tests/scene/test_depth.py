@@ -286,7 +286,7 @@ def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
         (lambda: sim.depth("fpv_cam", 4, 4.5), "positive integer height, got 4 x 4.5 pixels"),
         (lambda: sim.depth("fpv_cam", 4, 4, along="z"), "along='ray'"),
         (lambda: sim.add(RangeFinder([[0, 0, 0]])), "none of them zero"),
-        (lambda: sim.add(RangeFinder(max_range=0)), "max_range to be positive"),
+        (lambda: sim.add(RangeFinder(max_range=0)), "max_range of RangeFinder to be positive"),
         (lambda: sim.add(RangeFinder(freq=333)), "Use the nearest rate below, 250 Hz"),
     ):
         with pytest.raises(ConfigError) as error:
