@@ -34,6 +34,11 @@ FEWEST = 3
 """Fewest blocks whose scatter gives a standard deviation."""
 LONGEST = 0.04
 """Largest delay, s."""
+SAMPLING = 5e-4
+"""Relative error of integrals between samples, which is the same in all blocks: of moments of inertia it was 0.04 to
+0.07% in simulated flights without noise, at 100 and 500 Hz."""
+ROUNDS = 3
+"""Fits, each with the gyroscopic torques of the moments of inertia of the one before."""
 
 
 class FastRotation(NamedTuple):
@@ -42,7 +47,7 @@ class FastRotation(NamedTuple):
     values: NDArray
     """Factors of the moments of inertia about x, y, z, of the torque curve and of the rotors' inertia. (5,)"""
     deviations: NDArray
-    """Standard deviations, from the scatter between blocks. (5,)"""
+    """Standard deviations, from the scatter between blocks and ``SAMPLING``. (5,)"""
     delays: NDArray
     """Delay of the state behind the rotor speeds in each log, s. (n_logs,)"""
 
@@ -63,38 +68,36 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     Raises:
         ConfigError: If the rotors do not turn the drone as the airframe says, or the logs are too short.
     """
-    blocks = [_blocks(_Prepared.create(log, params, thrust_factor)) for log in logs]
-    found = np.concatenate(blocks)
-    if not len(found):
-        raise ConfigError(f"expected logs of over {YAW_SLOW + 1:g} s without gaps, got none. Use longer logs.")
-    medians = [median(found[:, k], found[:, k + 5]) for k in range(4)]
-    (roll, pitch, drag, reaction), deviations = zip(*medians, strict=True)
-    if not (roll > 0 and pitch > 0):
-        raise ConfigError(
-            "expected rotors that turn the drone in the direction of their torque, got the opposite. "
-            "Check the order of the rotors and the frames of attitude and angular velocity."
-        )
-    inertia = np.diag(np.asarray(params.J, np.float64))
-    x, y = 1 / roll / inertia[0], 1 / pitch / inertia[1]
-    z = (x * inertia[0] + y * inertia[1]) / (inertia[0] + inertia[1])
-    inertia = inertia * [x, y, z]
-    values = np.array([x, y, z, max(drag, 0.0) * inertia[2], max(reaction, 0.0) * inertia[2]])
+    moments = np.diag(np.asarray(params.J, np.float64))
+    values, blocks = np.ones(5), []
+    for _ in range(ROUNDS):
+        blocks = [_blocks(_Prepared.create(log, params, thrust_factor, values)) for log in logs]
+        found = np.concatenate(blocks)
+        if not len(found):
+            raise ConfigError(f"expected logs of over {YAW_SLOW + 1:g} s without gaps, got none. Use longer logs.")
+        medians = [median(found[:, k], found[:, k + 5]) for k in range(4)]
+        (roll, pitch, drag, reaction), deviations = zip(*medians, strict=True)
+        if not (roll > 0 and pitch > 0):
+            raise ConfigError(
+                "expected rotors that turn the drone in the direction of their torque, got the opposite. "
+                "Check the order of the rotors and the frames of attitude and angular velocity."
+            )
+        x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
+        z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
+        values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
+    inertia = moments * values[:3]
     tilt = np.array(deviations[:2]) / [roll, pitch]
     turn = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
-    spread = [*tilt * [x, y], turn * z, *inertia[2] * np.array(deviations[2:])]
+    spread = np.hypot([*tilt * [x, y], turn * z, *inertia[2] * np.array(deviations[2:])], SAMPLING * values)
     every = median(found[:, 4], np.ones(len(found)))[0]
     delays = [median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
-    return FastRotation(values, np.array(spread), np.array(delays))
+    return FastRotation(values, spread, np.array(delays))
 
 
 def aligned(log: Log, delay: float) -> Log:
     """Return the log with rotor speeds and commands that are later by a delay, s."""
-
-    def late(x: NDArray) -> NDArray:
-        return np.stack([np.interp(log.t - delay, log.t, c) for c in x.T], axis=-1)
-
-    command = None if log.command is None else late(log.command)
-    return replace(log, rotor_vel=late(log.rotor_vel), command=command)
+    command = None if log.command is None else shifted(log.command, delay / log.dt)
+    return replace(log, rotor_vel=shifted(log.rotor_vel, delay / log.dt), command=command)
 
 
 def median(x: NDArray, variance: NDArray) -> tuple[float, float]:
@@ -103,58 +106,78 @@ def median(x: NDArray, variance: NDArray) -> tuple[float, float]:
     The standard deviation is NaN for fewer than ``FEWEST`` numbers.
     """
     weight = 1 / np.maximum(variance, 0.25 * np.median(variance))  # so that no single block decides
-
-    def middle(x: NDArray) -> float:
-        order = np.argsort(x)
-        return float(x[order][np.searchsorted(np.cumsum(weight[order]), 0.5 * np.sum(weight))])
-
-    center = middle(x)
+    order = np.argsort(x)
+    share = (np.cumsum(weight[order]) - 0.5 * weight[order]) / np.sum(weight)
+    center = float(np.interp(0.5, share, x[order]))
     if len(x) < FEWEST:
         return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
-    # 1.4826: from the median absolute to the standard deviation; 1.2533: of the median over that of the mean (Gauss).
-    return center, 1.4826 * 1.2533 * middle(np.abs(x - center)) / np.sqrt(count)
+    spread = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
+    return center, 1.2533 * enlarged(len(x)) * spread  # of a median over that of a mean (Gauss)
+
+
+def enlarged(n: int) -> float:
+    """Return the factor of a standard deviation from n numbers with which three hold as often as if it were known.
+
+    Student's t distribution with n - 1 degrees of freedom over the normal one, by the expansion of Abramowitz and
+    Stegun, Handbook of Mathematical Functions, 26.7.5, at three standard deviations.
+    """
+    v = n - 1
+    return (3 + 30 / (4 * v) + 1656 / (96 * v**2) + 11592 / (384 * v**3)) / 3
 
 
 class _Prepared(NamedTuple):
-    """One log as the regression uses it."""
+    """One log as the regression uses it: what changes over the two intervals around each sample."""
 
     dt: float
     gaps: NDArray
     turned: NDArray
-    """Change of the angular velocity over two samples, plus that of gyroscopic torques, rad/s. (n, 3)"""
-    ang_vel: NDArray
-    torque: NDArray
-    """Torque of the rotors' thrusts about x and y, and of their drag about z, N m. (n, 3)"""
-    reaction: NDArray
-    """Torque about z of the rotors' acceleration, N m. (n,)"""
-    instrument: NDArray
-    """As ``torque``, of the speeds that commands explain. (n, 3)"""
-    instrument_reaction: NDArray
-    """As ``reaction``, of the speeds that commands explain. (n,)"""
+    """Change of the angular velocity, plus that of gyroscopic torques, rad/s. (n, 3)"""
+    angle: NDArray
+    """Integral of the angular velocity, rad. (n, 3)"""
+    rotors: _Rotors
+    """What the measured rotor speeds do."""
+    instruments: _Rotors
+    """What the speeds that commands explain do."""
 
     @staticmethod
-    def create(log: Log, params: first_principles.Params, thrust_factor: float) -> _Prepared:
+    def create(log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray) -> _Prepared:
+        """Return a log with the factors ``values`` of moments of inertia, torque curve and rotor inertia in force."""
         mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
-        inertia = np.asarray(params.J, np.float64)
+        root = np.sqrt(values[:3])
+        inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
         curves = [np.atleast_2d(np.asarray(c, np.float64)) for c in (params.rpm2thrust, params.rpm2torque)]
         rotor_inertia = np.asarray(params.prop_inertia, np.float64) * RPM_TO_RAD_S
 
-        def torques(speed: NDArray) -> tuple[NDArray, NDArray]:
+        def rotors(speed: NDArray) -> _Rotors:
             thrust, drag = [c[:, 0] + speed * (c[:, 1] + speed * c[:, 2]) for c in curves]
-            tilt = thrust_factor * arm * thrust @ mixing[:2].T
+            thrust = thrust_factor * thrust
+            torque = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
             # The drag of the air on rotors and their acceleration turn the body the same way.
-            spin = (rotor_inertia * np.gradient(speed, log.dt, axis=0)) @ mixing[2]
-            return np.c_[tilt, drag @ mixing[2]], spin
+            reaction = _change((rotor_inertia * speed) @ mixing[2])
+            return _Rotors(_over_two(torque, log.dt), _change(torque), reaction, _over_two(thrust.sum(axis=1), log.dt))
 
         w, dt = log.ang_vel, log.dt
-        gyro = np.linalg.solve(inertia, np.cross(w, w @ inertia).T).T
-        change = np.zeros_like(w)
-        change[1:-1] = w[2:] - w[:-2]
+        spin = np.zeros_like(w)
+        spin[:, 2] = -values[4] * (rotor_inertia * log.rotor_vel) @ mixing[2]
+        gyro = np.linalg.solve(inertia, np.cross(w, w @ inertia + spin).T).T
         speeds = log.rotor_vel if log.command is None else _explained(log)
         return _Prepared(
-            dt, log.gaps, change + _over_two(gyro, dt), w, *torques(log.rotor_vel), *torques(speeds)
+            dt, log.gaps, _change(w) + _over_two(gyro, dt), _over_two(w, dt), rotors(log.rotor_vel), rotors(speeds)
         )  # fmt: skip
+
+
+class _Rotors(NamedTuple):
+    """What rotors do over the two intervals around each sample."""
+
+    impulse: NDArray
+    """Integral of the torque of the thrusts about x and y, and of the drag about z, N m s. (n, 3)"""
+    swing: NDArray
+    """Change of these torques, N m. (n, 3)"""
+    reaction: NDArray
+    """Integral of the torque about z of the rotors' acceleration, N m s. (n,)"""
+    lift: NDArray
+    """Integral of the collective thrust, N s. (n,)"""
 
 
 def _explained(log: Log) -> NDArray:
@@ -168,10 +191,17 @@ def _explained(log: Log) -> NDArray:
     return np.stack(speeds, axis=-1)
 
 
+def _change(x: NDArray) -> NDArray:
+    """Return the change over the two intervals around each sample, zero at the ends."""
+    change = np.zeros_like(x)
+    change[1:-1] = x[2:] - x[:-2]
+    return change
+
+
 def _over_two(x: NDArray, dt: float) -> NDArray:
-    """Return the integral over the two intervals around each sample (Simpson's rule)."""
+    """Return the integral over the two intervals around each sample, zero at the ends, exact for degree 5."""
     total = np.zeros_like(x)
-    total[1:-1] = (x[:-2] + 4 * x[1:-1] + x[2:]) * (dt / 3)
+    total[2:-2] = (114 * x[2:-2] + 34 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) * (dt / 90)
     return total
 
 
@@ -215,25 +245,37 @@ def _blocks(d: _Prepared) -> NDArray:
 def _solved(d: _Prepared, axis: int, delay: float, at: NDArray) -> tuple[NDArray, NDArray]:
     """Return the coefficients of the regressors and their variances, at some samples.
 
-    Regressors are torque and rate of the torque about x and y, drag torque and reaction of the rotors about z; after
-    them the angular velocity.
+    Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
+    the drag torque and the reaction of the rotors. The last one is the angular velocity.
     """
-    times = np.arange(len(d.turned), dtype=float)
 
-    def late(x: NDArray) -> NDArray:
-        return np.interp(times - delay / d.dt, times, x)
-
-    def terms(torque: NDArray, reaction: NDArray) -> NDArray:
-        first = late(torque[:, axis])
-        second = late(reaction) if axis == 2 else np.gradient(first, d.dt)
-        return _over_two(np.c_[first, second, d.ang_vel[:, axis]], d.dt)
+    def terms(rotors: _Rotors) -> NDArray:
+        if axis == 2:
+            columns = rotors.impulse[:, 2], rotors.reaction
+        else:
+            columns = rotors.impulse[:, axis], rotors.swing[:, axis], rotors.lift
+        return np.c_[shifted(np.stack(columns, axis=-1), delay / d.dt), d.angle[:, axis]]
 
     slow = YAW_SLOW if axis == 2 else SLOW
     regressors, instruments, turned = (
-        _band(x, d.dt, slow)[at]
-        for x in (terms(d.torque, d.reaction), terms(d.instrument, d.instrument_reaction), d.turned[:, axis : axis + 1])
+        _band(x, d.dt, slow)[at] for x in (terms(d.rotors), terms(d.instruments), d.turned[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
     x = inverse @ instruments.T @ turned[:, 0]
     rest = turned[:, 0] - regressors @ x
     return x, np.mean(rest**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
+
+
+def shifted(x: NDArray, samples: float) -> NDArray:
+    """Return series that are later by a number of samples, by Lagrange's polynomials through six of them. (n, k)
+
+    A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; this lowers it by 1.5%.
+    """
+    whole = math.floor(samples)
+    part, at = samples - whole, np.arange(-2, 4)
+    late, n = np.zeros_like(x), len(x)
+    for k in at:
+        others = at[at != k]
+        weight = np.prod((part - others) / (k - others))
+        late += weight * x[np.clip(np.arange(n) - whole - k, 0, n - 1)]
+    return late
