@@ -36,7 +36,10 @@ LONGEST = 0.04
 """Largest delay, s."""
 SAMPLING = 5e-4
 """Relative error of integrals between samples, which is the same in all blocks: of moments of inertia it was 0.04 to
-0.07% in simulated flights without noise, at 100 and 500 Hz."""
+0.12% in simulated flights without noise, at 100 and 500 Hz."""
+CORNER = 0.02
+"""Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there, of
+which quadrature makes a delay of dt^2 / (12 time constant): 0.04 samples of 0.01 s for a time constant of 0.02 s."""
 ROUNDS = 3
 """Fits, each with the gyroscopic torques of the moments of inertia of the one before."""
 
@@ -47,7 +50,7 @@ class FastRotation(NamedTuple):
     values: NDArray
     """Factors of the moments of inertia about x, y, z, of the torque curve and of the rotors' inertia. (5,)"""
     deviations: NDArray
-    """Standard deviations, from the scatter between blocks and ``SAMPLING``. (5,)"""
+    """Standard deviations, from the scatter between blocks, ``SAMPLING`` and ``CORNER``. (5,)"""
     delays: NDArray
     """Delay of the state behind the rotor speeds in each log, s. (n_logs,)"""
 
@@ -85,10 +88,12 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
         z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
         values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
+    late = np.concatenate([_blocks(_Prepared.create(log, params, thrust_factor, values), CORNER) for log in logs])
+    turned = [median(late[:, k], late[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
     inertia = moments * values[:3]
     tilt = np.array(deviations[:2]) / [roll, pitch]
     turn = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
-    spread = np.hypot([*tilt * [x, y], turn * z, *inertia[2] * np.array(deviations[2:])], SAMPLING * values)
+    spread = np.hypot([*tilt * [x, y], turn * z, *inertia[2] * np.hypot(deviations[2:], turned)], SAMPLING * values)
     every = median(found[:, 4], np.ones(len(found)))[0]
     delays = [median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
     return FastRotation(values, spread, np.array(delays))
@@ -216,8 +221,8 @@ def _band(x: NDArray, dt: float, slow: float) -> NDArray:
     return smooth(FAST) - smooth(slow)
 
 
-def _blocks(d: _Prepared) -> NDArray:
-    """Return the solution of each block.
+def _blocks(d: _Prepared, late: float = 0.0) -> NDArray:
+    """Return the solution of each block, about z with a delay that is longer by ``late`` samples.
 
     Coefficients of torque about x and y, of drag torque and of reaction; delay; variances of the coefficients.
     (n_blocks, 9)
@@ -237,7 +242,7 @@ def _blocks(d: _Prepared) -> NDArray:
             # Torque and its rate over time: torque(t - e) = torque - e rate.
             delay -= float(np.mean([x[1] / x[0] for x, _ in tilt]))
             delay = float(np.clip(delay, -LONGEST, LONGEST))
-        turn, variance = _solved(d, 2, delay, at)
+        turn, variance = _solved(d, 2, delay + late * d.dt, at)
         found.append([*(x[0] for x, _ in tilt), *turn[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
     return np.reshape(found, (-1, 9))
 

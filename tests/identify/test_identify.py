@@ -453,9 +453,12 @@ def test_other_order_of_rotors_is_refused(flights):
 
 
 def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
-    """Rotor speeds that are noisy, quantised and late by another delay in each flight; commands are exact."""
-    rng, logs, late = np.random.default_rng(1), [], [0.004, 0.012, 0.0, 0.008, 0.004]
-    for flight, delay in zip(flights[:-1], late, strict=True):
+    """Rotor speeds that are noisy, quantised and late by another delay in each flight; commands are exact.
+
+    A second of a flight leaves an error of some 5%, so each flight is logged three times.
+    """
+    rng, logs, late = np.random.default_rng(1), [], 3 * [0.004, 0.012, 0.0, 0.008, 0.004]
+    for flight, delay in zip(3 * flights[:-1], late, strict=True):
         t, columns = flight["t"], {}
         for k in range(1, 5):
             columns[f"cmd{k}"] = flight[f"rpm{k}"]
@@ -466,8 +469,11 @@ def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
     with_commands = fast_rotation(logs, params, FACTORS["thrust factor"])
     without = fast_rotation([replace(log, command=None) for log in logs], params, FACTORS["thrust factor"])
     true = np.array([FACTORS["inertia x"], FACTORS["inertia y"]])
-    np.testing.assert_allclose(with_commands.values[:2], true, rtol=0.08)
-    np.testing.assert_allclose(with_commands.delays, late, atol=3e-3)
+    deviations = with_commands.deviations[:2]
+    assert np.all(np.abs(with_commands.values[:2] - true) < 3 * deviations), with_commands
+    assert np.all(deviations < 0.05 * true), deviations
+    delays = np.median(np.reshape(with_commands.delays, (3, 5)), axis=0)
+    np.testing.assert_allclose(delays, late[:5], atol=3e-3)
     assert np.all(without.values[:2] > 1.07 * true), without.values
 
 
