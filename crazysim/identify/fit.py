@@ -22,12 +22,15 @@ from crazysim.identify.logs import Log
 from crazysim.identify.motion import integral
 from crazysim.identify.motors import motor_lag, with_speeds
 from crazysim.identify.prediction import Model, windows
-from crazysim.identify.rotation import BLOCK, CORNER, FEWEST, SAMPLING, aligned, enlarged, fast_rotation, median
+from crazysim.identify.rotation import BLOCK, FEWEST, SAMPLING, aligned, enlarged, fast_rotation, median
 from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
 from crazysim.rotation import rotate, rotate_inverse
 
 DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
+SLOW_CORNER = 0.2
+"""Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
+samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples."""
 LARGEST = 10.0
 """Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
 checked, a thrust factor stays below 2.5 squared times that of the mass."""
@@ -154,12 +157,8 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     force, force_spread = _forces(logs, params)
     force_spread[0] = math.hypot(force_spread[0], SAMPLING * force[0])
     torque, torque_spread = _torques(logs, params, float(force[0]), fast.values)
-    late = [aligned(log, CORNER * log.dt) for log in logs]
-    for others in (
-        _torques(late, params, float(force[0]), fast.values),
-        _torques(logs, params, float(force[0]), fast.values, corners=True),
-    ):
-        torque_spread = np.hypot(torque_spread, others[0] - torque)
+    late = [aligned(log, SLOW_CORNER * log.dt) for log in logs]
+    torque_spread = np.hypot(torque_spread, _torques(late, params, float(force[0]), fast.values)[0] - torque)
     for k, step in enumerate(fast.deviations):
         if math.isfinite(step):
             other = _torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
@@ -217,7 +216,7 @@ def _forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArr
 
 
 def _torques(
-    logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, fast: NDArray, *, corners: bool = False
+    logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, fast: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return the parameters of the torque, see ``TORQUES``, and their deviations."""
     mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
@@ -235,22 +234,12 @@ def _torques(
         rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
         # Everything known, integrated, goes to the left side.
         known = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
-        if corners:
-            known += _corners(rotors, log.dt)
         vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
         columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
         columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
         return np.stack(columns, axis=-1), momentum - known
 
     return _regressed(logs, terms, np.zeros(len(TORQUES), bool))
-
-
-def _corners(x: NDArray, dt: float) -> NDArray:
-    """Return what the trapezoidal integral lacks if series have their sharp corners at samples. (n, k)"""
-    bend = np.zeros_like(x)
-    bend[1:-1] = x[2:] - 2 * x[1:-1] + x[:-2]
-    sharp = np.abs(bend) > 4 * np.median(np.abs(bend), axis=0)
-    return np.cumsum(bend * sharp, axis=0) * dt / 12
 
 
 def _body(log: Log, vector: NDArray) -> NDArray:

@@ -44,8 +44,11 @@ def draw(rng, folder, k):
     return path, true | {"drag": {"coefficients": drag}}, truth
 
 
-def flown(airframes, seconds, rng):
-    """Return flights of drones that tilt, turn and climb at random, as columns at 100 Hz."""
+def flown(airframes, seconds, rng, *, at_samples):
+    """Return flights of drones that tilt, turn and climb at random, as columns at 100 Hz.
+
+    Commands come at samples of the log, or at any time between them, as of a program that does not wait for it.
+    """
     n = len(airframes)
     sim, drones = Sim(drone=airframes, control="attitude", integrator="rk4"), [load_airframe(a) for a in airframes]
     weight = np.array([float(a.value("rigid_body.mass")) * 9.81 for a in drones])
@@ -65,8 +68,9 @@ def flown(airframes, seconds, rng):
             lift = rng.uniform(0.9, 1.15, n) * np.clip(1 - 0.02 * climbed - 0.05 * vel[:, 2], 0.8, 1.2)
             cmd[0, due] = np.c_[tilt, lift * weight][due]
             until[due] = k + rng.integers(15, 50, np.sum(due))
-        # A command comes at any time between two samples of the log, as of a program that does not wait for it.
-        sim.step(wait := int(rng.integers(1, 5)))
+        wait = 0 if at_samples else int(rng.integers(1, 5))
+        if wait:
+            sim.step(wait)
         sim.attitude_control(cmd)
         sim.step(5 - wait)
         s = sim.data.states
@@ -74,12 +78,12 @@ def flown(airframes, seconds, rng):
     return np.stack(rows[50:], axis=1).astype(np.float64)
 
 
-def missed(folder, n, seconds, seed):
+def missed(folder, n, seconds, seed, *, at_samples):
     """Return numbers further than three deviations from the truth, of fits with and without noise, and how many are."""
     rng = np.random.default_rng(seed)
     paths, airframes, truths = zip(*(draw(rng, folder, k) for k in range(n)), strict=True)
     wrong, total = [], 0
-    for path, flight, truth in zip(paths, flown(airframes, seconds, rng), truths, strict=True):
+    for path, flight, truth in zip(paths, flown(airframes, seconds, rng, at_samples=at_samples), truths, strict=True):
         for noise in (0, 1):
             x = flight + 0
             x[:, :13] += noise * NOISE * rng.normal(size=(len(x), 13))
@@ -97,12 +101,14 @@ def missed(folder, n, seconds, seed):
 
 
 @pytest.mark.long("flies four airframes for 40 s and fits each twice")
-def test_three_deviations_contain_the_truth(tmp_path):
-    wrong, total = missed(tmp_path, 4, 40.0, 0)
+@pytest.mark.parametrize("at_samples", [False, True])
+def test_three_deviations_contain_the_truth(tmp_path, at_samples):
+    wrong, total = missed(tmp_path, 4, 40.0, 0, at_samples=at_samples)
     assert len(wrong) <= 0.02 * total, wrong
 
 
 @pytest.mark.slow("50 airframes; four do the same")
-def test_three_deviations_contain_the_truth_in_99_percent(tmp_path):
-    wrong, total = missed(tmp_path, 50, 60.0, 1)
+@pytest.mark.parametrize("at_samples", [False, True])
+def test_three_deviations_contain_the_truth_in_99_percent(tmp_path, at_samples):
+    wrong, total = missed(tmp_path, 50, 60.0, 1, at_samples=at_samples)
     assert len(wrong) <= 0.01 * total, wrong
