@@ -452,6 +452,7 @@ def test_other_order_of_rotors_is_refused(flights):
         identify([read_log(other)])
 
 
+@pytest.mark.long("fits 15 flights with commands and without")
 def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
     """Rotor speeds that are noisy, quantised and late by another delay in each flight; commands are exact.
 
