@@ -112,7 +112,7 @@ def test_betaflight_receives_the_state_and_flies():
     state, rc = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     state.bind(("127.0.0.1", ports[1]))
     rc.bind(("127.0.0.1", ports[2]))
-    state.settimeout(2.0)
+    state.settimeout(5.0)
     rc.settimeout(0.0)
     received, origin = [], Origin(10.0, 20.0, 100.0)
 
@@ -129,6 +129,9 @@ def test_betaflight_receives_the_state_and_flies():
             state.sendto(np.asarray(motors, "<f4").tobytes(), ("127.0.0.1", ports[0]))
 
     sim = disturbed(freq=250)
+    data = sim.data
+    sim.step()  # compiles before the stand-in waits
+    sim.data = data
     with state, rc, SoftwareInTheLoop(sim, Waiting(ports=ports, origin=origin, rc_freq=5.0)) as loop:
         thread = Thread(serve)
         loop.links[0].channels[:] = np.arange(1000, 1016)
