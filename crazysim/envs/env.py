@@ -94,7 +94,9 @@ class Env(ABC):
             key: Random key, as ``jax.random.key`` makes. ()
 
         Raises:
-            ConfigError: If the task begins in a state that is not finite.
+            ConfigError: If the task begins in a state that is not finite. A compiled reset, such as
+                ``jax.jit(env.reset)``, cannot raise: there such a world ends at its first step, with
+                ``info["nonfinite"]``.
         """
         key = commit(key, self.sim.device) if self.sim.mesh is None else key
         with beside(key):

@@ -180,7 +180,7 @@ def ranks(x: Array, n: int) -> Array:
     # Numbers of equal value count by their place, so that no two get one rank.
     earlier = np.arange(x.shape[-1])[None] < np.arange(n)[:, None]
     mine, others = x[..., :n, None], x[..., None, :]
-    return jnp.sum((others < mine) | ((others == mine) & earlier), axis=-1)
+    return jnp.sum((others < mine) | ((others == mine) & earlier), axis=-1, dtype=jnp.int32)
 
 
 def _raised(flat: Array, points: Points) -> Array:

@@ -132,7 +132,7 @@ def build(
             found |= {"floor": gap < 0, "floor_distance": gap}
         if chosen:
             gap = jnp.concatenate([_to_group(own, drone_rot, group, data) for group in groups], axis=-1)
-            found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": jnp.argmin(gap, axis=-1)}
+            found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": _argmin(gap)}
         if drones:
             gap, nearest = (_to_others(own, drone_rot), None) if pos.ndim == 1 else _to_drones(own, drone_rot)
             found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
@@ -318,7 +318,7 @@ def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
     with the swarm.
     """
     n = own[0][1].shape[-2]
-    indices = jnp.arange(n)
+    indices = jnp.arange(n, dtype=np.int32)
 
     def of_chunk(chunk: Array) -> tuple[Array, Array]:
         gaps = []
@@ -337,11 +337,23 @@ def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
                 rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
                 gaps.append(_of(both, distance(mine.shape, geom.shape, inside, rot)))
         gap = jnp.where(chunk[:, None] == indices, jnp.inf, _smallest(gaps, own[0][1]))
-        return jnp.min(gap, axis=-1), jnp.argmin(gap, axis=-1)
+        return jnp.min(gap, axis=-1), _argmin(gap)
 
     if n <= CHUNK:
         return of_chunk(indices)
     n_chunks = -(-n // CHUNK)
-    padded = jnp.minimum(jnp.arange(n_chunks * CHUNK), n - 1).reshape(n_chunks, CHUNK)
+    padded = jnp.minimum(jnp.arange(n_chunks * CHUNK, dtype=np.int32), n - 1).reshape(n_chunks, CHUNK)
     gap, nearest = jax.lax.map(of_chunk, padded)
     return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest))  # type: ignore[return-value]
+
+
+def _argmin(gaps: Array) -> Array:
+    """Return the index of the smallest of some distances, int32 also where x64 is enabled: kernels have no int64.
+
+    Args:
+        gaps: Distances, m. (..., n)
+
+    Returns:
+        (...)
+    """
+    return jax.lax.argmin(gaps, gaps.ndim - 1, np.int32)

@@ -144,6 +144,14 @@ def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(env, begu
         }
 
 
+def test_a_step_is_one_kernel_where_x64_is_enabled(name, x64):
+    """Indices and counts stay int32: kernels have no int64."""
+    env = AutoReset(make(name))
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert state.action.dtype == np.float64
+    assert env.fused_step(state, state.action) is not None
+
+
 def test_repeated_steps_are_traced_once(env, begun):
     """Law 6: reset, restart and step return the same kind of state, for NumPy, JAX and float64 actions alike."""
     state = begun

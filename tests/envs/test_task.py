@@ -157,22 +157,34 @@ def test_law_09_wrong_shapes_of_a_task_are_refused_at_making(two_drones, case):
         DroneEnv(two_drones, wrong)
 
 
-@pytest.mark.parametrize("state", ["pos", "quat", "ang_vel"])
-def test_law_09_a_start_that_is_not_finite_is_refused(two_drones, state):
-    class Lost(Still):
-        """Not a number in the second world."""
+def lost(sim, state="pos"):
+    """Return an environment in whose second world a state begins as NaN."""
 
+    class Lost(Still):
         def spawn(self, data, key):
             value = getattr(data.states, state)
             wrong = jnp.where(data.core.world_id == 1, jnp.nan, value)
             return data.replace(states=data.states.replace(**{state: wrong}))
 
-    env = DroneEnv(two_drones, Lost())
+    return DroneEnv(sim, Lost())
+
+
+@pytest.mark.parametrize("state", ["pos", "quat", "ang_vel"])
+def test_law_09_a_start_that_is_not_finite_is_refused(two_drones, state):
+    env = lost(two_drones, state)
     words = f"task 'still': expected spawn to return finite states, got {state} with NaN or infinity in world 1"
     with pytest.raises(ConfigError, match=words):
         env.reset(jax.random.key(0))
     with pytest.raises(ConfigError, match=words):
         DroneVectorEnv(env).reset(seed=0)
+
+
+def test_a_start_that_is_not_finite_ends_at_the_first_step_of_compiled_code(two_drones):
+    """Compiled code cannot raise; see ``Env.reset``."""
+    env = lost(two_drones)
+    state = jax.jit(lambda key: env.step(start := env.reset(key), jnp.zeros_like(start.action)))(jax.random.key(0))
+    np.testing.assert_array_equal(state.terminated, np.arange(two_drones.n_worlds) == 1)
+    np.testing.assert_array_equal(state.info["nonfinite"], state.terminated)
 
 
 def test_law_09_an_episode_without_a_step_is_refused(two_drones):

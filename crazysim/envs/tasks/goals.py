@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.typing import ArrayLike
 
 from crazysim import rotation
@@ -127,7 +127,7 @@ def pick(x: Array, number: Array) -> Array:
     Returns:
         (..., k)
     """
-    chosen = number[..., None, None] == np.arange(x.shape[-2])[:, None]
+    chosen = number[..., None, None] == np.arange(x.shape[-2], dtype=np.int32)[:, None]
     return jnp.sum(jnp.where(chosen, x, 0), axis=-2)
 
 
@@ -144,9 +144,9 @@ def nearest(distance: Array, x: Array, n: int) -> Array:
     """
     out = []
     for _ in range(n):
-        first = jnp.argmin(distance, axis=-1)
+        first = lax.argmin(distance, distance.ndim - 1, np.int32)
         out.append(pick(x, first))
-        distance = jnp.where(first[..., None] == np.arange(x.shape[-2]), jnp.inf, distance)
+        distance = jnp.where(first[..., None] == np.arange(x.shape[-2], dtype=np.int32), jnp.inf, distance)
     return jnp.stack(out, axis=-2)
 
 

@@ -114,7 +114,7 @@ def to_go(data: SimData) -> Array:
     record = race_of(data)
     pos, quat = gates_of(data)
     legs = way(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
-    left = jnp.arange(1, pos.shape[-2]) > record.passed[..., None]
+    left = np.arange(1, pos.shape[-2], dtype=np.int32) > record.passed[..., None]
     next_pos, next_quat = next_gate(data)
     first = way(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
     return jnp.where(record.finished, 0, first + jnp.sum(jnp.where(left, legs, 0), axis=-1))

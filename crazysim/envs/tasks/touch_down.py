@@ -88,7 +88,7 @@ class TouchDown(Task):
             pos, vel = self.target_motion(data, ahead=1)
             if report.objects is None or report.floor is None:
                 raise TypeError("expected contacts with objects and floor, got None")
-            mine = np.arange(data.core.n_drones) == data.core.drone_id[..., None]
+            mine = np.arange(data.core.n_drones, dtype=np.int32) == data.core.drone_id[..., None]
             on_place = jnp.any(report.objects & mine, axis=-1)
             elsewhere = jnp.any(report.objects & ~mine, axis=-1) | report.floor
             offset, drift = s.pos - pos, s.vel - vel
