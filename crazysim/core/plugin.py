@@ -187,6 +187,9 @@ class Plugin:
     the others limit."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
     """Data that ``constrain`` is written for: those of one drone, or of one world."""
+    begins_before: ClassVar[str | None] = None
+    """Name of the stage of an episode's first step in front of which ``begin_episode`` is called, if it uses what that
+    step has computed so far; None to call it at resets, and in front of all stages in worlds that were not reset."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -284,16 +287,17 @@ class Plugin:
         return ()
 
     def begin_episode(self, data: SimData) -> SimData:
-        """Return the data of one drone at the beginning of an episode; ``data`` are those after a reset.
+        """Return the data of one drone at the beginning of an episode.
 
-        It may write leaves of drones, such as what is drawn for an episode. It is also called in the first step of an
-        episode, for worlds that were not reset, before all other stages and with the same random numbers.
+        It may write leaves of drones, such as what is drawn for an episode. It is called at resets, and in the first
+        step of worlds that were not reset, before all other stages and with the same random numbers; with
+        ``begins_before`` in every first step instead, in front of that stage.
         """
         return data
 
     @property
     def begins_episodes(self) -> bool:
-        """True if resets must call ``begin_episode``."""
+        """True if ``begin_episode`` must be called."""
         return type(self).begin_episode is not Plugin.begin_episode
 
     def influence(self, data: SimData) -> SimData:

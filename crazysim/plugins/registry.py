@@ -96,7 +96,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
         pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
         resets = dict(self._sim.reset_pipeline)
-        if plugin.begins_episodes:
+        if _begins_at_resets(plugin):
             append_fn(resets, Stage(plugin.begin_episode, "drone"), name)
         self._put(name, record, default)
         self._installed[name] = installed
@@ -110,7 +110,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         pipeline = _without(dict(self._sim.step_pipeline), self._installed[name])
         pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
         resets = dict(self._sim.reset_pipeline)
-        if self[name].begins_episodes:
+        if _begins_at_resets(self[name]):
             resets.pop(name, None)
         self._put(name, None, None)
         del self._installed[name]
@@ -141,7 +141,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         finally:
             sim.step_pipeline = present_pipeline
         resets = dict(self._sim.reset_pipeline)
-        if name in resets and plugin.begins_episodes:
+        if name in resets and _begins_at_resets(plugin):
             resets[name] = Stage(plugin.begin_episode, "drone")
         self._put(name, _continued(record, present), default)
         self._installed[name] = installed
@@ -157,7 +157,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def reset_stages(self) -> tuple[str, ...]:
         """Names of stages that do in the first step of an episode what resets have done."""
         resets = self._sim.reset_pipeline
-        return tuple([_begin_name(p) for p in self.values() if p.begins_episodes and p.name in resets])
+        return tuple([_begin_name(p) for p in self.values() if _begins_at_resets(p) and p.name in resets])
 
     @property
     def members(self) -> tuple[str, ...]:
@@ -274,13 +274,19 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
 
 
 def _placements(plugin: Plugin, sim: Simulation) -> object:
-    """Return the stages of a plugin with their places, after one that begins the episode of worlds without a reset."""
+    """Return the stages of a plugin with their places, after the one that begins an episode in its first step."""
     placements = plugin.stages(sim)
     if not plugin.begins_episodes or not isinstance(placements, (list, tuple)):
         return placements
     begins = Stage(plugin.begin_episode, "drone", at_the_start)
-    first = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not at_the_start)
-    return [Placement(begins, before=first, name=_begin_name(plugin)), *placements]
+    before = plugin.begins_before
+    if before is None:  # in front of all stages that do not begin an episode
+        before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not at_the_start)
+    return [Placement(begins, before=before, name=_begin_name(plugin)), *placements]
+
+
+def _begins_at_resets(plugin: Plugin) -> bool:
+    return plugin.begins_episodes and plugin.begins_before is None
 
 
 def _begin_name(plugin: Plugin) -> str:

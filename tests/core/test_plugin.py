@@ -12,6 +12,7 @@ from jax import Array
 from scipy.linalg import expm
 
 from crazysim import (
+    ESKF,
     Battery,
     ConfigError,
     ContactResponse,
@@ -26,6 +27,7 @@ from crazysim import (
     RangeFinder,
     Sim,
     Wind,
+    WindField,
     leaf,
     parameter,
     stage,
@@ -33,9 +35,13 @@ from crazysim import (
 from crazysim.core.integration import INTEGRATORS, Integration
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.plugin import FunctionPlugin
+from crazysim.core.stage import at_the_start
 from crazysim.core.stages import first_principles_derivative
 from crazysim.engine import Step
 from crazysim.errors import UnknownNameError
+from crazysim.plugins.effects.grid import Grid
+from crazysim.plugins.estimators import Complementary
+from crazysim.plugins.sensors import Barometer
 
 DURATION = 0.5
 STEPS = np.array([32, 64, 128])
@@ -298,6 +304,63 @@ def test_a_reset_restores_states_of_plugins_in_its_worlds_alone():
     after = np.asarray(sim.data.plugins["wake"].vel)
     np.testing.assert_array_equal(after[[0, 2]], 0.0)
     np.testing.assert_array_equal(after[1], flown[1])
+
+
+class PlaceData(PyTree):
+    """Where an episode began."""
+
+    pos: Array = leaf("drone", 1, (3,))
+    """Position, world frame, m. (n_worlds, n_drones, 3)"""
+
+
+class Place(Plugin):
+    """Note where an episode begins."""
+
+    name: str = "place"
+
+    def record(self, sim):
+        return self.filled(sim, PlaceData)
+
+    def begin_episode(self, data):
+        return self.write(data, PlaceData(data.states.pos + 0.0))
+
+
+class LatePlace(Place):
+    """Note where a drone is after the integration of the first step."""
+
+    begins_before: ClassVar[str | None] = "increment_steps"
+    name: str = "late"
+
+
+def test_episodes_begin_at_resets_or_in_front_of_a_stage_of_their_first_step():
+    sim = hovering(engine="interpret")
+    place, late = sim.add(Place()), sim.add(LatePlace())
+    assert [*sim.reset_pipeline] == ["reset", "place"]
+    sim.data = with_states(sim.data, vel=[0, 0, 1.0])
+    before = np.array(sim.data.states.pos)
+    sim.step()
+    after = np.array(sim.data.states.pos)
+    assert (after[..., 2] > before[..., 2]).all()
+    for k in range(2):
+        np.testing.assert_array_equal(place.read(sim.data).pos, before, err_msg=f"after {k} more")
+        np.testing.assert_array_equal(late.read(sim.data).pos, after, err_msg=f"after {k} more")
+        sim.step()
+    sim.reset(np.array([True, False, False]))
+    np.testing.assert_array_equal(place.read(sim.data).pos[0], sim.default_data.states.pos[0])
+    np.testing.assert_array_equal(place.read(sim.data).pos[1:], before[1:])
+    np.testing.assert_array_equal(late.read(sim.data).pos[0], 0.0)
+
+
+def test_all_parts_of_the_package_begin_episodes_by_one_method():
+    sim = Sim(engine="interpret", estimator="kalman")
+    imu = sim.plugins["imu"]
+    sim.add(ESKF([imu, sim.plugins["motion_capture"]], False))
+    sim.add(Complementary([imu, sim.add(Barometer())], False))
+    sim.add(WindField(Grid(np.zeros((2, 2, 2, 3))), spread=(1.0, 1.0, 1.0)))
+    begin = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is at_the_start}
+    names = ("imu", "motion_capture", "kalman", "eskf", "complementary", "barometer", "wind_field")
+    assert begin == {f"{name}_begin": sim.plugins[name].begin_episode for name in names}
+    assert [*sim.reset_pipeline] == ["reset", "wind_field"], "the others begin at the state that they measure"
 
 
 def test_new_data_has_new_records():

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.random import uniform, world_key
-from crazysim.core.stage import Stage, at_the_start
+from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, Grid, interpolate
 from crazysim.plugins.effects.moving_air import Air, Exposed, require_drag, with_moving_air
@@ -88,19 +88,20 @@ class WindField(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages that displace the grid at the beginning of an episode, and look up the air."""
+        """Return the stage that looks up the air."""
         is_small = np.size(self.field.values) <= LARGEST_FUSED
-        found = [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True, why=TOO_LARGE))]
-        if self.spread is None:
-            return found
-        begins = Stage(self.displace, "drone", at_the_start)
-        return [Placement(begins, name=f"{self.name}_displacement"), *found]
+        return [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True, why=TOO_LARGE))]
+
+    @property
+    def begins_episodes(self) -> bool:
+        """True if a displacement of the grid is drawn."""
+        return self.spread is not None
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the force that the wind adds to the drag."""
         return with_moving_air(data, self.read(data).at_drone(data))
 
-    def displace(self, data: SimData) -> SimData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Draw the displacement of the grid for an episode; of one drone."""
         record = self.read(data)
         drawn = 2 * uniform(world_key(data, self.name), (3,), record.shift.dtype) - 1

@@ -15,7 +15,7 @@ from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import Stage, at_the_start
+from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators.error_state import GRAVITY
 from crazysim.plugins.estimators.estimator import Estimator
@@ -124,7 +124,6 @@ class Complementary(Estimator):
             return lambda data: (data.core.steps + 1) % steps == 0
 
         return [
-            ("begin", Stage(self._begin, "drone", at_the_start)),
             ("attitude", Stage(turns, "drone", every(period))),
             ("", Stage(rises, "drone", every(height_period))),
         ]
@@ -136,7 +135,7 @@ class Complementary(Estimator):
         pos, vel = (jnp.concatenate([zero, up], axis=-1) for up in (record.height, record.climb))
         return {"pos": pos, "vel": vel, "quat": rotation.safe_normalize(record.quat, s.quat)}
 
-    def _begin(self, data: SimData) -> SimData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Begin at the true attitude and height of one drone."""
         s, record = data.states, self.read(data)
         up = s.vel[2:]

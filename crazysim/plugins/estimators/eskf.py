@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Simulation, per_drone
+from crazysim.core.plugin import Simulation, per_drone
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, at_the_start, tick
+from crazysim.core.stage import Stage, tick
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
@@ -73,6 +74,8 @@ class ESKF(ErrorStateFilter):
     """Coordinate beyond which the estimate has diverged, m."""
     max_vel: float = setting(default=100.0, positive=True)
     """Velocity along an axis beyond which the estimate has diverged, m/s."""
+    begins_before: ClassVar[str | None] = "integration"
+    """Name of the stage in front of which an episode begins: at the state before the first step."""
     name: str = "eskf"
 
     @property
@@ -89,11 +92,6 @@ class ESKF(ErrorStateFilter):
         rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aids)
         paths = per_drone(sim, inertial_path.START, rows, len(inertial_path.START)) if rows else None
         return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still), paths=paths)
-
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that begins with the state before the first step, and those of every estimator."""
-        begin = Placement(Stage(self._begin, "drone", at_the_start), name=f"{self.name}_begin")
-        return [begin, *super().stages(sim)]
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         """Return the stages of the filter by name, in their order."""
@@ -125,7 +123,7 @@ class ESKF(ErrorStateFilter):
         ang_vel = self.inertial(data)[0] - estimate.gyro_bias
         return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel), "ang_vel": ang_vel}
 
-    def _begin(self, data: SimData) -> SimData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Begin at the true state of one drone."""
         s = data.states
         estimate = self._started(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -23,14 +24,16 @@ CONTROLLERS = ("state_controller", "attitude_controller", "body_rate_controller"
 class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
-    A subclass defines ``kinds``, ``record``, ``filter_stages`` and ``estimated_states``. With ``control`` controllers
-    use the estimate in place of the state, as do policies of tasks that observe measurements.
+    A subclass defines ``kinds``, ``record``, ``begin_episode``, ``filter_stages`` and ``estimated_states``. With
+    ``control`` controllers use the estimate in place of the state, as do policies of tasks that observe measurements.
     """
 
     sensors: Sequence[Sensor]
     """Sensors: an ``IMU``, and others. ``sim.add`` needs them added before; ``Sim(estimator=...)`` adds them."""
     control: bool = True
     """True where the controllers of the simulation fly on the estimate."""
+    begins_before: ClassVar[str | None] = "increment_steps"
+    """Name of the stage in front of which an episode begins: at the state after the first step."""
     _: dataclasses.KW_ONLY
     name: str = "estimator"
 

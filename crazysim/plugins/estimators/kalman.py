@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, at_the_start
+from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.error_state import Estimate
@@ -117,7 +117,6 @@ class Kalman(ErrorStateFilter):
         """Return the stages of the filter by name, in their order."""
         period, is_due = self.predictions(freq)
         return [
-            ("begin", Stage(self._begin, "drone", at_the_start)),
             ("sample", Stage(self.sample, "drone")),
             ("predict", Stage(self._predict(period), "drone", is_due)),
             ("noise", Stage(self._add_noise, "drone")),
@@ -133,7 +132,7 @@ class Kalman(ErrorStateFilter):
         quat = rotation.safe_normalize(estimate.quat, data.states.quat)
         return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel)}
 
-    def _begin(self, data: SimData) -> SimData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Begin at the true state of one drone."""
         s, record = data.states, self.read(data)
         estimate = error_state.start(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)

@@ -76,10 +76,12 @@ class Barometer(Sensor):
         height = data.states.pos[2:]
         return jnp.concatenate([pressure_at(height + self.read(data).altitude), height])
 
-    def begin(self, data: SimData, record: BarometerData, key: Array) -> BarometerData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Draw the offset of one barometer, and where its drift begins."""
-        noise = normal(key, (2,), record.offset.dtype)
-        return record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
+        record = self.read(data)
+        noise = normal(self.begin_key(data), (2,), record.offset.dtype)
+        drawn = record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
+        return self.write(data, drawn)
 
     def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, BarometerData]:
         """Return the pressure and the height of one barometer, and the record after it."""

@@ -68,9 +68,11 @@ class GPS(Sensor):
         vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, pos), s.vel)
         return jnp.concatenate([rotation.rotate(s.quat, pos, s.pos), vel])
 
-    def begin(self, data: SimData, record: GPSData, key: Array) -> GPSData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Draw where the drift of one receiver begins."""
-        return record.replace(wander=record.drift * normal(key, (3,), record.wander.dtype))
+        record = self.read(data)
+        wander = record.drift * normal(self.begin_key(data), (3,), record.wander.dtype)
+        return self.write(data, record.replace(wander=wander))
 
     def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, GPSData]:
         """Return position and velocity from one receiver, and the record after it."""

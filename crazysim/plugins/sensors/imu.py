@@ -195,16 +195,16 @@ class IMU(Sensor):
         force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, record.pos)
         return _to_sensor(record.quat, s.ang_vel, force)
 
-    def begin(self, data: SimData, record: IMUData, key: Array) -> IMUData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Draw the errors of one unit, and the angles of its rotors."""
-        truth, keys = self.ideal(data), jax.random.split(key)
+        record, truth, keys = self.read(data), self.ideal(data), jax.random.split(self.begin_key(data))
         noise = normal(keys[0], (12, 2), truth.dtype)
-        gyro, accel = record.gyro.begin(truth[:3], noise[:, 0]), record.accel.begin(truth[3:], noise[:, 1])
+        gyro, accel = record.gyro.drawn(truth[:3], noise[:, 0]), record.accel.drawn(truth[3:], noise[:, 1])
         record = record.replace(gyro=gyro, accel=accel)
-        if record.phase is None:
-            return record
-        phase = 2 * math.pi * uniform(keys[1], record.phase.shape, truth.dtype)
-        return record.replace(phase=phase)
+        if record.phase is not None:
+            phase = 2 * math.pi * uniform(keys[1], record.phase.shape, truth.dtype)
+            record = record.replace(phase=phase)
+        return self.write(data, record)
 
     def measure(self, data: SimData, record: IMUData, key: Array) -> tuple[Array, IMUData]:
         """Return the angular velocity, rad/s, and the specific force, m/s^2, and the record after it."""

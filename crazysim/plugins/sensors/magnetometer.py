@@ -71,10 +71,11 @@ class Magnetometer(Sensor):
         record = self.read(data)
         return rotation.rotate_inverse(rotation.multiply(data.states.quat, record.quat), record.field)
 
-    def begin(self, data: SimData, record: MagnetometerData, key: Array) -> MagnetometerData:
+    def begin_episode(self, data: SimData) -> SimData:
         """Draw the errors of one magnetometer."""
-        truth = self.ideal(data)
-        return record.replace(errors=record.errors.begin(truth, normal(key, (12,), truth.dtype)))
+        record, truth = self.read(data), self.ideal(data)
+        errors = record.errors.drawn(truth, normal(self.begin_key(data), (12,), truth.dtype))
+        return self.write(data, record.replace(errors=errors))
 
     def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, MagnetometerData]:
         """Return the field that one magnetometer measures, T, and the record after it."""

@@ -77,10 +77,10 @@ class MotionCapture(Sensor):
         vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, record.pos), s.vel)
         return jnp.concatenate([pos, rotation.multiply(s.quat, record.quat), vel])
 
-    def begin(self, data: SimData, record: MotionCaptureData, key: Array) -> MotionCaptureData:
-        """Return the record with the place and the velocity of one drone before the first measurement."""
+    def begin_episode(self, data: SimData) -> SimData:
+        """Write the place and the velocity of one drone before the first measurement into the record."""
         pos, vel = jnp.split(self.ideal(data), (7,))
-        return record.replace(last=pos[:3] - self.interval(data) * vel, vel=vel)
+        return self.write(data, self.read(data).replace(last=pos[:3] - self.interval(data) * vel, vel=vel))
 
     def measure(self, data: SimData, record: MotionCaptureData, key: Array) -> tuple[Array, MotionCaptureData]:
         """Return position, attitude and velocity of one tracked body, and the record after it."""

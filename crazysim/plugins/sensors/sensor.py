@@ -18,7 +18,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate, setting
-from crazysim.core.stage import Stage, at_the_start, tick
+from crazysim.core.stage import Stage, tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf, on_device
 
@@ -54,13 +54,16 @@ class Samples(PyTree):
 class Sensor(Plugin):
     """Base class of sensors that measure at a rate, and whose measurements may arrive late or never.
 
-    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``begin`` if a sensor has
-    errors of its own, drawn once an episode. Its record has a field ``samples``. Measurements are taken after the state
-    of the step is known; the latest one is held. A measurement that is overtaken by a newer one is discarded.
+    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``begin_episode`` if a
+    sensor has errors of its own, drawn once an episode with ``begin_key``. Its record has a field ``samples``.
+    Measurements are taken after the state of the step is known; the latest one is held. A measurement that is overtaken
+    by a newer one is discarded.
     """
 
     kind: ClassVar[type[PyTree]]
     """Class of the record."""
+    begins_before: ClassVar[str | None] = "increment_steps"
+    """Name of the stage in front of which an episode begins: at the state of the first measurement."""
 
     _: dataclasses.KW_ONLY
     freq: int | None = None
@@ -88,9 +91,9 @@ class Sensor(Plugin):
         """Return a measurement of one drone, (k,), and the record of the plugin after it."""
         raise NotImplementedError
 
-    def begin(self, data: SimData, record: Any, key: Array) -> Any:
-        """Return the record with the errors of one sensor, which stay the same in an episode, drawn at random."""
-        return record
+    def begin_key(self, data: SimData) -> Array:
+        """Return the random key of one drone for the errors that stay the same in an episode. ()"""
+        return drone_key(data, f"{self.name}_begin")
 
     def record(self, sim: Simulation) -> PyTree:
         """Return the sensor before its first measurement."""
@@ -132,11 +135,8 @@ class Sensor(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages that draw a sensor's errors, measure, and deliver late measurements."""
+        """Return the stages that measure, and deliver late measurements."""
         end, placements = "increment_steps", []
-        if type(self).begin is not Sensor.begin:
-            begins = Stage(self._begin, "drone", at_the_start)
-            placements.append(Placement(begins, before=end, name=f"{self.name}_begin"))
         when = None if steps_between(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
         placements.append(Placement(Stage(self._take, "drone", when), before=end))
         if self.is_late:
@@ -185,10 +185,6 @@ class Sensor(Plugin):
         if self.max_delay is not None:
             return self.max_delay
         return float(np.max(np.asarray(self.delay)) + np.max(np.asarray(self.jitter)))
-
-    def _begin(self, data: SimData) -> SimData:
-        """Draw the errors of one sensor."""
-        return self.write(data, self.begin(data, self.read(data), drone_key(data, f"{self.name}_begin")))
 
     def _take(self, data: SimData) -> SimData:
         """Take a measurement of one drone, and send it on its way."""

@@ -49,7 +49,7 @@ class TriadData(PyTree):
     resolution: Array | None = leaf("parameter", 1, (3,))
     """Smallest difference of two measurements, u; None for none. (3,)"""
 
-    def begin(self, truth: Array, noise: Array) -> TriadData:
+    def drawn(self, truth: Array, noise: Array) -> TriadData:
         """Return the errors of one sensor in an episode.
 
         Args:
