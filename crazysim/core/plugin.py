@@ -19,7 +19,7 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import Setting, check_settings, setting, settings_of
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.errors import ConfigError, UnknownNameError, shown
 from crazysim.pytree import PyTree, on_device
 from crazysim.tables import Shapes, bounds, numbers
 
@@ -381,6 +381,22 @@ class Plugin:
     def write(self, data: SimData, record: PyTree) -> SimData:
         """Return the data with another record of this plugin."""
         return data.replace(plugins=data.plugins | {self.name: record})
+
+
+def plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
+    """Return plugins that are given as a list.
+
+    Args:
+        name: Name of the argument in messages.
+        plugins: The plugins.
+
+    Raises:
+        ConfigError: If they are not a list of plugins.
+    """
+    if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
+        example = "IMU()" if name == "sensors" else "Wind()"
+        raise ConfigError(f"expected {name} as a list of plugins, got {shown(plugins)}. Use {name}=[{example}], say.")
+    return plugins
 
 
 def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:

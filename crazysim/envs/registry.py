@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium
 
 from crazysim.control import Control
-from crazysim.core.plugin import Plugin
+from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import member, positive
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv
@@ -126,7 +126,7 @@ def make(
     settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}
     own = {k: v for k, v in options.items() if k in entry.options}
     task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
-    plugins = [*_plugins("effects", effects), *_plugins("sensors", sensors)]
+    plugins = [*plugin_list("effects", effects), *plugin_list("sensors", sensors)]
     if randomize is not None:
         if randomize not in RANGES:
             raise ConfigError(
@@ -145,18 +145,6 @@ def make(
     for plugin in plugins:
         sim.add(plugin)
     return DroneEnv(sim, task, freq, actions, bool(sensors) or settings.get("estimator") is not None)
-
-
-def _plugins(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
-    """Return plugins that are given as a list.
-
-    Raises:
-        ConfigError: If they are not.
-    """
-    if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
-        example = "IMU()" if name == "sensors" else "Wind()"
-        raise ConfigError(f"expected {name} as a list of plugins, got {shown(plugins)}. Use {name}=[{example}], say.")
-    return plugins
 
 
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:

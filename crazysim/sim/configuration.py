@@ -17,6 +17,7 @@ from crazysim.core.airframes import AirframeSource, is_list, load_airframes
 from crazysim.core.controls import controller_layout, described_controller, require_controller, require_pair
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
+from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import (
     check_settings,
     control_freqs,
@@ -31,6 +32,8 @@ from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.models import require_freq, require_support
 from crazysim.errors import ConfigError
+from crazysim.plugins.effects import Residual
+from crazysim.plugins.estimators import Estimator, find_estimator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,6 +150,26 @@ class Configuration:
             n_worlds, n_drones, airframes, dynamics, control, integrator, freq, freqs, controller, find_device(device),
             mesh, engine, flag("strict", strict),
         )  # fmt: skip
+
+
+def plugins_of(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
+    """Return the plugins that a simulation is made with: those of its shorthands, then the listed ones.
+
+    Raises:
+        ConfigError: If an argument of ``Sim`` is invalid.
+    """
+    found: list[Plugin] = []
+    if estimator is not None:
+        estimator = find_estimator(estimator)
+        found += [*estimator.sensors, estimator]
+    if aero is not None:
+        if aero != "identified":
+            raise ConfigError(
+                f"expected aero='identified' or None, got {aero!r}. Use plugins=[RotorAerodynamics()] for the other "
+                f"forces of the air on rotors."
+            )
+        found.append(Residual())
+    return [*found, *plugin_list("plugins", plugins)]
 
 
 def _described(n_worlds: int, n_drones: int, freq: int, control: Control, cascade: bool, fitted: bool) -> str:

@@ -34,9 +34,7 @@ from crazysim.dynamics.parameters import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
-from crazysim.errors import ConfigError
-from crazysim.plugins.effects import Residual
-from crazysim.plugins.estimators import Estimator, find_estimator
+from crazysim.plugins.estimators import Estimator
 from crazysim.plugins.registry import P, PluginRegistry
 from crazysim.pytree import on_device
 from crazysim.scene import mjx
@@ -51,7 +49,7 @@ from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.adopt import Kind, poses_of, read_vehicles
 from crazysim.sim.built_pipeline import BuiltPipeline
-from crazysim.sim.configuration import Configuration
+from crazysim.sim.configuration import Configuration, plugins_of
 from crazysim.sim.members import Member, find_member
 
 __all__ = [
@@ -106,6 +104,7 @@ class Sim:
         switch: Callable[..., Array] | ArrayLike | None = None,
         estimator: str | Estimator | None = None,
         aero: str | None = None,
+        plugins: Sequence[Plugin] = (),
     ):
         """Build the scene's spec, the data and both pipelines; MuJoCo allocates nothing per world.
 
@@ -137,10 +136,11 @@ class Sim:
                 indices, () or (n_worlds, n_drones).
             estimator: Filter on whose estimate the controllers fly: ``"kalman"``, with an ``IMU`` and a
                 ``MotionCapture``, another name of ``crazysim.plugins.estimators.ESTIMATORS``, or an estimator with
-                sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``. It is added with its
-                sensors as plugins. None for the true state.
-            aero: ``"identified"`` to add the forces and torques that were identified from flights of the airframes, by
-                ``Residual``; None for those of the model alone.
+                sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``; None for the true state.
+                Short for its sensors and itself at the head of ``plugins``.
+            aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
+                for those of the model alone. Short for ``Residual()`` at the head of ``plugins``.
+            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``.
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -156,6 +156,7 @@ class Sim:
             n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict,
             controller, switch,
         )  # fmt: skip
+        parts = plugins_of(plugins, estimator, aero)
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
         self.airframes = c.airframes
@@ -175,17 +176,8 @@ class Sim:
         stages = build_step_pipeline(self.control, self.dynamics, self.integrator, c.controller)
         self._steps = BuiltPipeline("step_pipeline", stages, self._stepper.build)
         self._resets = BuiltPipeline("reset_pipeline", {"reset": reset}, Reset)
-        if estimator is not None:
-            estimator = find_estimator(estimator)
-            for plugin in (*estimator.sensors, estimator):
-                self.add(plugin)
-        if aero is not None:
-            if aero != "identified":
-                raise ConfigError(
-                    f"expected aero='identified' or None, got {aero!r}. Use sim.add(RotorAerodynamics()) for the "
-                    f"other forces of the air on rotors."
-                )
-            self.add(Residual())
+        for plugin in parts:
+            self.add(plugin)
 
     @classmethod
     def from_mjcf(

@@ -163,6 +163,30 @@ def test_the_order_of_adding_does_not_matter():
             np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
 
 
+def test_a_simulation_is_made_with_plugins_as_if_they_were_added():
+    """``estimator`` and ``aero`` are short for plugins, which come before those of the list."""
+    wind, battery = Wind((1.0, 0, 0), speed_20ft=7.7), Battery()
+    settings = {"engine": "interpret", "drone": "cf21B_500_idsia", "control": "state", "rng_key": 4}
+    short = Sim(2, estimator="kalman", aero="identified", plugins=[wind, battery], **settings)
+    sensors = [short.plugins[name] for name in ("imu", "motion_capture")]
+    listed = Sim(2, plugins=[*sensors, short.plugins["kalman"], short.plugins["residual"], wind, battery], **settings)
+    added = Sim(2, **settings)
+    for plugin in short.plugins.values():
+        added.add(plugin)
+    assert [*short.plugins] == ["imu", "motion_capture", "kalman", "residual", "wind", "battery"]
+    for sim in (listed, added):
+        assert [*sim.plugins.items()] == [*short.plugins.items()]
+        assert [*sim.step_pipeline] == [*short.step_pipeline]
+        assert trees_equal(sim.data, short.data)
+        assert trees_equal(sim.default_data, short.default_data)
+
+
+@pytest.mark.parametrize("plugins", [Wind(), "imu", [Wind], None], ids=str)
+def test_law_09_plugins_of_a_simulation_are_a_list(plugins):
+    with pytest.raises(ConfigError, match=r"expected plugins as a list of plugins, got .*plugins=\[Wind\(\)\]"):
+        Sim(plugins=plugins)
+
+
 def test_remove_restores_what_was_there_before():
     """In any order: the stages, the records, and every bit of the flight."""
     sim = hovering(engine="interpret")

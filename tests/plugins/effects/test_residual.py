@@ -107,7 +107,7 @@ def test_aero_identified_adds_the_residual_of_the_airframe():
     np.testing.assert_allclose(sim.data.plugins["residual"].linear, LINEAR, rtol=1e-6)
     with pytest.raises(ConfigError, match="crazysim identify LOG --airframe cf2x_L250"):
         Sim(drone="cf2x_L250", aero="identified")
-    with pytest.raises(ConfigError, match=r"expected aero='identified' or None, got True. Use sim.add\(Rotor"):
+    with pytest.raises(ConfigError, match=r"expected aero='identified' or None, got True. Use plugins=\[Rotor"):
         Sim(aero=True)
 
 
