@@ -141,7 +141,7 @@ class AutoParams(RigidBodyParams):
 
 
 class AutoTarget(PyTree):
-    """What the position loop demands of the loops below it, and its memory."""
+    """Demand of the position loop on the loops below it, and its memory."""
 
     position: PositionMemory
     """Memory of the position loop."""

@@ -141,9 +141,9 @@ class _Prepared(NamedTuple):
     angle: NDArray
     """Integral of the angular velocity, rad. (n, 3)"""
     rotors: _Rotors
-    """What the measured rotor speeds do."""
+    """Thrusts and torques at the measured rotor speeds."""
     instruments: _Rotors
-    """What the speeds that commands explain do."""
+    """Thrusts and torques at the rotor speeds that commands explain."""
 
     @staticmethod
     def create(log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray) -> _Prepared:
