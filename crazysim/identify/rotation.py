@@ -132,7 +132,7 @@ def enlarged(n: int) -> float:
 
 
 class _Prepared(NamedTuple):
-    """One log as the regression uses it: what changes over the two intervals around each sample."""
+    """One log as the regression uses it, with changes over the two intervals around each sample."""
 
     dt: float
     gaps: NDArray
@@ -173,7 +173,7 @@ class _Prepared(NamedTuple):
 
 
 class _Rotors(NamedTuple):
-    """What rotors do over the two intervals around each sample."""
+    """Thrusts and torques of rotors over the two intervals around each sample."""
 
     impulse: NDArray
     """Integral of the torque of the thrusts about x and y, and of the drag about z, N m s. (n, 3)"""
