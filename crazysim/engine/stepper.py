@@ -91,6 +91,16 @@ class Stepper:
         feedforward = None if feedforward is None else placed(data, feedforward)
         self._data = stage_command(data, placed(data, command), feedforward)
 
+    @property
+    def synced(self) -> bool:
+        """True if the scene matches the data: a sync has set ``core.mjx_synced`` since the data last changed.
+
+        The flag is compared by identity with the one that is known to be false, which never waits for the device.
+        """
+        data = self._data
+        flag = data.leaves[data.plan.synced] if isinstance(data, FlatData) else self.data.core.mjx_synced
+        return flag is not self._unsynced
+
     def assign(self, data: SimData) -> None:
         """Take data from outside: put it on the device, and clear ``core.mjx_synced``."""
         if self._data is None or data.core.steps is not self.data.core.steps:

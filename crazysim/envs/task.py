@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from jax import Array
 
@@ -12,7 +12,6 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, Placement
 from crazysim.core.settings import check_settings, setting
 from crazysim.envs.state import Obs
-from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.sim.sim import Sim
 
@@ -48,20 +47,6 @@ class Task:
     """Error below which the task counts as done, in ``unit``."""
     hold: float = setting(default=1.0, low=0.0)
     """Time at the end of an episode during which the error must stay below the tolerance, s."""
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Refuse the record of functions that ``Task`` was in version 0.1.
-
-        Raises:
-            ConfigError: If the base class itself is called.
-        """
-        del args, kwargs
-        if cls is Task:
-            raise ConfigError(
-                "expected a subclass of Task, got Task itself, which took functions of all worlds up to version 0.1. "
-                "Write a frozen dataclass with methods for one world: docs/guides/tasks.md"
-            )
-        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a simulation.

@@ -13,7 +13,6 @@ from jax import Array
 
 from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
-from crazysim.engine.backends import fused
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.query import Query, query
 from crazysim.scene import contact_report
@@ -22,7 +21,6 @@ from crazysim.scene.contact_report import ContactReport, ObjectSelection
 from crazysim.scene.depth import Along
 from crazysim.scene.mocap import MocapPoses, with_mocap_bodies
 from crazysim.scene.objects import Handle
-from crazysim.scene.rays import RayKernels
 from crazysim.scene.scene import Scene
 
 MAX_SIZE = 256
@@ -33,18 +31,10 @@ for any number, and 1.4 times as long in each call."""
 class SceneQueries:
     """Queries with the arguments seen so far, compiled until the scene changes."""
 
-    def __init__(self, scene: Scene, platform: str | None, strict: bool = False):
-        """Take the scene.
-
-        Args:
-            scene: The scene.
-            platform: Platform whose kernels may run the queries; None to use XLA only.
-            strict: True to raise an error where XLA would be used with an ``EngineWarning``.
-        """
-        self._scene, self._strict = scene, strict
+    def __init__(self, scene: Scene):
+        """Take the scene."""
+        self._scene = scene
         self._reported: set[str] = set()
-        self._platform = None if platform is None or fused.missing(platform) else platform
-        scene.ray_kernels = RayKernels(self._platform, strict)
         self._compiled: tuple[mujoco.MjModel | None, dict[tuple[Any, ...], Callable[..., Any]]] = None, {}
 
     def contact_report(self, data: SimData, objects: ObjectSelection, floor: bool, drones: bool) -> ContactReport:
@@ -85,7 +75,8 @@ class SceneQueries:
     def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
         """Return the contacts of all worlds as a function of data and mocap poses, by one kernel where possible."""
         # The data come with the objects of plugins at their poses.
-        model, platform = self._scene.collision_model, self._platform
+        model, kernels = self._scene.collision_model, self._scene.ray_kernels
+        platform = kernels.platform
         by_xla = contact_report.build(model, objects, floor, drones)
         if platform is None or contact_report.size_of(model, objects) > MAX_SIZE:
             return by_xla
@@ -105,7 +96,7 @@ class SceneQueries:
                 if not isinstance(error, LimitError):
                     problem = f"the contact report has no kernel: {error.reason}"
                     remedy = "Leave out the geoms that need it with objects="
-                    report_unsupported([problem], self._strict, self._reported, remedy)
+                    report_unsupported([problem], kernels.strict, self._reported, remedy)
                 return by_xla(data, mocap)
 
         return contacts

@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
 from crazysim.engine.mapped import mapped
 from crazysim.errors import UnsupportedError
@@ -317,6 +319,19 @@ class RayKernels:
     """Description of what cast rays last, for ``Sim.explain``."""
     reported: set[str] = dataclasses.field(default_factory=set)
     """Warnings that were given."""
+
+    @classmethod
+    def choose(cls, engine: str, device: jax.Device, mesh: Mesh | None, strict: bool) -> RayKernels:
+        """Return the choice for a simulation: kernels where its engine may use them, on one device that has them.
+
+        Args:
+            engine: Engine of its steps, one of ``crazysim.engine.ENGINES``.
+            device: Device of its data.
+            mesh: Devices over which its worlds are spread instead; None for one.
+            strict: True to raise an error where XLA would be used with an ``EngineWarning``.
+        """
+        has_kernels = mesh is None and engine in ("auto", "fused") and not fused.missing(device.platform)
+        return cls(device.platform if has_kernels else None, strict)
 
     def run(self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets) -> list[Array]:
         """Return the results of a function of one ray for ``n`` rays; see ``mapped``."""

@@ -33,8 +33,8 @@ LARGE_SWARM = 64
 class Scene:
     """MuJoCo's side of a simulation.
 
-    The scene is updated lazily: ``sync`` does so for all worlds when contacts are requested and anything has changed
-    since, ``sync_one`` for the world of an image. Nothing is allocated per world before the first ``contacts``.
+    The scene is updated lazily: ``sync`` does so for all worlds when contacts are requested and the data's flag is
+    clear, ``sync_one`` for the world of an image. Nothing is allocated per world before the first ``contacts``.
     """
 
     spec: mujoco.MjSpec
@@ -47,8 +47,11 @@ class Scene:
     """Objects that were added with ``add``."""
     plugins: Placing
     """Returns the plugins of the simulation, some of which place objects."""
+    ray_kernels: RayKernels
+    """Choice of what casts rays and answers contact reports."""
     revision: int
-    """Number of changes of the objects and mocap ids that the data hold."""
+    """Number of edits of the spec. The compiled model is that of one of them, and so are the objects and mocap ids in
+    the data."""
 
     def __init__(
         self,
@@ -59,7 +62,8 @@ class Scene:
         freq: int,
         device: jax.Device,
         mesh: Mesh | None,
-        plugins: Placing = tuple,
+        plugins: Placing,
+        ray_kernels: RayKernels,
     ):
         """Build and compile the spec.
 
@@ -72,6 +76,7 @@ class Scene:
             device: Device of the scene of all worlds.
             mesh: Devices over which the worlds are spread instead; None for one device.
             plugins: Returns the plugins of the simulation, some of which place objects.
+            ray_kernels: Choice of what casts rays and answers contact reports.
 
         Raises:
             ConfigError: If the scene cannot be read or compiled.
@@ -83,9 +88,9 @@ class Scene:
         self.spec = build.build_spec(xml_path, airframes, freq, self.max_geom_pairs)
         self.added = SceneObjects(n_worlds)
         self.plugins = plugins
-        self.ray_kernels = RayKernels()
-        self.revision = 0
-        self.compile()
+        self.ray_kernels = ray_kernels
+        self.revision = self._compiled = 0
+        self._compile()
 
     def add(
         self,
@@ -116,7 +121,6 @@ class Scene:
             ConfigError: If a name is taken, MJCF does not compile (with the compiler's words), or a setting is invalid.
         """
         handle = self.added.add(self.spec, what, name, count, pos, quat, mocap, options)
-        self.edited = True
         self.revision += 1
         return handle
 
@@ -126,6 +130,21 @@ class Scene:
         Raises:
             ConfigError: If the spec does not compile or lacks a drone; the scene stays as it was then.
         """
+        self._compile()
+        self.revision += 1  # the spec may have been edited by hand
+        self._compiled = self.revision
+
+    def compile_if_edited(self) -> None:
+        """Compile the spec if objects were added since the last compilation."""
+        if self._is_edited:
+            self._compile()
+            self._compiled = self.revision
+
+    @property
+    def _is_edited(self) -> bool:
+        return self._compiled != self.revision
+
+    def _compile(self) -> None:
         self.spec.numeric("max_geom_pairs").data = [self.max_geom_pairs]
         mj_model = build.compile_spec(self.spec)
         drone_ids = build.mocap_ids(mj_model, [f"drone:{i}" for i in range(self.n_drones)])
@@ -136,14 +155,6 @@ class Scene:
         self._mjx = MjxScene(mj_model, self.n_worlds, self.device, self.mesh)
         self._collision_model: CollisionModel | None = None
         self._visual_model: CollisionModel | None = None
-        self.edited = False
-        self.revision += 1
-        self.invalidate()
-
-    def compile_if_edited(self) -> None:
-        """Compile the spec if objects were added since the last compilation."""
-        if self.edited:
-            self.compile()
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -160,12 +171,12 @@ class Scene:
     @property
     def drone_mocap_ids(self) -> list[int]:
         """Mocap id of each drone's body, as in the next compiled model. (n_drones,)"""
-        return self._ids([f"drone:{i}" for i in range(self.n_drones)]) if self.edited else self._drone_ids
+        return self._ids([f"drone:{i}" for i in range(self.n_drones)]) if self._is_edited else self._drone_ids
 
     def objects(self, before: Objects | None) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects."""
         movable = self.added.movable
-        return self.added.record(before, self._ids(movable) if self.edited else self._object_ids)
+        return self.added.record(before, self._ids(movable) if self._is_edited else self._object_ids)
 
     def _ids(self, names: Sequence[str]) -> list[int]:
         """Return mocap ids in the spec, which are those of the compiled model; nothing is compiled.
@@ -273,10 +284,9 @@ class Scene:
         self.compile_if_edited()
         return self._mjx.data
 
-    @mjx_data.setter
-    def mjx_data(self, mjx_data: mjx.Data) -> None:
+    def assign_mjx(self, mjx_data: mjx.Data) -> None:
+        """Take ``mjx_data`` of a user; ``Sim.mjx_data`` also clears the flag of the data."""
         self._mjx.data = mjx_data
-        self.invalidate()
 
     @property
     def is_allocated(self) -> bool:
@@ -293,27 +303,16 @@ class Scene:
         return self._mjx.poses()[:2]
 
     def shard(self, mesh: Mesh) -> None:
-        """Spread the scene of all worlds over devices."""
-        self.mesh = mesh
+        """Spread the scene of all worlds over devices, where XLA answers queries."""
+        self.mesh, self.ray_kernels = mesh, RayKernels()
         self._mjx.shard(mesh)
-        self.invalidate()
-
-    def invalidate(self) -> None:
-        """Mark the scene as out of date."""
-        self._synced = False
 
     def sync(self, data: SimData) -> SimData:
-        """Bring ``mjx_data`` up to date in all worlds, and return the data with ``core.mjx_synced`` set.
-
-        Whether a sync is due is a flag on the host, so the call does not wait for the device.
-        """
+        """Bring ``mjx_data`` up to date in all worlds, and return the data with ``core.mjx_synced`` set."""
         self.compile_if_edited()
-        if not self._synced:
-            first = not self._mjx.is_allocated
-            with announced("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
-                data = self._mjx.sync(data)
-            self._synced = True
-        return data
+        first = not self._mjx.is_allocated
+        with announced("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
+            return self._mjx.sync(data)
 
     def sync_one(self, data: SimData, world: int) -> None:
         """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used.

@@ -44,6 +44,7 @@ from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
+from crazysim.scene.rays import RayKernels
 from crazysim.scene.render import Viewer
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
@@ -164,11 +165,14 @@ class Sim:
         self.device, self.mesh, self.engine = c.device, mesh, engine
 
         self.plugins = PluginRegistry(self)  # type: ignore[arg-type]  # properties serve as attributes
-        worlds = self.n_worlds, self.n_drones
-        self._scene = Scene(xml_path, self.airframes, *worlds, self.freq, self.device, mesh, self.plugins.values)
-        self._revision = self._scene.revision
+        kernels = RayKernels.choose(engine, self.device, mesh, strict)
+        self._scene = Scene(
+            xml_path, self.airframes, self.n_worlds, self.n_drones, self.freq, self.device, mesh, self.plugins.values,
+            kernels,
+        )  # fmt: skip
+        self._adopted = self._scene.revision
         self._stepper = Stepper(self.device, mesh, engine, strict)
-        self._queries = self._new_queries()
+        self._queries = SceneQueries(self._scene)
         self._seed = as_key(rng_key)
         self.build_data()
         self._default_data = self._stepper.data
@@ -247,10 +251,6 @@ class Sim:
 
     # Data -------------------------------------------------------------------------------------------------------------
 
-    def _new_queries(self) -> SceneQueries:
-        kernels = self.mesh is None and self.engine in ("auto", "fused")
-        return SceneQueries(self._scene, self.device.platform if kernels else None, self.configuration.strict)
-
     @property
     def data(self) -> SimData:
         """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``.
@@ -266,7 +266,6 @@ class Sim:
     def data(self, data: SimData) -> None:
         self.configuration.check(data, self._default_data)
         self._stepper.assign(data)
-        self._scene.invalidate()
 
     @property
     def default_data(self) -> SimData:
@@ -281,10 +280,10 @@ class Sim:
 
     def _adopt_scene(self) -> None:
         """Give the data the objects and mocap ids of an edited scene; the scene itself is not compiled."""
-        if self._revision == self._scene.revision:
+        if self._adopted == self._scene.revision:
             return
         with self.lock, jax.ensure_compile_time_eval():  # data that are first read inside a user's trace stay arrays
-            self._revision = self._scene.revision
+            self._adopted = self._scene.revision
             self.data = self._with_scene(self._stepper.data)
             self._default_data = self._stepper.to_device(self._with_scene(self._default_data))
 
@@ -306,7 +305,6 @@ class Sim:
             self._seed, c.controller,
         )  # fmt: skip
         self._stepper.assign(data.replace(objects=self._scene.objects(None)))
-        self._scene.invalidate()
         self.plugins.build_records()
         return self.data
 
@@ -323,7 +321,7 @@ class Sim:
         self.data = shard(self.data, mesh)
         self.default_data = shard(default, mesh)
         self._scene.shard(mesh)
-        self._queries = self._new_queries()
+        self._queries = SceneQueries(self._scene)
         self.build_step_fn()
         return self.data
 
@@ -491,7 +489,6 @@ class Sim:
         self.plugins.check()
         self._steps.fn()
         self._stepper.advance(n_steps)
-        self._scene.invalidate()
 
     @locked
     def rollout(
@@ -529,7 +526,7 @@ class Sim:
             self.step_fn, self.data, policy, params, n_control_steps, flag("progress", progress), every,
             n_substeps=n_substeps, keep=keep,
         )  # fmt: skip
-        self._advance(data)
+        self._stepper.accept(data)
         return kept
 
     def explain(self, measure: bool = False) -> str:
@@ -553,12 +550,7 @@ class Sim:
         Raises:
             ConfigError: If the mask has another shape or type.
         """
-        self._advance(self.reset_fn(self.data, self.default_data, mask))
-
-    def _advance(self, data: SimData) -> None:
-        """Take data that a compiled call returned."""
-        self._stepper.accept(data)
-        self._scene.invalidate()
+        self._stepper.accept(self.reset_fn(self.data, self.default_data, mask))
 
     # Scene ------------------------------------------------------------------------------------------------------------
 
@@ -598,7 +590,7 @@ class Sim:
 
     @mjx_data.setter
     def mjx_data(self, mjx_data: mjx.Data) -> None:
-        self._scene.mjx_data = mjx_data
+        self._scene.assign_mjx(mjx_data)
         self.data = self.data
 
     @property
@@ -647,10 +639,11 @@ class Sim:
         Raises:
             ValueError: If the world does not exist.
         """
-        if world is None:
-            self._stepper.data = self._scene.sync(self._placed())
-        else:
-            self._scene.sync_one(self._placed(), world)
+        data = self._placed()
+        if world is not None:
+            self._scene.sync_one(data, world)
+        elif not self._stepper.synced:
+            self._stepper.data = self._scene.sync(data)
 
     def _placed(self) -> SimData:
         """Return the data with the objects of plugins, such as loads, at their poses."""

@@ -123,10 +123,10 @@ def test_hooks_change_actions_and_remember(env):
 
 
 def test_wrappers_that_step_the_environment_themselves_are_refused():
-    """They were written so in version 0.1."""
-    with pytest.raises(ConfigError, match=r"expected hooks for one world, got Old\.step\. Override before_step"):
+    """Gymnasium's are written so."""
+    with pytest.raises(ConfigError, match=r"expected hooks for one world, got Counting\.step\. Override before_step"):
 
-        class Old(Wrapper):
+        class Counting(Wrapper):
             def step(self, state, action):
                 return self.env.step(state, action)
 

@@ -202,6 +202,26 @@ def test_the_flag_of_the_data_follows(two):
             assert not bool(two.data.core.mjx_synced), name
 
 
+def test_an_edit_of_the_scene_has_the_next_question_sync_once(syncs):
+    """An edit compiles the scene at the next question, and clears the one flag, whoever asks for the data first."""
+    sim = Sim(n_worlds=2)
+    edits = {
+        "add": lambda: sim.scene.add("sphere", pos=(0.0, 0.0, 9.0)),
+        "build_mjx": sim.build_mjx,
+        "the model before the data": lambda: (sim.scene.add("box", pos=(9.0, 0.0, 1.0)), sim.mj_model),
+    }
+    for name, edit in edits.items():
+        sim.contacts()
+        assert sim.data.core.mjx_synced, name
+        syncs.clear()
+        edit()
+        assert not sim.data.core.mjx_synced, name
+        for _ in range(2):
+            sim.contacts()
+            assert sim.data.core.mjx_synced, name
+        assert len(syncs) == 1, name
+
+
 def test_clearing_the_flag_reads_nothing_and_compiles_nothing(two):
     """Whatever the flag is, it is exchanged; one that is known to be clear stays, so that edits cost no transfer."""
     fresh(two, UP, UP)
@@ -452,6 +472,7 @@ class AnyOrder(RuleBasedStateMachine):
     @precondition(lambda self: hasattr(self, "ball"))
     @rule()
     def ask(self):
+        assert bool(self.sim.data.core.mjx_synced) != self.changed, "the flag says whether a question syncs"
         z = np.asarray(self.sim.data.states.pos[:, 0, 2]) + 0.02
         expected = (z < 0.086) | (np.abs(z - self.ball) < 0.186)
         done = []

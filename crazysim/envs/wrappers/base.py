@@ -29,7 +29,7 @@ class Wrapper(Hooks, Env):
         self.name = self.name or type(self).__name__
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Refuse wrappers of version 0.1, which stepped the environment inside.
+        """Refuse wrappers that step the environment themselves, which is compiled as a whole.
 
         Raises:
             ConfigError: If the class overrides reset, restart or step without being an automatic reset.

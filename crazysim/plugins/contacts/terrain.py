@@ -158,5 +158,4 @@ def _put(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos
     if not plugin.floor:
         for other in [g for g in spec.worldbody.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
             spec.delete(other)
-    scene.edited = True
     scene.revision += 1
