@@ -1,8 +1,6 @@
-"""Errors, under the path of Crazyflow; they are defined in ``crazysim.errors``."""
+"""Errors, where Crazyflow has them."""
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
-
-CrazyflowError = ConfigError
-"""Crazyflow's base class: ``except CrazyflowError`` catches what is wrong with a configuration."""
+from crazysim.errors import ConfigError as CrazyflowError
 
 __all__ = ["ConfigError", "CrazyflowError", "RenderError", "UnknownNameError"]

@@ -30,12 +30,51 @@ def test_public_names_exist_once():
     assert crazysim.__version__ == PROJECT["version"]
 
 
+ALIASES = {
+    "control.parameters": ["dynamics.parameter_tables"],
+    "dynamics.parameters": ["dynamics.parameter_tables"],
+    "exception": ["errors"],
+    "sim.data": ["control", "core.controls", "core.data", "sim.crazyflow"],
+    "sim.dynamics": ["core.stages"],
+    "sim.functional": ["core.functional"],
+    "sim.integration": ["core.integration"],
+    "sim.pipeline": ["core.pipeline"],
+    "sim.sensors.depth": ["sim.crazyflow"],
+    "sim.sharding": ["core.sharding"],
+    "utils": ["cache", "core.data", "pytree", "sim.crazyflow"],
+}
+"""Import paths of Crazyflow that only name what other modules define, and these modules."""
+
+
+def is_alias(statement):
+    """Return whether a statement is a docstring, an import, or the list of public names."""
+    if isinstance(statement, ast.Assign):
+        return [ast.unparse(target) for target in statement.targets] == ["__all__"]
+    is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+    return is_text or isinstance(statement, ast.ImportFrom)
+
+
+def test_import_paths_of_crazyflow_are_aliases_without_logic():
+    aliases = {}
+    for source in SOURCES:
+        statements = ast.parse(source.read_text()).body
+        homes = {x.module.removeprefix("crazysim.") for x in statements if isinstance(x, ast.ImportFrom)}
+        if source.name != "__init__.py" and all(map(is_alias, statements)):
+            aliases[".".join(source.relative_to(ROOT / "crazysim").with_suffix("").parts)] = sorted(homes)
+    assert aliases == ALIASES
+    for path, homes in ALIASES.items():
+        module = importlib.import_module(f"crazysim.{path}")
+        defined = [x for home in homes for x in vars(importlib.import_module(f"crazysim.{home}")).values()]
+        assert all(any(getattr(module, name) is x for x in defined) for name in module.__all__), path
+
+
 @pytest.mark.parametrize(
     "path", ["sim.Sim", "sim.data.SimData", "sim.functional.state_control", "sim.pipeline.append_fn",
              "sim.sim.sync_sim2mjx", "sim.sim.use_box_collision", "sim.visualize.draw_line", "sim.sharding.world_mesh",
-             "sim.sensors.depth.render_depth",
-             "control.Control", "dynamics.Dynamics", "drones.Drone",
-             "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.ConfigError"],
+             "sim.integration.rk4", "sim.sensors.depth.render_depth", "sim.dynamics.so_rpy_rotor_drag_dynamics",
+             "control.Control", "control.parameters.load_params", "dynamics.Dynamics",
+             "dynamics.parameters.load_fn_params", "drones.Drone", "utils.leaf_replace", "utils.enable_cache",
+             "dynamics.supported_drones", "dynamics.supported_dynamics", "exception.CrazyflowError"],
 )  # fmt: skip
 def test_the_peers_import_paths_lead_somewhere(path):
     module, _, name = path.rpartition(".")

@@ -1,4 +1,4 @@
-"""Records of a simulation, under the path that Crazyflow uses."""
+"""Records of a simulation, where Crazyflow has them."""
 
 from crazysim.control import Control
 from crazysim.core.controls import (
@@ -9,9 +9,7 @@ from crazysim.core.controls import (
     StateControlData,
 )
 from crazysim.core.data import SimCore, SimData, SimParams, SimState, SimStateDeriv
-
-ControlData = StateControlData | AttitudeControlData | BodyRateControlData | ForceTorqueControlData
-"""Records of controllers."""
+from crazysim.sim.crazyflow import ControlData
 
 __all__ = [
     "AttitudeControlData",

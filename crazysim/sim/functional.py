@@ -1,4 +1,4 @@
-"""Commands as pure functions, under the path that Crazyflow uses."""
+"""Commands as pure functions, where Crazyflow has them."""
 
 from crazysim.core.functional import (
     attitude_control,

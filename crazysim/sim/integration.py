@@ -1,15 +1,5 @@
-"""Integrators, under the path that Crazyflow uses."""
+"""Integrators, where Crazyflow has them."""
 
-from crazysim.core.integration import (
-    Integrator,
-    euler,
-    rk4,
-    symplectic_euler,
-)
+from crazysim.core.integration import Integrator, euler, rk4, symplectic_euler
 
-__all__ = [
-    "Integrator",
-    "euler",
-    "rk4",
-    "symplectic_euler",
-]
+__all__ = ["Integrator", "euler", "rk4", "symplectic_euler"]

@@ -17,7 +17,7 @@ from crazysim.core.functional import stage_command
 from crazysim.core.settings import positive
 from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
-from crazysim.dynamics.parameters import rotor_vel_limits
+from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step
 from crazysim.errors import ConfigError

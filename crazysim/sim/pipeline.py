@@ -1,4 +1,4 @@
-"""Editing of pipelines, under the path that Crazyflow uses."""
+"""Functions that edit pipelines, where Crazyflow has them."""
 
 from crazysim.core.pipeline import (
     Pipeline,
@@ -10,12 +10,4 @@ from crazysim.core.pipeline import (
     replace_fn,
 )
 
-__all__ = [
-    "Pipeline",
-    "append_fn",
-    "insert_fn_after",
-    "insert_fn_before",
-    "prepend_fn",
-    "remove_fn",
-    "replace_fn",
-]
+__all__ = ["Pipeline", "append_fn", "insert_fn_after", "insert_fn_before", "prepend_fn", "remove_fn", "replace_fn"]

@@ -1,0 +1,96 @@
+"""Functions that only users of Crazyflow call; the modules with its import paths name them."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.core.controls import AttitudeControlData, BodyRateControlData, ForceTorqueControlData, StateControlData
+from crazysim.core.settings import as_mask
+from crazysim.errors import ConfigError
+from crazysim.pytree import PyTree, n_batch_axes, scopes, select_worlds
+from crazysim.sim.sim import Sim
+
+Record = TypeVar("Record", bound=PyTree)
+Tree = TypeVar("Tree")
+
+ControlData = StateControlData | AttitudeControlData | BodyRateControlData | ForceTorqueControlData
+"""Records of controllers."""
+
+
+def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) -> Record:
+    """Return a copy of a record with fields replaced in the worlds of a mask.
+
+    Args:
+        record: Record whose named fields begin with an axis over worlds, or broadcast to one.
+        mask: True in the worlds to change; None for all. (n_worlds,)
+        **changes: New values. (n_worlds, ...)
+
+    Raises:
+        ConfigError: If the mask has another shape or type.
+    """
+    return record.replace(**{name: _selected(mask, new, getattr(record, name)) for name, new in changes.items()})
+
+
+def world_mask(tree: Tree) -> Tree:
+    """Return the tree with True in place of every leaf that has an axis over worlds, False in place of others."""
+    return jax.tree.map(lambda scope: n_batch_axes(scope) > 0, scopes(tree))
+
+
+def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None = None) -> Tree:
+    """Return a tree whose batched leaves are those of another tree in the worlds of a mask.
+
+    Args:
+        tree: Tree to change.
+        new_tree: Tree of the same structure with the new values.
+        batched: Tree of bools, True for the leaves to replace, such as ``world_mask`` returns.
+        mask: True in the worlds to change; None for all. (n_worlds,)
+
+    Raises:
+        ConfigError: If the mask has another shape or type.
+    """
+    return jax.tree.map(
+        lambda old, new, is_batched: _selected(mask, new, old) if is_batched else old,
+        tree,
+        new_tree,
+        batched,
+    )
+
+
+def render_depth(
+    sim: Sim, camera: int | str = 0, resolution: tuple[int, int] = (100, 100), include_drone: bool = False
+) -> Array:
+    """Return the depth image of one camera in every world, m: along the ray, -1 where it meets nothing.
+
+    ``sim.depth`` returns the images of all drones' cameras at once, and hides each drone from its own camera only.
+
+    Args:
+        sim: Simulation.
+        camera: Id or name; 0 is ``track_cam:0``.
+        resolution: Width and height, pixels.
+        include_drone: True to show drones, including the one that carries the camera.
+
+    Raises:
+        ValueError: If the camera does not exist, the name means several cameras, or the resolution is invalid.
+    """
+    try:
+        width, height = resolution
+    except (TypeError, ValueError):
+        raise ConfigError(f"expected a resolution of width and height, pixels, got {resolution!r}") from None
+    depth = sim.depth(camera, width, height, drones=include_drone, hide_own=False, along="ray")
+    if depth.shape[1] > 1:
+        raise ConfigError(
+            f"expected one camera, got {depth.shape[1]} for {camera!r}. Use one such as '{camera}:0', or sim.depth."
+        )
+    return jnp.where(jnp.isfinite(depth[:, 0]), depth[:, 0], -1.0)
+
+
+def _selected(mask: Any, new: Any, old: Any) -> Array:
+    """Return new values in the worlds of a mask, and old ones elsewhere; the mask is checked."""
+    new = jnp.asarray(new)
+    n_worlds = np.broadcast_shapes(new.shape, np.shape(old))[:1]
+    return select_worlds(as_mask(mask, n_worlds), new, old)
