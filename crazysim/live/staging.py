@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.control import Control
+from crazysim.core.functional import staged_leaves
 from crazysim.sim.sim import Sim
 
 UNSET = np.eye(16)[12]
@@ -50,10 +51,7 @@ class StagedCommands:
 
 def _present(sim: Sim) -> NDArray:
     """Return the staged commands; of drones that have had no state command, hovering where they are."""
-    controls = sim.data.controls
-    if sim.control == Control.rotor_vel:
-        return np.array(controls.rotor_vel, float)
-    command = np.array(getattr(controls, sim.control.value).staged_cmd, float)
+    command = np.array(staged_leaves(sim.data)[0], float)
     if sim.control == Control.state:
         unset = (command == UNSET).all(-1)
         command[unset, :3] = np.asarray(sim.data.states.pos, float)[unset]

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from crazysim.core.functional import feedforward_of, stage_command, staged_leaves
 from crazysim.eager import to_host
 from crazysim.errors import ConfigError
 from crazysim.media.flight import SAMPLE, SCENE, Flight, pack_sample, pack_scene
@@ -195,7 +196,7 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
     old = {"pos": data.states.pos, "quat": data.states.quat, "steps": data.core.steps}
     new = {"pos": now["pos"], "quat": now["quat"], "steps": np.full((len(worlds), 1), round(time * sim.freq), np.int32)}
     if controls.state is not None and now["setpoint"].size:
-        old["setpoint"], new["setpoint"] = controls.state.staged_cmd, now["setpoint"]
+        old["setpoint"], new["setpoint"] = staged_leaves(data)[0], now["setpoint"]
     if objects is not None:
         columns = np.searchsorted(flight.body_ids, np.asarray(objects.mocap_ids))
         old |= {"body_pos": objects.pos, "body_quat": objects.quat}
@@ -203,12 +204,15 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
     changed = _with_worlds(old, worlds, new)
     states = data.states.replace(pos=changed["pos"], quat=changed["quat"])
     core = data.core.replace(steps=changed["steps"])
-    if "setpoint" in changed:
-        controls = controls.replace(state=controls.state.replace(staged_cmd=changed["setpoint"]))
     if objects is not None:
         recorded = any(plugin.places for plugin in sim.plugins.values())
         objects = objects.replace(pos=changed["body_pos"], quat=changed["body_quat"], recorded=recorded)
-    sim.data = data.replace(states=states, core=core, controls=controls, objects=objects)
+    data = data.replace(states=states, core=core, objects=objects)
+    if "setpoint" in changed:
+        command, (_, *before) = changed["setpoint"], staged_leaves(data)
+        feedforward = [x.at[worlds].set(feedforward_of(command)[worlds]) for x in before]  # those of other worlds stay
+        data = stage_command(data, command, *feedforward)
+    sim.data = data
     body_pos, body_quat = _bodies(sim, worlds)
     if not (np.allclose(body_pos, now["body_pos"], atol=1e-6) and np.allclose(body_quat, now["body_quat"], atol=1e-6)):
         ids = np.ix_(worlds, _body_ids(sim))  # some are moved through mjx_data

@@ -96,15 +96,14 @@ class Member:
             staged = self._with_checked_row(f"command of {self.name}", getattr(record, plugin.command_field), command)
             self._sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
             return
-        controls, level = data.controls, data.controls.mode
-        staged: Any = controls.rotor_vel if level == Control.rotor_vel else getattr(controls, level.value).staged_cmd
+        level = data.controls.mode
+        staged, *before = F.staged_leaves(data)
         if level == Control.rotor_vel:
             command = self._for_rotors(command, command_shape(data, level)[-1])
         staged = self._with_checked_row(f"{level.value} command of {self.name}", staged, command)
-        before, feedforward = getattr(controls.state, "staged_feedforward", None), None
-        if before is not None:  # that of the other drones stays
-            feedforward = _with_row(before, self.index, _row(F.feedforward_of(staged), self.index))
-        self._stage(staged, feedforward)
+        # the feedforward of the other drones stays
+        feedforward = [_with_row(x, self.index, _row(F.feedforward_of(staged), self.index)) for x in before]
+        self._stage(staged, *feedforward)
 
     def _for_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
         """Return rotor speeds with zeros for rotors that other drones of the simulation have."""

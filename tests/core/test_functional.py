@@ -1,11 +1,15 @@
 """The functional API stages commands for their own level, and reports ticks correctly."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import PAIRS, send, shared_sim, trees_equal
 
+import crazysim
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
 from crazysim.errors import ConfigError
@@ -125,6 +129,14 @@ def test_controllable_is_per_world(dynamics, control):
         expected = [[step % period == 0] for step in steps]
         np.testing.assert_array_equal(F.controllable(at), expected)
         assert F.controllable(at).dtype == bool
+
+
+def test_commands_are_staged_in_one_function():
+    """Fields of staged commands are written by ``stage_command``, where they are made, and by loops for inner ones."""
+    sources = (Path(crazysim.__file__).parent).rglob("*.py")
+    writes = re.compile(r"staged_(cmd|feedforward)\"?(=|: )(?!Array)")
+    written = {".".join(source.parts[-2:]) for source in sources if writes.search(source.read_text())}
+    assert written == {"core.functional.py", "core.controls.py", "core.stages.py", "core.controllers.py"}
 
 
 def test_controllable_works_inside_jit():

@@ -150,6 +150,15 @@ def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     other.close()
 
 
+def test_setpoints_are_put_without_the_feedforward_of_earlier_ones(flight):
+    """That of the worlds that the flight has not stays."""
+    other = build()
+    other.state_control(pos=[0.0, 0.0, 1.0], feedforward=np.ones((3, 2, 8)))
+    put(other, flight, 0.25)
+    found = np.asarray(other.data.controls.state.staged_feedforward)
+    np.testing.assert_array_equal(found, np.broadcast_to(np.array([0.0, 1.0, 0.0])[:, None, None], (3, 2, 8)))
+
+
 def test_objects_with_handles_are_recorded_and_put_back():
     """A box that is moved through its handle is where it was in each world, in a new simulation too."""
 
