@@ -81,6 +81,14 @@ def test_the_peers_import_paths_lead_somewhere(path):
     assert hasattr(importlib.import_module(f"crazysim.{module}"), name)
 
 
+def test_gravity_is_written_once():
+    """In numbers of the code; an MJCF text has its own."""
+    named = [source for source in SOURCES if "9.81" in source.read_text()]
+    nodes = [(source, node) for source in named for node in ast.walk(ast.parse(source.read_text()))]
+    places = [source.stem for source, node in nodes if isinstance(node, ast.Constant) and node.value == 9.81]
+    assert places == ["airframe"]
+
+
 def test_extras_are_never_imported_at_module_level():
     extras = {"matplotlib", "imageio_ffmpeg", "tqdm", "casadi", "viser", "trimesh", "onnx", "pettingzoo", "brax"}
     extras |= {"stable_baselines3", "torch"}

@@ -16,13 +16,12 @@ from crazysim.control.auto import Auto
 from crazysim.control.bandwidth import authority, precession, rotor_rate
 from crazysim.control.controllers import CASCADE, find_controller
 from crazysim.drones import Airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics, supported_dynamics
 from crazysim.dynamics.models import require_freq
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import replacing
 
-GRAVITY = 9.81
-"""Gravitational acceleration, m/s^2."""
 STATE = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
 """Controllers that follow state commands, besides Crazyflow's cascade."""
 QUARTER_TURN = np.pi / 2
@@ -80,14 +79,14 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
 
 def _ratio(airframe: Airframe) -> float:
     """Return the largest thrust without a torque over the weight, 1."""
-    return level_thrust(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY)
+    return level_thrust(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
 
 
 def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     """Yield mass, thrust and what follows from them and the rotors' positions."""
     mass, ratio = float(airframe.value("rigid_body.mass")), _ratio(airframe)
     most, least = (float(airframe.value(f"rotors.thrust_{end}")) for end in ("max", "min"))
-    hover = mass * GRAVITY / airframe.n_rotors
+    hover = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
     yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {least:.3g} to {most:.3g} N"
     positions = airframe.value("rotors.position")
     wheelbase = np.max(np.linalg.norm(positions[:, None] - positions, axis=-1))

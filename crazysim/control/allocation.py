@@ -8,6 +8,7 @@ from jax import Array
 
 from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec, safe_clip
@@ -57,7 +58,7 @@ def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
     Raises:
         ConfigError: If the airframe has no thrust curve.
     """
-    thrust = float(airframe.value("rigid_body.mass", ())) * 9.81 / airframe.n_rotors
+    thrust = float(airframe.value("rigid_body.mass", ())) * GRAVITY_MAGNITUDE / airframe.n_rotors
     return airframe.rotor_vel([thrust])
 
 

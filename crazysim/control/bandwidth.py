@@ -27,6 +27,7 @@ import numpy as np
 from crazysim.control.allocation import hover_arms, hover_rotor_vel
 from crazysim.control.levels import allocation_matrix
 from crazysim.drones import Airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 
 ATTITUDE_STIFFNESS = 0.3
@@ -105,7 +106,7 @@ def authority(airframe: Airframe) -> np.ndarray:
     """
     shares = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
     low, high = (float(airframe.value(f"rotors.thrust_{end}", ())) for end in ("min", "max"))
-    weight = 9.81 * float(airframe.value("rigid_body.mass", ()))
+    weight = GRAVITY_MAGNITUDE * float(airframe.value("rigid_body.mass", ()))
     lift, turn = shares[:, 0], shares[:, 3]
     torques = []
     for axis in (1, 2):

@@ -9,6 +9,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.setpoint import Setpoint
+from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
@@ -49,7 +50,7 @@ class FlatState(PyTree):
 
 
 def flat_state(
-    setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = (0.0, 0.0, -9.81)
+    setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = GRAVITY
 ) -> FlatState:
     """Return attitude, rates and wrench with which a drone without drag flies a setpoint.
 

@@ -19,6 +19,11 @@ TUNED = ("fitted", "controller", "geometric", "mellinger", "pid", "residual")
 """Tables of gains and fits."""
 
 
+GRAVITY_MAGNITUDE = 9.81
+"""Gravitational acceleration, m/s^2: the value with which the airframes were identified, and that of the Crazyflie's
+firmware (``GRAVITY_MAGNITUDE`` in physicalConstants.h)."""
+
+
 class Drone(StrEnum):
     """Names of the built-in airframes."""
 

@@ -6,13 +6,11 @@ import warnings
 
 import numpy as np
 
-from crazysim.drones.airframe import Airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE, Airframe
 from crazysim.drones.keys import GUIDE, LAYOUT
 from crazysim.errors import AirframeWarning, ConfigError, shown
 from crazysim.tables import INERTIA, check_numbers
 
-GRAVITY = 9.81
-"""Gravitational acceleration, m/s^2."""
 MAX_ROTORS = 64
 """Most rotors; the VoloCity, an air taxi, has 18."""
 MAX_THRUST_TO_WEIGHT = 1000
@@ -85,7 +83,7 @@ def _rotors(airframe: Airframe) -> str | None:
     low, high, signs = value("rotors.thrust_min"), value("rotors.thrust_max"), value("rotors.yaw_torque_sign")
     if not low < high:
         return f"expected 0 <= thrust_min < thrust_max, got {low} N and {high} N"
-    if not n * low < mass * GRAVITY < n * high <= MAX_THRUST_TO_WEIGHT * mass * GRAVITY:
+    if not n * low < mass * GRAVITY_MAGNITUDE < n * high <= MAX_THRUST_TO_WEIGHT * mass * GRAVITY_MAGNITUDE:
         return (
             f"expected rotors that lift {mass} kg, between their least and largest thrust and with at most "
             f"{MAX_THRUST_TO_WEIGHT} times its weight, got {n} rotors of {low} to {high} N"
@@ -101,7 +99,7 @@ def _rotors(airframe: Airframe) -> str | None:
             f"expected rotors whose thrusts lift the drone and turn it about {axes}, each alone, got positions (x, y) "
             f"{shown(value('rotors.position')[:, :2].tolist())} m with yaw_torque_sign {shown(signs.tolist())}"
         )
-    hover = np.linalg.pinv(mixing)[:, 0] * mass * GRAVITY
+    hover = np.linalg.pinv(mixing)[:, 0] * mass * GRAVITY_MAGNITUDE
     if not np.all((hover >= low) & (hover <= high)):
         return (
             f"expected rotors that keep the drone level in hover with {low} to {high} N each, got "
@@ -138,7 +136,7 @@ def _curves(airframe: Airframe) -> str | None:
             k0, k1, k2 = np.atleast_2d(numbers["rotors.torque_curve"]).T
             torques = np.array([k0 + speed * (k1 + speed * k2) for speed in (low, high)])
             most = MAX_ANG_ACC * np.min(np.linalg.eigvalsh(airframe.inertia)) / airframe.n_rotors
-            hover = airframe.rotor_vel([numbers["rigid_body.mass"] * GRAVITY / airframe.n_rotors])
+            hover = airframe.rotor_vel([numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE / airframe.n_rotors])
             if not np.all(k1 + 2 * k2 * hover > 0):
                 return (
                     f"expected torque_curve that rises at the speed of hover, got "
@@ -162,7 +160,7 @@ def _curves(airframe: Airframe) -> str | None:
 def _forces(airframe: Airframe) -> str | None:
     """Check drag, and the forces of the fitted models and the battery."""
     numbers, n = airframe.values, airframe.n_rotors
-    weight, most = numbers["rigid_body.mass"] * GRAVITY, n * numbers["rotors.thrust_max"]
+    weight, most = numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE, n * numbers["rotors.thrust_max"]
     for path in ("drag.coefficients", "fitted.so_rpy_rotor_drag.drag_coefficients"):
         if (
             path in numbers

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.drones.checks import GRAVITY, MAX_ROTORS
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.drones.checks import MAX_ROTORS
 from crazysim.errors import ConfigError, shown
 from crazysim.storage import is_file
 from crazysim.tables import POSITIVE, number
@@ -52,7 +53,7 @@ MotorTable = str | Path | Mapping[str, ArrayLike]
 COLUMNS = {
     "throttle": ("throttle", 1.0),
     "thrust_n": ("thrust", 1.0),
-    "thrust_g": ("thrust", 1e-3 * GRAVITY),
+    "thrust_g": ("thrust", 1e-3 * GRAVITY_MAGNITUDE),
     "rpm": ("rpm", 1.0),
     "torque_nm": ("torque", 1.0),
     "power_w": ("power", 1.0),
@@ -307,7 +308,7 @@ def _thrusts(
     rows = {} if table is None else _motor_table(table)
     named = f"motor table {Path(table).name}" if isinstance(table, (str, Path)) else "motor table that was given"
     if table is None:
-        thrust = ratio * mass * GRAVITY / n
+        thrust = ratio * mass * GRAVITY_MAGNITUDE / n
         file.add("rotors", "thrust_max", thrust, "N", "thrust_to_weight", ratio=ratio)
     else:
         thrust = float(np.max(rows["thrust"]))

@@ -8,12 +8,13 @@ from enum import StrEnum
 import numpy as np
 
 from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
 
 RINGING = 1.5
 """Largest product of a rate and a step: Euler steps diverge from 2 on, and a lag overshoots by half its error here."""
-GRAVITY = (0.0, 0.0, -9.81)
-"""Gravitational acceleration, world frame, m/s^2: the value with which the airframes were identified."""
+GRAVITY = (0.0, 0.0, -GRAVITY_MAGNITUDE)
+"""Gravitational acceleration, world frame, m/s^2."""
 
 
 class Dynamics(StrEnum):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.identify.columns import Columns
 from crazysim.identify.motion import body_rates, integral
@@ -19,7 +20,6 @@ from crazysim.identify.motion import body_rates, integral
 if TYPE_CHECKING:
     from crazysim.identify.logs import Log
 
-GRAVITY = 9.81
 RATIOS = (0.5, 2.0)
 """Ratios of measured to expected motion that count as agreement, on each axis that moves. Of the logs of two public
 benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
@@ -183,11 +183,11 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     if data["rotor_vel"].shape[1]:
         squares = np.sum(data["rotor_vel"] ** 2, axis=1)
         middle = float(np.median(squares * axis[:, 2]))
-        thrust = GRAVITY * squares / middle if middle > 0 else np.zeros(len(t))
+        thrust = GRAVITY_MAGNITUDE * squares / middle if middle > 0 else np.zeros(len(t))
         flying = squares > np.median(squares) / 2
     else:
-        thrust, flying = GRAVITY / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
-    expected = integral(thrust[:, None] * axis - [0, 0, GRAVITY], t)
+        thrust, flying = GRAVITY_MAGNITUDE / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
+    expected = integral(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
     ground = np.cumsum(~flying)[:, None] * np.ones(3)
     width, (measured, expected, ground) = _changes(t, 0.25, data["vel"], expected, ground)
     air = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)

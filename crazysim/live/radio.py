@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.drones import load_airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, not_installed
 from crazysim.live.mocap.frames import Frame
 from crazysim.live.swarm import DroneState
@@ -29,7 +30,7 @@ LOG = {
     "acc": ("acc.x", "acc.y", "acc.z"),
 }
 """Log variables of each part of the state."""
-UNITS = {"ang_vel": math.pi / 180, "acc": 9.81}
+UNITS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
 """Units of log variables that are not those of ``DroneState``: degrees/s and multiples of the standard gravity."""
 
 log = logging.getLogger(__name__)

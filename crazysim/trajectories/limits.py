@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import AirframeSource, load_airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.trajectories.approaches import Approach, closest_approaches
-from crazysim.trajectories.peaks import GRAVITY, QUANTITIES, Peak, peaks
+from crazysim.trajectories.peaks import QUANTITIES, Peak, peaks
 from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
@@ -85,7 +86,10 @@ class Limits:
         """
         frame = load_airframe(airframe)
         low, high = (
-            frame.n_rotors * float(frame.value(f"rotors.{key}", ())) / float(frame.value("rigid_body.mass")) / GRAVITY
+            frame.n_rotors
+            * float(frame.value(f"rotors.{key}", ()))
+            / float(frame.value("rigid_body.mass"))
+            / GRAVITY_MAGNITUDE
             for key in ("thrust_min", "thrust_max")
         )
         return dataclasses.replace(

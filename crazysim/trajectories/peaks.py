@@ -9,10 +9,9 @@ import jax
 import numpy as np
 
 from crazysim.control.flatness import attitude_of_thrust
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
-GRAVITY = 9.81
-"""Gravitational acceleration, m/s^2: that of the dynamics and controllers."""
 N_INTERVALS = 64
 """Number of intervals into which each piece is divided by the samples."""
 REFINED_PART = 0.05
@@ -40,11 +39,11 @@ class Quantity:
 
 
 def _specific_thrust(acc: Floats) -> Floats:
-    return acc[..., :3] + np.array([0.0, 0.0, GRAVITY])
+    return acc[..., :3] + np.array([0.0, 0.0, GRAVITY_MAGNITUDE])
 
 
 def _thrust(acc: Floats) -> Floats:
-    return np.linalg.norm(_specific_thrust(acc), axis=-1) / GRAVITY
+    return np.linalg.norm(_specific_thrust(acc), axis=-1) / GRAVITY_MAGNITUDE
 
 
 def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:

@@ -14,12 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim import rotation
 from crazysim.core.data import SimData
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.plugins.payloads import SlungLoad
 from crazysim.sim.sim import Sim
 from crazysim.validate.rows import Row
 
-GRAVITY = 9.81
-"""Gravitational acceleration, m/s^2."""
 INERTIA = (2e-5, 3e-5, 5e-5)
 """Moments of inertia of a body, all different, about the size of a Crazyflie's, kg m^2."""
 SPIN = (4.0, 1.0, 7.0)
@@ -92,8 +91,12 @@ def free_fall_error(integrator: str) -> float:
     """
     sim, t, dt = free_body(integrator), 1.0, 1 / 500
     sim.step(500)
-    extra = {"euler": 0.5 * GRAVITY * t * dt, "symplectic_euler": -0.5 * GRAVITY * t * dt, "rk4": 0.0}[integrator]
-    expected = np.array([1.0, -2.0, 103.0 - 0.5 * GRAVITY * t**2 + extra])
+    extra = {
+        "euler": 0.5 * GRAVITY_MAGNITUDE * t * dt,
+        "symplectic_euler": -0.5 * GRAVITY_MAGNITUDE * t * dt,
+        "rk4": 0.0,
+    }[integrator]
+    expected = np.array([1.0, -2.0, 103.0 - 0.5 * GRAVITY_MAGNITUDE * t**2 + extra])
     return float(np.linalg.norm(state_of(sim)["pos"] - expected))
 
 
@@ -124,12 +127,12 @@ def terminal_velocity() -> Iterable[Row]:
     with jax.enable_x64(True):
         sim = Sim(control="rotor_vel", integrator="rk4")
         p = sim.data.params
-        fall = float(np.ravel(p.mass)[0]) * GRAVITY / -float(np.asarray(p.drag_matrix)[..., 2, 2].ravel()[0])
+        fall = float(np.ravel(p.mass)[0]) * GRAVITY_MAGNITUDE / -float(np.asarray(p.drag_matrix)[..., 2, 2].ravel()[0])
         sim.data = with_states(sim.data, pos=[0, 0, 2000.0], rotor_vel=np.zeros(4))
         sim.rotor_vel_control(np.zeros((1, 1, 4)))
         sim.step(20_000)
         found = -state_of(sim)["vel"][2]
-    rate = GRAVITY / fall
+    rate = GRAVITY_MAGNITUDE / fall
     # what is left of the transient, and rounding
     text = f"m g / D = {fall:.3f} m/s"
     yield Row("terminal velocity, 40 s", text, abs(found / fall - 1), "", (0, 2 * math.exp(-40 * rate)))
@@ -160,7 +163,7 @@ def pendulum() -> Iterable[Row]:
     with jax.enable_x64(True):
         sim = Sim(3, drone="bumblebee", control="rotor_vel", integrator="rk4")
         sim.data = sim.data.replace(params=sim.data.params.replace(mass=jnp.full(1, 1e9)))
-        sim.data = with_states(sim.data, pos=[0, 0, 5.0], force=[0, 0, 1e9 * GRAVITY])
+        sim.data = with_states(sim.data, pos=[0, 0, 5.0], force=[0, 0, 1e9 * GRAVITY_MAGNITUDE])
         load = sim.add(SlungLoad(mass=0.2, length=length, in_scene=False))
         record = load.read(sim.data)
         pos = np.stack([length * np.sin(angles), 0 * angles, 5 - length * np.cos(angles)], axis=-1)[:, None]
@@ -176,7 +179,7 @@ def pendulum() -> Iterable[Row]:
         mean, other = 1.0, math.cos(angle / 2)
         for _ in range(6):
             mean, other = (mean + other) / 2, math.sqrt(mean * other)
-        period = 2 * math.pi * math.sqrt(length / GRAVITY) / mean
+        period = 2 * math.pi * math.sqrt(length / GRAVITY_MAGNITUDE) / mean
         error = abs(float(times[1] - times[0]) / period - 1)
         # crossings are interpolated linearly between samples of 2 ms: (2 ms)^3 of the curvature, relative to 1.3 s
         name = f"period of a load on a rod, amplitude {angle:g} rad"

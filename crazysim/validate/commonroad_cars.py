@@ -12,10 +12,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.plugins.vehicles import CarState, CommonRoadParams, CommonRoadState, commonroad_single_track, single_track
 from crazysim.plugins.vehicles.parameters import SLIP_SPEED, CarParams
 from crazysim.pytree import as_parameter
-from crazysim.validate.closed_forms import GRAVITY
 from crazysim.validate.rows import Row
 
 REFERENCE = "CommonRoad, BMW 320i"
@@ -56,7 +56,7 @@ def own_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) ->
     x, p = jnp.asarray(state), params
     limited = rates(state, command, params)
     zero, speed, slip = jnp.zeros(1), x[3:4], x[6:7]
-    loads = p.mass * GRAVITY * p.arms[..., ::-1] / jnp.sum(p.arms)
+    loads = p.mass * GRAVITY_MAGNITUDE * p.arms[..., ::-1] / jnp.sum(p.arms)
     car = CarParams(
         mass=p.mass, yaw_inertia=p.yaw_inertia, front=p.arms[..., :1], rear=p.arms[..., 1:],
         stiffness=p.friction * p.stiffness * loads, grip=p.friction * loads, drive=jnp.stack([p.mass[0], 0, 0]),

@@ -13,6 +13,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.plugins.estimators import complementary as law
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.validate.firmware_controllers import VECTORS
@@ -98,7 +99,7 @@ def complementary(kind: str) -> tuple[NDArray, NDArray]:
 
     def tick(carry: Any, x: Any) -> tuple[Any, Array]:
         (quat, integral, climb, height, rate, over), (k, row) = carry, x
-        gyro, accel = jnp.radians(row[:3]), law.GRAVITY * row[3:6]
+        gyro, accel = jnp.radians(row[:3]), GRAVITY_MAGNITUDE * row[3:6]
         turned = law.mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
         turned = *turned, law.inertial_climb(climb, turned[0], accel, 0.004)
         quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))

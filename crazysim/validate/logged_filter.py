@@ -13,6 +13,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim import rotation
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.kalman import DEVIATIONS
@@ -50,7 +51,7 @@ def read(path: Path) -> dict[str, NDArray]:
     log = {key: np.stack([table[name] for name in columns], axis=-1) for key, columns in names.items()}
     commanded = commanded_samples(path.name, log["goal"][:, 2])
     log = {k: x[commanded[0] : commanded[-1]] for k, x in log.items()}
-    accel = np.float32(error_state.GRAVITY) * log["accel"]
+    accel = np.float32(GRAVITY_MAGNITUDE) * log["accel"]
     return log | {"accel": accel, "quat": along_thrust(log["pos"], log["quat"])}
 
 
@@ -65,7 +66,7 @@ def along_thrust(pos: NDArray, quat: NDArray) -> NDArray:
         pos: Position of the tracked body, world frame, m. (n, 3)
         quat: Its attitude, body to world, xyzw. (n, 4)
     """
-    accel = np.gradient(np.gradient(pos, PERIOD, axis=0), PERIOD, axis=0) + [0, 0, error_state.GRAVITY]
+    accel = np.gradient(np.gradient(pos, PERIOD, axis=0), PERIOD, axis=0) + [0, 0, GRAVITY_MAGNITUDE]
     force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[round(SETTLED / PERIOD) :]
     x, y, z = np.mean(force, axis=0) / np.linalg.norm(np.mean(force, axis=0))
     tilt = np.array([-y, x, 0, 1 + z]) / np.sqrt(2 + 2 * z)  # the shortest rotation of the z axis to (x, y, z)

@@ -10,6 +10,7 @@ import jax
 import mujoco
 import numpy as np
 
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.validate.closed_forms import SPIN, free_body, state_of, with_states
 from crazysim.validate.rows import Row
 
@@ -55,7 +56,7 @@ def of_mujoco() -> Iterable[Row]:
 
 def of_crazyflow() -> Iterable[Row]:
     """Yield the distance from Crazyflow's drone after 2 s under its own controllers, in float32."""
-    weight = 0.0434 * 9.81
+    weight = 0.0434 * GRAVITY_MAGNITUDE
     state = np.zeros((1, 1, 16), np.float32)
     state[..., [0, 1, 2, 12]] = 0.5, -0.3, 5.2, 1.0
     commands = {"attitude": np.asarray([[[0.1, -0.15, 0.2, 1.02 * weight]]], np.float32), "state": state}

@@ -16,6 +16,7 @@ import numpy as np
 
 from crazysim import rotation
 from crazysim.drones import load_airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.plugins.effects import Latency
 from crazysim.sim.sim import Sim
 from crazysim.validate.closed_forms import with_states
@@ -166,7 +167,7 @@ class Quadrotors:
         """
         draw = np.random.default_rng(0).uniform
         mass = draw(0.02 ** (1 / 3), 5 ** (1 / 3), n) ** 3
-        thrust = draw(1.5, 5, n) * mass * 9.81 / 4
+        thrust = draw(1.5, 5, n) * mass * GRAVITY_MAGNITUDE / 4
         arm = 0.028 * np.cbrt(mass / 0.0306) * draw(0.9, 1.1, n)
         inertia = np.sqrt(2) * arm * thrust / draw(40, 1200, n)
         ratio = np.array([9.416556729130406e-06, 9.644051701582312e-06, 1.745951732253285e-05]) / 9.416556729130406e-06
@@ -176,7 +177,7 @@ class Quadrotors:
     @property
     def hover(self) -> np.ndarray:
         """Action, from -1 to 1, of rotors that carry the weight. (n, 4)"""
-        return np.repeat((2 * np.sqrt(self.mass * 9.81 / (4 * self.thrust)) - 1)[:, None], 4, axis=1)
+        return np.repeat((2 * np.sqrt(self.mass * GRAVITY_MAGNITUDE / (4 * self.thrust)) - 1)[:, None], 4, axis=1)
 
 
 def trained_here(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import stage
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.plugins.effects import RotorAerodynamics, Wind
 from crazysim.sim.sim import Sim
-from crazysim.validate.closed_forms import GRAVITY, angle_between, state_of, with_states
+from crazysim.validate.closed_forms import angle_between, state_of, with_states
 from crazysim.validate.rows import Row
 
 FREQ, PERIOD = 1000, 0.1
@@ -32,7 +33,7 @@ States = list[dict[str, NDArray]]
 
 def hover_speed(params: dict[str, Any]) -> float:
     """Return the rotor speed of hover, rad/s."""
-    return math.sqrt(params["mass"] * GRAVITY / (params["num_rotors"] * params["k_eta"]))
+    return math.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (params["num_rotors"] * params["k_eta"]))
 
 
 def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> Sim:

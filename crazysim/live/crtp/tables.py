@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
 from crazysim.live.swarm import Commander, DroneState, Swarm
 from crazysim.live.swarm.sensors import battery_of, ranges_of
@@ -30,8 +31,6 @@ OUT_OF_RANGE = 32767
 """Distance where nothing is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
 RANGES = {"down": "zrange"}
 """Log variables of directions that have another name."""
-GRAVITY = 9.81
-"""Unit of log variables of acceleration, m/s^2."""
 
 Reading = Callable[[DroneState, Commander], float]
 """Value of a log variable of a drone."""
@@ -115,14 +114,14 @@ def _goal(row: int, k: int) -> Reading:
 LOG: dict[str, tuple[str, Reading]] = {
     **_axes("stateEstimate", "x y z", "pos"),
     **_axes("stateEstimate", "vx vy vz", "vel"),
-    **_axes("stateEstimate", "ax ay az", "acc", 1 / GRAVITY),
+    **_axes("stateEstimate", "ax ay az", "acc", 1 / GRAVITY_MAGNITUDE),
     **_axes("stateEstimate", "qx qy qz qw", "quat"),
     **_angles("stateEstimate"),
     **_angles("stabilizer"),
     **_axes("kalman", "stateX stateY stateZ", "pos"),
     **{f"kalman.varP{axis}": ("float", lambda _s, _c: 1e-6) for axis in "XYZ"},
     **_axes("gyro", "x y z", "ang_vel", 180 / math.pi),
-    **_axes("acc", "x y z", "acc", 1 / GRAVITY),
+    **_axes("acc", "x y z", "acc", 1 / GRAVITY_MAGNITUDE),
     **{f"ctrltarget.{axis}": ("float", _goal(0, k)) for k, axis in enumerate("xyz")},
     **{f"ctrltarget.v{axis}": ("float", _goal(1, k)) for k, axis in enumerate("xyz")},
     "ctrltarget.yaw": ("float", lambda _s, commander: math.degrees(commander.goal()[0, 3])),

@@ -17,6 +17,7 @@ from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.stage import over_drones, over_worlds
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.attitude import from_yaw, rotate, to_rpy
@@ -29,9 +30,6 @@ from crazysim.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
 from crazysim.plugins.estimators import Estimator
 from crazysim.sim.sim import Sim
-
-GRAVITY = 9.81
-"""Standard acceleration of accelerometers' readings, m/s^2."""
 
 
 class Swarm(Closing):
@@ -274,7 +272,7 @@ class Swarm(Closing):
         dt = now - before[0].time if before else 0.0
         moved = np.stack([state.vel for state in before]) if before else vel
         force = (vel - moved) / dt if dt > 0 else np.zeros_like(vel)
-        acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY])
+        acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY_MAGNITUDE])
         if before and dt == 0:
             acc = np.stack([state.acc for state in before])
         acc = measured[0] if measured else acc

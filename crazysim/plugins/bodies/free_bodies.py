@@ -17,6 +17,7 @@ from crazysim.core.plugin import Placement, Simulation, parameter
 from crazysim.core.population import Population, Rates
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.core.stage import Stage
+from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rigid_body import free_rotation
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
@@ -27,8 +28,6 @@ from crazysim.pytree import Members, host_array, leaf
 from crazysim.scene.contact_report import ObjectSelection
 from crazysim.tables import MASS
 
-GRAVITY = (0.0, 0.0, -9.81)
-"""Gravity, world frame, m/s^2, as the airframes have it."""
 MAX_BODIES = 1000
 """Most bodies in a world."""
 GAP = 0.5

@@ -16,8 +16,8 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter, per_drone
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
-from crazysim.plugins.estimators.error_state import GRAVITY
 from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.barometer import Barometer
 from crazysim.plugins.sensors.flow_deck import TimeOfFlight
@@ -212,6 +212,6 @@ def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
         accel: Specific force, body frame, m/s^2. (3,)
         dt: Length of the interval, s.
     """
-    acc = rotation.matrix(quat)[2:] @ accel / GRAVITY - 1.0
+    acc = rotation.matrix(quat)[2:] @ accel / GRAVITY_MAGNITUDE - 1.0
     beyond = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - DEADBAND, 0.0)
-    return KEEP_VELOCITY * (climb + GRAVITY * dt * beyond)
+    return KEEP_VELOCITY * (climb + GRAVITY_MAGNITUDE * dt * beyond)

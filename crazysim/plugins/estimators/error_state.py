@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.pytree import PyTree, leaf
 
 POS, VEL, ATT, GYRO = (0, 1, 2), (3, 4, 5), (6, 7, 8), (12, 13, 14)
@@ -37,8 +38,6 @@ MAX_POS, MAX_VEL = 100.0, 10.0
 (kalman_supervisor.c)."""
 SMALL_ANGLE, LARGE_ANGLE = 1e-4, 10.0
 """Smallest attitude error that is moved into the attitude, and the largest, rad (kalman_core.c)."""
-GRAVITY = 9.81
-"""Acceleration of gravity, m/s^2 (physicalConstants.h)."""
 REVERSION = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
@@ -112,7 +111,7 @@ def predict(
     """
     pos, vel, quat = estimate.pos, estimate.vel, estimate.quat
     rot, identity, angle = rotation.matrix(quat), jnp.eye(3, dtype=pos.dtype), dt * gyro
-    gravity = GRAVITY * rot[2]  # in the body frame
+    gravity = GRAVITY_MAGNITUDE * rot[2]  # in the body frame
 
     # The linearised step: rows of the errors of position, velocity and attitude.
     to_pos = dt * rot
@@ -130,7 +129,7 @@ def predict(
 
     force = rotation.along_z(accel[2]) if resting is None and not all_axes else accel
     shift = dt * vel + 0.5 * dt**2 * force
-    pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY * dt**2], pos.dtype)
+    pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY_MAGNITUDE * dt**2], pos.dtype)
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
     upper = p[_upper(N)]
     cov = jnp.where(_is_variance(N), upper, _at_most(upper))
