@@ -1,22 +1,35 @@
-"""Progress bars of commands."""
+"""The progress bar of rollouts, films, trainings and commands."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
 
+from crazysim.errors import not_installed
 
-def progress(items: Iterable[Any], label: str, unit: str = "frame") -> Iterable[Any]:
-    """Return the items with a progress bar, if tqdm is installed and stderr is a terminal.
+
+def progress_bar(
+    items: Iterable[Any] | None = None, label: str = "", unit: str = "frame", required: bool = False, **settings: Any
+) -> Any:
+    """Return a progress bar of tqdm, shown where stderr is a terminal; iterating over it returns the items.
 
     Args:
-        items: Items.
+        items: Items; None for a bar that ``update`` moves.
         label: Text in front of the bar.
         unit: Name of one item.
+        required: True to raise an error where tqdm is not installed; False to print the label and return the items.
+        **settings: Settings of tqdm, such as ``total``.
+
+    Raises:
+        ImportError: If tqdm is required and not installed.
     """
     try:
         from tqdm import tqdm
-    except ImportError:
-        print(f"{label} ...")
+    except ImportError as error:
+        if required:
+            raise ImportError(not_installed("progress bars need", "tqdm", "demo")) from error
+        if label:
+            print(f"{label} ...")
         return items
-    return tqdm(items, desc=label, unit=unit, ncols=80, disable=None)
+    options: dict[str, Any] = {"ncols": 80} | settings
+    return tqdm(items, label, unit=unit, disable=None, **options)

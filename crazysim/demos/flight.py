@@ -20,7 +20,7 @@ from crazysim.eager import compiled
 from crazysim.errors import RenderError, not_installed
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
-from crazysim.progress import progress
+from crazysim.progress import progress_bar
 from crazysim.pytree import on_device
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
@@ -75,7 +75,7 @@ def run(
     recorder = Recorder(sim, worlds=[0])
     errors, touching = [], []
     step_s = contacts_s = 0.0
-    for _ in progress(range(n_frames), "flying"):
+    for _ in progress_bar(range(n_frames), "flying"):
         begin = perf_counter()
         data, error = jax.block_until_ready(fly(sim.data))
         step_s += perf_counter() - begin

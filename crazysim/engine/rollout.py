@@ -16,7 +16,8 @@ from crazysim.core.settings import positive
 from crazysim.core.stage import with_leaves
 from crazysim.engine.ir.program import Zeros
 from crazysim.engine.step import Step
-from crazysim.errors import ConfigError, not_installed
+from crazysim.errors import ConfigError
+from crazysim.progress import progress_bar
 
 Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
@@ -120,14 +121,10 @@ def run(
     zeros = step.zeros(data)
     if not progress:
         return compiled(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError(not_installed("progress bars need", "tqdm", "demo")) from error
     piece = max(n_control_steps // every // 100, 1) * every
     pieces, rest = divmod(n_control_steps, piece)
     kept = []
-    with tqdm(total=n_control_steps, unit="control steps", disable=None) as bar:
+    with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
         for n in [piece] * pieces + [rest] * (rest > 0):
             data, part = compiled(step, data, policy, params, n, every=every, zeros=zeros, **settings)
             jax.block_until_ready(part)

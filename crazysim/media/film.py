@@ -7,7 +7,6 @@ import math
 import subprocess
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +17,7 @@ from crazysim.media.flight import Flight
 from crazysim.media.flight_recorder import Clock, put
 from crazysim.media.view import View
 from crazysim.media.worlds import require_world
+from crazysim.progress import progress_bar
 from crazysim.sim.sim import Sim
 from crazysim.storage import check_writable, unfinished_path
 
@@ -86,7 +86,8 @@ class Film:
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
         self._ffmpeg: subprocess.Popen[bytes] | None = None
-        self._bar = _bar(total) if flag("progress", progress) else None
+        wanted = flag("progress", progress)
+        self._bar = progress_bar(label="filming", required=True, total=total) if wanted else None
         self._clock = Clock()
 
     def add(self, sim: Sim) -> int:
@@ -207,11 +208,3 @@ class Film:
             return
         with contextlib.suppress(ConfigError, RenderError):  # the earlier error is the one to raise
             self.close()
-
-
-def _bar(total: int | None) -> Any:
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError(not_installed("progress bars need", "tqdm", "demo")) from error
-    return tqdm(total=total, desc="filming", unit="frame", ncols=80, disable=None)

@@ -28,6 +28,7 @@ from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, DivergedError
+from crazysim.progress import progress_bar
 from crazysim.storage import replacing
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE, TrainConfig, recipe_of
@@ -358,14 +359,11 @@ def _settings(settings: dict[str, Any]) -> dict[str, Any]:
 @contextmanager
 def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
     """Yield a function that shows metrics on a progress bar; without ``wanted`` or tqdm it does nothing."""
-    try:
-        if not wanted:
-            raise ImportError
-        from tqdm import tqdm
-    except ImportError:
+    bar = progress_bar(unit="iteration", total=total, initial=done, ncols=100) if wanted else None
+    if bar is None:
         yield lambda *_: None
         return
-    with tqdm(total=total, initial=done, unit="iteration", ncols=100, disable=None) as bar:
+    with bar:
         shown: dict[str, str] = {}
 
         def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:

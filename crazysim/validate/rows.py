@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from crazysim.errors import ConfigError
-from crazysim.progress import progress
+from crazysim.progress import progress_bar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,7 @@ def measure(sections: Sequence[Section]) -> list[Row]:
     """Return the rows of all sections; a check that raises an error is a row that failed."""
     rows: list[Row] = []
     tasks = [(section, check) for section in sections if not section.missing for check in section.checks]
-    for section, check in progress(tasks, "validating", "check"):
+    for section, check in progress_bar(tasks, "validating", "check"):
         found: list[Row] = []
         try:
             found += check()
