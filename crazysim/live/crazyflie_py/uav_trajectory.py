@@ -6,6 +6,7 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
@@ -21,7 +22,7 @@ class Polynomial:
 
     def eval(self, t: float) -> float:
         """Return the value at a time, s."""
-        return float((self.p * float(t) ** np.arange(len(self.p))).sum())
+        return float(polyval(float(t), self.p))
 
     def derivative(self) -> Polynomial:
         """Return the derivative."""
