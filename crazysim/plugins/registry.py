@@ -141,8 +141,10 @@ class PluginRegistry(Mapping[str, Plugin]):
         finally:
             sim.step_pipeline = present_pipeline
         resets = dict(self._sim.reset_pipeline)
-        if name in resets and _begins_at_resets(plugin):
+        if _begins_at_resets(plugin) and (name in resets or not _begins_at_resets(before)):
             resets[name] = Stage(plugin.begin_episode, "drone")
+        elif _begins_at_resets(before):
+            resets.pop(name, None)
         self._put(name, _continued(record, present), default)
         self._installed[name] = installed
         self._build(pipeline, resets)

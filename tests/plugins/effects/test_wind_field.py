@@ -62,6 +62,19 @@ def test_law_10_displacements_are_of_world_and_episode():
     assert not np.isclose(again[0], found[0]).all(axis=-1).any()
 
 
+def test_a_displacement_comes_and_goes_with_its_setting():
+    sim = build()
+    for spread in ((1.0, 2.0, 0.0), None):
+        before = [*sim.step_pipeline]
+        sim.replace(WindField(SHEAR, spread=spread))
+        has = spread is not None
+        assert ("wind_field" in sim.reset_pipeline) == ("wind_field_begin" in sim.step_pipeline) == has
+        assert len(sim.step_pipeline) == len(before) + (1 if has else -1)
+        sim.reset()
+        assert (sim.data.plugins["wind_field"].shift is not None) == has
+        assert not has or np.ptp(np.asarray(sim.data.plugins["wind_field"].shift)[:, 0, 0]) > 0
+
+
 def test_the_air_at_loads_counts_for_loads():
     """A load 1.6 m below drones at 3 m is at 1.4 m, in (0.8, 0, 0.4) m/s, and drones in (4, 0, 2)."""
     sim = build()
