@@ -23,7 +23,7 @@ from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
 from crazysim.core.locking import locked
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.plugin import Plugin
+from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.random import seed_sim
 from crazysim.core.settings import flag, positive
 from crazysim.core.sharding import shard
@@ -141,7 +141,8 @@ class Sim:
                 Short for its sensors and itself at the head of ``plugins``.
             aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
                 for those of the model alone. Short for ``Residual()`` at the head of ``plugins``.
-            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``.
+            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. One that begins
+                where the drones are, such as a load, is added when they are in place.
 
         Raises:
             ValueError: If an argument is invalid, with what was expected.
@@ -185,7 +186,13 @@ class Sim:
 
     @classmethod
     def from_mjcf(
-        cls, xml_path: str | Path, n_worlds: int = 1, *, kinds: Mapping[str, Kind] | None = None, **settings: Any
+        cls,
+        xml_path: str | Path,
+        n_worlds: int = 1,
+        *,
+        kinds: Mapping[str, Kind] | None = None,
+        plugins: Sequence[Plugin] = (),
+        **settings: Any,
     ) -> Sim:
         """Return a simulation with the vehicles of an MJCF, at their poses; everything else there is the scene.
 
@@ -197,12 +204,14 @@ class Sim:
             n_worlds: Number of worlds.
             kinds: Airframes, or subclasses of ``Population``, by further prefixes; ``crazysim.sim.adopt.known_kinds``
                 returns those that are known.
+            plugins: Plugins, which are added when all vehicles are at their poses.
             **settings: Further arguments of ``Sim``.
 
         Raises:
             UnknownNameError: If a prefix is unknown, with those that are known.
             ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
         """
+        plugin_list("plugins", plugins)
         spec, drones, populations = read_vehicles(xml_path, kinds or {})
         sim = cls(n_worlds, len(drones), [v.kind for v in drones], xml_path=spec, **settings)  # type: ignore[arg-type]
         sim.drone_names = tuple([v.name for v in drones])
@@ -214,6 +223,8 @@ class Sim:
             record = plugin.with_poses(plugin.read(sim.data), *poses_of(members, states.pos))
             sim.data = plugin.write(sim.data, record)
         sim.build_default_data()
+        for plugin in plugins:
+            sim.add(plugin)
         return sim
 
     @property

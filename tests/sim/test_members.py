@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from springs import Springs
 
-from crazysim import ConfigError, Sim
+from crazysim import ConfigError, Sim, SlungLoad
 from crazysim.errors import UnknownNameError
 
 MJCF = """
@@ -129,12 +129,14 @@ def test_wrong_names_and_shapes_are_refused():
 
 
 def test_the_vehicles_of_a_file_are_adopted(tmp_path):
-    sim = Sim.from_mjcf(file_with(tmp_path), 2, kinds={"Mass": Springs}, control="state")
+    load = SlungLoad(0.01, 0.5, in_scene=False)
+    sim = Sim.from_mjcf(file_with(tmp_path), 2, kinds={"Mass": Springs}, control="state", plugins=[load])
     assert sim.names == ("Bumblebee_3", "Crazyflie_0", "Crazyflie_2", "Mass_4")
     assert [airframe.name for airframe in sim.airframes] == ["bumblebee", "crazyflie", "crazyflie"]
     np.testing.assert_allclose(sim["Bumblebee_3"].pos, [[1, 2, 3]] * 2)
     np.testing.assert_allclose(sim["Crazyflie_0"].quat, [[0, 0, 1, 0]] * 2)
     np.testing.assert_allclose(sim["Mass_4"].pos, [[4, 5, 6]] * 2)
+    np.testing.assert_allclose(load.read(sim.data).pos[:, 0], [[1, 2, 2.5]] * 2, rtol=1e-5)
     assert sim.scene.object_names == ("pole_1",)
     sim.step(5)
     sim.reset()
