@@ -265,10 +265,14 @@ def test_a_reset_brings_every_record_back_in_its_worlds_alone(every):
     sim.step(40)
     flown, mask = sim.data.plugins, np.array([False, True, True])
     sim.reset(mask)
-    drawn, start = sim.data.plugins["randomize"], sim.default_data.plugins["randomize"]
-    found = {name: getattr(drawn, name) for name in ("factors", "thrust_factors", "air_vel")}
-    assert np.all(np.asarray(drawn.factors)[mask][..., 0] != 1), "drawn at the reset"
-    default = sim.default_data.plugins | {"randomize": start.replace(**found)}
+    drawn, default = sim.data.plugins, dict(sim.default_data.plugins)
+    for name, fields in (("randomize", ("factors", "thrust_factors", "air_vel")), ("wind_field", ("shift",))):
+        found = {field: getattr(drawn[name], field) for field in fields}
+        changed = np.asarray(found[fields[0]]) != np.asarray(getattr(flown[name], fields[0]))
+        np.testing.assert_array_equal(
+            changed[..., 0], np.broadcast_to(mask[:, None], (3, 2)), f"{name}: drawn at resets"
+        )
+        default[name] = default[name].replace(**found)
     pairs = zip(*map(jax.tree.leaves, (scopes(flown), flown, sim.data.plugins, default)), strict=True)
     for scope, before, after, default in pairs:
         if scope == "drone":
