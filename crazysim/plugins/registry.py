@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -92,15 +93,16 @@ class PluginRegistry(Mapping[str, Plugin]):
             raise ConfigError(f"data.plugins already has a record {name!r}. Use sim.add(..., name=...).")
         self._require_names(plugin, self._sim.names)
         self._require_terms(plugin, self.values())
-        record, default = plugin.record(self._sim), plugin.default_record(self._sim)
-        pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
-        pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
-        resets = dict(self._sim.reset_pipeline)
-        if _begins_at_resets(plugin):
-            append_fn(resets, Stage(plugin.begin_episode, "drone"), name)
-        self._put(name, record, default)
-        self._installed[name] = installed
-        self._build(pipeline, resets)
+        with self._unchanged_on_error():
+            record, default = plugin.record(self._sim), plugin.default_record(self._sim)
+            pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
+            pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
+            resets = dict(self._sim.reset_pipeline)
+            if _begins_at_resets(plugin):
+                append_fn(resets, Stage(plugin.begin_episode, "drone"), name)
+            self._put(name, record, default)
+            self._installed[name] = installed
+            self._build(pipeline, resets)
         return plugin
 
     def remove(self, plugin: Plugin | str) -> None:
@@ -118,6 +120,10 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     def replace(self, plugin: P) -> P:
         """Replace the settings of a plugin; see ``Sim.replace``."""
+        with self._unchanged_on_error():
+            return self._replaced(plugin)
+
+    def _replaced(self, plugin: P) -> P:
         before = self[plugin.name]
         if type(before) is not type(plugin):
             raise ConfigError(
@@ -149,6 +155,20 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._installed[name] = installed
         self._build(pipeline, resets)
         return plugin
+
+    @contextlib.contextmanager
+    def _unchanged_on_error(self) -> Iterator[None]:
+        """Leave the simulation and its scene as they were where an error ends the block."""
+        sim, installed = self._sim, dict(self._installed)
+        data, default, steps, resets = sim.data, sim.default_data, sim.step_pipeline, sim.reset_pipeline
+        with sim.scene.unchanged_on_error():
+            try:
+                yield
+            except BaseException:
+                self._installed = installed
+                sim.step_pipeline, sim.reset_pipeline = steps, resets
+                sim.data, sim.default_data = data, default
+                raise
 
     @staticmethod
     def members_of(plugin: Plugin) -> tuple[str, ...]:

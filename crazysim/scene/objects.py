@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -159,6 +160,17 @@ def as_poses(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | Non
     return array
 
 
+class Mark(NamedTuple):
+    """What there was in a scene at some time."""
+
+    names: list[set[str]]
+    """Names of the elements of the spec, as ``_elements`` has them."""
+    handles: list[Handle]
+    """Handles of all objects."""
+    initial: list[tuple[NDArray, NDArray]]
+    """Initial poses of those that can be moved."""
+
+
 class SceneObjects:
     """The objects that were added to a scene."""
 
@@ -207,6 +219,23 @@ class SceneObjects:
             self._initial.append((poses[0], poses[1]))
         return handle
 
+    def number_of(self, name: str) -> int:
+        """Return the number of objects of a kind, or of a body of that name: 0 if it was not added."""
+        return sum(len(handle) for handle in self._handles if handle.name == name)
+
+    def mark(self, spec: mujoco.MjSpec) -> Mark:
+        """Return what there is in a spec now, for ``take_back``."""
+        return Mark([{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial[:])
+
+    def take_back(self, spec: mujoco.MjSpec, mark: Mark) -> bool:
+        """Take out of a spec what was added since a mark, and return whether there was anything."""
+        pairs = zip(_elements(spec), mark.names, strict=True)
+        added = [x for elements, names in pairs for x in elements if x.name not in names]
+        for element in added:
+            spec.delete(element)
+        self._handles, self._initial = mark.handles, mark.initial
+        return bool(added)
+
     def record(self, before: Objects | None, mocap_ids: list[int]) -> Objects | None:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects.
 
@@ -223,6 +252,11 @@ class SceneObjects:
             poses = tuple(np.concatenate([x, new[..., n:, :]], axis=-2) for x, new in zip(old, poses, strict=True))
         pos, quat, vel = (on_device(x) for x in poses)
         return Objects(pos, quat, vel, on_device(mocap_ids, np.int32), self.movable)
+
+
+def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
+    """Return the bodies of the world, and what comes with them in an attached spec; users before what they use."""
+    return spec.worldbody.bodies, spec.materials, spec.textures, spec.meshes, spec.hfields
 
 
 def add_bodies(

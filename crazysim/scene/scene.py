@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -120,9 +121,36 @@ class Scene:
         Raises:
             ConfigError: If a name is taken, MJCF does not compile (with the compiler's words), or a setting is invalid.
         """
-        handle = self.added.add(self.spec, what, name, count, pos, quat, mocap, options)
+        with self.unchanged_on_error():
+            handle = self.added.add(self.spec, what, name, count, pos, quat, mocap, options)
         self.revision += 1
         return handle
+
+    def add_once(self, what: Source, name: str, count: int) -> None:
+        """Add objects, unless there are as many of that name: those of a plugin stay when it is removed or replaced.
+
+        Raises:
+            ConfigError: If there are others.
+        """
+        there = self.added.number_of(name)
+        if there not in (0, count):
+            raise ConfigError(
+                f"expected {there} objects {name!r}, which are in the scene already, got {count}: objects stay there "
+                f"when a plugin is removed. Use another name=, or a new simulation."
+            )
+        if not there:
+            self.add(what, name, count=count)
+
+    @contextlib.contextmanager
+    def unchanged_on_error(self) -> Iterator[None]:
+        """Take objects that are added within the block out of the scene again where an error ends the block."""
+        mark = self.added.mark(self.spec)
+        try:
+            yield
+        except BaseException:
+            if self.added.take_back(self.spec, mark):
+                self.revision += 1
+            raise
 
     def compile(self) -> None:
         """Compile the spec; closes the window and returns bodies moved through ``mjx_data`` to where the spec has them.

@@ -451,6 +451,51 @@ class Nameless(FunctionPlugin):
         return [Placement(lambda data: data, name="clip_floor_pos")]
 
 
+class Late(Plugin):
+    """A plugin that fails after it has put an object into the scene."""
+
+    fails: str = "never"
+    name: str = "late"
+
+    def record(self, sim):
+        sim.scene.add_once(PAINTED, "late", 2)
+        return 3 if self.fails == "record" else None
+
+    def stages(self, sim):
+        fn = 3 if self.fails == "pipeline" else lambda data: data
+        return [Placement(fn, before="lunch" if self.fails == "stages" else "integration")]
+
+    def begin_episode(self, data):
+        return data
+
+
+PAINTED = """
+<mujoco>
+  <asset><texture name="paint" type="2d" builtin="flat" width="4" height="4"/><material name="paint" texture="paint"/>
+  </asset>
+  <worldbody><geom type="box" size="0.1 0.1 0.1" material="paint"/></worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("fails", ["record", "stages", "pipeline"])
+def test_an_addition_that_fails_changes_nothing(fails):
+    sim = Sim()
+    post = sim.scene.add("box")
+    pipelines, data, default = (sim.step_pipeline, sim.reset_pipeline), sim.data, sim.default_data
+    with pytest.raises(ValueError, match=r"expected|No stage named"):
+        sim.add(Late(fails))
+    assert (sim.step_pipeline, sim.reset_pipeline) == pipelines
+    assert dict(sim.plugins) == {}
+    assert trees_equal(sim.data, data)
+    assert trees_equal(sim.default_data, default)
+    assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy", "box:0"]
+    sim.add(Late())
+    sim.data = post.set_pose(sim.data, (0, 0, 3))
+    assert sim.mj_model.body("late:1").id
+    assert sim.data.objects.names == ("box:0", "late:0", "late:1")
+
+
 class Unlisted(Plugin):
     """A plugin that returns a stage without a list."""
 

@@ -214,11 +214,23 @@ def sims():
     return of
 
 
+def parts(sim):
+    """Return what the parts of a simulation are called, those of its scene included."""
+    objects = sim.data.objects
+    pipelines, records = (sim.step_pipeline, sim.reset_pipeline), (sim.data.plugins, sim.default_data.plugins)
+    bodies = [body.name for body in sim.spec.worldbody.bodies]
+    return [
+        *map(list, (sim.plugins, *pipelines, *records)),
+        sim.names,
+        bodies,
+        () if objects is None else objects.names,
+    ]
+
+
 @pytest.mark.parametrize("kind", PLUGINS, ids=lambda kind: kind.__name__)
-def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added(kind, sims):
+def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added_and_change_nothing(kind, sims):
     sim, found = sims(kind), []
-    sim.add(example(kind))
-    sim.remove(example(kind).name)
+    before = parts(sim)
     for name, declared in numeric_fields(kind):
         if np.ndarray not in alternatives(kind)[name] and not declared.is_parameter:
             continue
@@ -234,4 +246,8 @@ def test_arrays_of_another_shape_are_refused_when_the_plugin_is_added(kind, sims
             found.append(refused(add, f"{name} of shape {shape}"))
             if kind.__name__ in [type(x).__name__ for x in sim.plugins.values()]:
                 sim.remove(example(kind).name)
+            elif parts(sim) != before:
+                found.append(f"{name} of shape {shape} left something behind")
     assert not [text for text in found if text], "\n".join(text for text in found if text)
+    sim.add(example(kind))
+    sim.remove(example(kind).name)

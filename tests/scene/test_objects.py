@@ -151,6 +151,7 @@ BAD = {
         "size 0 must be",
     ),
     "text": (lambda s: s.scene.add("<mujoco><worldbody>", "q"), "expected an object that compiles"),
+    "second": (lambda s: s.scene.add([TOWER, "<mujoco>"], "q", count=2), "expected an object that compiles"),
     "what": (lambda s: s.scene.add(3, "q"), "or a body of one, got 3"),
     "setting": (lambda s: s.scene.add("box", "q", length=3), "expected settings size=(0.2, 0.2, 0.2), rgba"),
     "size": (lambda s: s.scene.add("sphere", "q", radius=-1), "expected positive lengths"),
@@ -173,6 +174,7 @@ def test_law_09_invalid_objects_are_refused(name):
     with pytest.raises(ConfigError) as error:
         act(sim)
     assert words in str(error.value)
+    assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy", "gate:0"]
     sim.step()  # and the simulation goes on
 
 

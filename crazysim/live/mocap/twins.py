@@ -131,9 +131,10 @@ class Twins(Closing):
             found[name] = twin
         self.twins = found
         self._order = _in_order(found)
-        self.handles: dict[str, Handle] = {
-            name: sim.scene.add(t.what, name, pos=NOWHERE, mocap=True, **t.options) for name, t in found.items()
-        }
+        with sim.scene.unchanged_on_error():
+            self.handles: dict[str, Handle] = {
+                name: sim.scene.add(t.what, name, pos=NOWHERE, mocap=True, **t.options) for name, t in found.items()
+            }
         self._rows = np.array([handle.rows[0] for handle in self.handles.values()], np.int32)
         self.tracker = Tracker(self.names, rules, source.name)
         self._frozen, self._step = np.zeros(len(self.names), bool), 0

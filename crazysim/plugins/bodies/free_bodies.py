@@ -149,11 +149,10 @@ class FreeBodies(Population):
         if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
             raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
         self.check(sim)
-        self._add_to_scene(sim, shapes)
         terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, TerrainData)]
         n_contacts = require_few_contacts(Touching(sim, self).n_contacts(terrains), f"{len(shapes)} bodies")
         zero = np.zeros(3)
-        return self.create(
+        record = self.create(
             sim,
             FreeBodiesData,
             pos=np.asarray(pos, np.float64),
@@ -165,9 +164,11 @@ class FreeBodies(Population):
             impulse=zero,
             press=host_array(0.0, sim.n_worlds, 1, n_contacts),
             drag=host_array(0.0, sim.n_worlds, 1, n_contacts, 3),
-            inertia=numbers["mass"] * np.stack([inertia_per_mass(shape) for shape in shapes]),
+            inertia=zero,
             **numbers,
         )
+        self._add_to_scene(sim, shapes)
+        return record.replace(inertia=record.mass * np.stack([inertia_per_mass(shape) for shape in shapes]))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of the integration and of the contacts."""
@@ -216,13 +217,10 @@ class FreeBodies(Population):
 
     def _add_to_scene(self, sim: Simulation, shapes: Sequence[Shape]) -> None:
         """Add the bodies to the scene, if they are not there yet."""
-        objects = sim.data.objects
-        if objects is not None and f"{self.name}:0" in objects.names:
-            return
         rgba = (0.25, 0.5, 0.75, 1.0) if self.rgba is None else self.rgba
         colors = np.broadcast_to(as_rgba(rgba, len(shapes)), (len(shapes), 4))
         geoms = [bodies_geom(shape, rgba) for shape, rgba in zip(shapes, colors, strict=True)]
-        sim.scene.add(geoms, self.name, count=len(shapes))
+        sim.scene.add_once(geoms, self.name, len(shapes))
 
 
 def row(shapes: Sequence[Shape]) -> np.ndarray:

@@ -220,9 +220,6 @@ def add_to_scene(
         n_pieces: Straight pieces of each.
         ring: Height of the loads' rings above their middles, m, for links that end in a hook; None for others.
     """
-    objects = sim.data.objects
-    if objects is not None and f"{name}:0" in objects.names:
-        return
     rgba = as_rgba((0.85, 0.55, 0.2, 1.0) if rgba is None else rgba)
     half = np.full(3, size, float) if np.ndim(size) == 0 else np.asarray(size, float) / 2
     kind = "sphere" if np.ndim(size) == 0 else "box"
@@ -239,7 +236,7 @@ def add_to_scene(
         )
         kinds = [(body, name, n_loads), kinds[1], (head, f"{name}_hook", n_loads)]
     for text, kind, count in kinds:
-        sim.scene.add(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count=count)
+        sim.scene.add_once(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count)
 
 
 def _rod(start: Iterable[float], end: Iterable[float], radius: float, rgba: Iterable[float]) -> str:

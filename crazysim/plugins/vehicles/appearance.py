@@ -40,9 +40,6 @@ def _kind(cars: Any, part: str) -> str:
 
 def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
     """Add the objects of cars to the scene, if they are not there yet."""
-    objects = sim.data.objects
-    if objects is not None and f"{_kind(cars, 'body')}:0" in objects.names:
-        return
     number, n = vehicle.number, cars.n_members
     wheel = _wheel(number("wheels.radius"), number("wheels.width"))
     parts = {"body": (_body(vehicle, as_rgba(BODY if cars.rgba is None else cars.rgba)), n)}
@@ -53,7 +50,7 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
         parts["trailer"] = (_deck(vehicle), n)
         parts["trailer_wheel"] = (small, 4 * n)
     for part, (geoms, count) in parts.items():
-        sim.scene.add(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _kind(cars, part), count=count)
+        sim.scene.add_once(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _kind(cars, part), count)
 
 
 def wheel_places(vehicle: VehicleModel) -> np.ndarray:

@@ -140,10 +140,8 @@ class Cars(Population):
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
         two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
-        if self.in_scene:
-            appearance.add_to_scene(sim, self, vehicle)
         held = self.level == "drive" and follows is None
-        return self.create(
+        record = self.create(
             sim,
             CarData,
             pos=np.concatenate([pos, z], axis=-1),
@@ -166,6 +164,9 @@ class Cars(Population):
             memory=_for_members(memory, counts),
             gains=gains,
         )
+        if self.in_scene:
+            appearance.add_to_scene(sim, self, vehicle)
+        return record
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""

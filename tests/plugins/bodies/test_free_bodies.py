@@ -499,6 +499,8 @@ def test_stages_see_the_bodies():
     ((1,), {"quat": (0, 0, 0, 0)}, "expected quat"),
     ((1,), {"pos": (0, np.nan, 0)}, "expected pos of FreeBodies to be finite"),
     ((2,), {"pos": np.zeros((3, 3))}, "expected pos"),
+    ((3,), {"vel": np.zeros((2, 3))}, "expected vel with 1 dimensions"),
+    ((3,), {"mass": [0.1, 0.2]}, "expected mass with 1 dimensions"),
     ((1,), {"softness": 0.001}, "softness"),
     ((1,), {"objects": "nothing"}, "nothing"),
 ])  # fmt: skip
@@ -507,6 +509,19 @@ def test_law_09_wrong_settings_leave_the_simulation_as_it_was(args, kwargs, mess
     with pytest.raises(ConfigError, match=message):
         sim.add(FreeBodies(*args, **kwargs))
     assert sim.data.plugins == {}
+    assert sim.data.objects is None
+    assert [body.name for body in sim.spec.worldbody.bodies] == ["drone:0", "_dummy"]
+
+
+def test_law_09_bodies_that_stayed_in_the_scene_are_taken_again_as_many_as_they_are():
+    sim, _ = build(2)
+    with pytest.raises(ConfigError, match="expected 2 objects 'bodies', which are in the scene already, got 3"):
+        sim.replace(FreeBodies(3))
+    sim.remove("bodies")
+    with pytest.raises(ConfigError, match="expected 2 objects 'bodies', which are in the scene already, got 3"):
+        sim.add(FreeBodies(3))
+    sim.add(FreeBodies(2))
+    assert sim.data.objects.names == ("bodies:0", "bodies:1")
 
 
 def test_law_09_one_plugin_holds_all():
