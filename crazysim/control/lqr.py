@@ -26,6 +26,7 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
+from crazysim.tables import numbers
 
 
 class LQRParams(RigidBodyParams):
@@ -95,15 +96,24 @@ def weights_of(
 def as_weights(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     """Return weights as a matrix (n, n) of float64.
 
+    Args:
+        name: ``"Q"`` for weights of states, which may be zero, or ``"R"`` for those of inputs, which may not.
+        weights: A diagonal (n,) or a symmetric matrix (n, n).
+        n: Number of states or inputs.
+
     Raises:
-        ConfigError: If they are neither n numbers nor a symmetric matrix, or not finite.
+        ConfigError: If they are neither n numbers nor a symmetric matrix, not finite, or negative in any direction.
     """
-    array = np.asarray(weights, np.float64)
-    array = np.diag(array) if array.shape == (n,) else array
-    if array.shape != (n, n) or not np.all(np.isfinite(array)) or not np.allclose(array, array.T):
+    array = numbers(f"weights {name}", weights, shapes=((n,), (n, n)), remedy=f"Give a diagonal of {n} numbers.")
+    array = np.diag(array) if array.ndim == 1 else array
+    is_symmetric = np.allclose(array, array.T)
+    least, rounding = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()
+    if not is_symmetric or (least <= 0 if name == "R" else least < -rounding):
+        found = f"the eigenvalue {least:.3g}" if is_symmetric else "a matrix that is not symmetric"
+        kind = "definite" if name == "R" else "semidefinite"
         raise ConfigError(
-            f"expected weights {name} as {n} finite numbers or a symmetric matrix {(n, n)}, got shape "
-            f"{np.shape(weights)}. Give a diagonal of {n} numbers."
+            f"expected weights {name} as a symmetric, positive {kind} matrix, got {found}. Give a diagonal of {n} "
+            f"{'positive numbers' if name == 'R' else 'numbers that are at least zero'}."
         )
     return array
 

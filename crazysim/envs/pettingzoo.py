@@ -13,6 +13,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from crazysim.envs.env import Env
+from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, flatten
@@ -91,8 +92,12 @@ class DroneParallelEnv(ParallelEnv):
         Args:
             seed: Seed of all random numbers; None to continue those before, which first come from the system.
             options: Options of PettingZoo; there are none here, and they are ignored.
+
+        Raises:
+            ConfigError: If the seed is no integer that is at least 0.
         """
         del options
+        seed = as_seed(seed)
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)
         number = seed if seed is not None else int(self._generator.integers(2**31))

@@ -16,9 +16,26 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.errors import ConfigError, shown
 
 STRIDE = np.uint32(0x9E3779B9)
 """2^32 divided by the golden ratio: its multiples are spread evenly."""
+
+
+def as_seed(seed: object) -> int | None:
+    """Return a seed of the random numbers of all worlds; None stays None.
+
+    Raises:
+        ConfigError: If it is not an integer from 0 to 2^63 - 1, which both Gymnasium and JAX take.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**63:
+        raise ConfigError(
+            f"expected one integer from 0 to 2^63 - 1 as seed of all worlds, each of which draws its own numbers, got "
+            f"{shown(seed)}. Use for example 0."
+        )
+    return int(seed)
 
 
 def episode_key(data: SimData, name: str) -> Array:

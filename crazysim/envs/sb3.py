@@ -14,6 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.envs.env import Env
+from crazysim.envs.random import as_seed
 from crazysim.envs.rendering import Renderer
 from crazysim.envs.state import EnvState, Obs, check_actions, flatten
 from crazysim.envs.wrappers import AutoReset, EpisodeStatistics
@@ -82,7 +83,7 @@ class DroneVecEnv(VecEnv):
 
     def reset(self) -> Any:
         """Start new episodes in all worlds, with the last seed passed to ``seed`` if it is unused."""
-        seed = self._seeds[0]
+        seed = as_seed(self._seeds[0])
         number = seed if seed is not None else int(self._generator.integers(2**31))
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)

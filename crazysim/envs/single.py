@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.envs.env import DroneEnv
+from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES
 from crazysim.envs.vector import DroneVectorEnv
@@ -51,11 +52,11 @@ class DroneSingleEnv(gymnasium.Env):
         Without a seed the random numbers continue those before; the first ones come from the system.
 
         Raises:
-            ConfigError: If the seed is not an integer, or there are options.
+            ConfigError: If the seed is no integer that is at least 0, or there are options.
         """
         if options:
             raise ConfigError(f"expected no options of reset, got {', '.join(options)}")
-        super().reset(seed=seed)
+        super().reset(seed=as_seed(seed))
         obs, info = self.vector.reset(seed=int(self.np_random.integers(2**31)) if seed is None else seed)
         return _first(obs), _first(info)
 

@@ -15,12 +15,13 @@ from jax import Array
 from crazysim.cache import announced
 from crazysim.core.settings import as_mask, member, positive
 from crazysim.envs.env import DroneEnv, Env
+from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, check_actions
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
@@ -89,17 +90,14 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Without a seed the random numbers continue those before; the first ones come from the system.
 
         Raises:
-            ConfigError: If the seed is not an integer, an option does not exist, or there is a mask before the first
-                reset of all worlds.
+            ConfigError: If the seed is no integer that is at least 0, an option does not exist, or there is a mask
+                before the first reset of all worlds.
         """
         options = dict(options or {})
         mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
         if options:
             raise ConfigError(f"expected no option of reset but reset_mask, got {', '.join(options)}")
-        if seed is not None and not isinstance(seed, (int, np.integer)):
-            raise ConfigError(
-                f"expected one integer as seed of all worlds, each of which draws its own numbers, got {seed!r}"
-            )
+        seed = as_seed(seed)
         before = self.state
         if mask is not None and seed is not None:
             raise ConfigError(
@@ -107,13 +105,13 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             )
         if mask is not None and before is None:
             raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
-        super().reset(seed=None if seed is None else int(seed))
+        super().reset(seed=seed)
         if mask is not None:
             state = self._again(before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
             with announced("compiling the environment", "2 to 4 s"):
-                state = self._begin(jax.random.key(int(number)))
+                state = self._begin(jax.random.key(number))
         self._stepper.state, self._outputs = state, self._output(state)
         obs, _, info = self._outputs
         return self._handed((obs, self._with_final_info(info)))
@@ -223,13 +221,21 @@ def make_vector(
         num_envs: Number of worlds.
         autoreset_mode: Mode of automatic resets.
         render_mode: Mode of ``render``.
-        max_episode_steps: Length of an episode, steps; None for that of the task.
+        max_episode_steps: Length of an episode, steps; None for that of the task, or of its setting ``seconds``.
         numpy: True to return NumPy arrays, copies that may be written to.
         render_worlds: Worlds to render; None for all.
         render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.
+
+    Raises:
+        ConfigError: If an option does not exist, or both ``max_episode_steps`` and ``seconds`` are given.
     """
     if max_episode_steps is not None:
+        if "seconds" in options:
+            raise ConfigError(
+                f"expected max_episode_steps or seconds, got {shown(max_episode_steps)} and "
+                f"{shown(options['seconds'])}: both are the length of an episode. Leave one out."
+            )
         options["seconds"] = positive("max_episode_steps", max_episode_steps) / positive(
             "freq", options.get("freq", 50)
         )

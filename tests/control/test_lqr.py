@@ -11,7 +11,7 @@ from crazysim import Sim, load_airframe
 from crazysim.control import Setpoint
 from crazysim.control.linear import linearize, load_derivative, rod_angles, rod_direction
 from crazysim.control.load_lqr import LoadLQR, LoadLQRParams, load_gain, load_lqr_control, load_reference
-from crazysim.control.lqr import LQR, LQRParams, hover_gain, lqr_control, reference_of, state_error
+from crazysim.control.lqr import LQR, LQRParams, as_weights, hover_gain, lqr_control, reference_of, state_error
 from crazysim.control.tracking_lqr import (
     TrackingLQR,
     error_derivative,
@@ -80,9 +80,13 @@ def test_gains_inside_jit_have_gradients():
 
 
 BAD = {
-    "number of weights": ({"Q": [1, 2, 3]}, "12 finite numbers"),
-    "asymmetric": ({"Q": np.triu(np.ones((12, 12)))}, "symmetric"),
-    "not finite": ({"R": [1, np.nan, 1, 1]}, "4 finite numbers"),
+    "number of weights": ({"Q": [1, 2, 3]}, r"expected weights Q of shape \(12,\) or \(12, 12\), got \(3,\)"),
+    "asymmetric": ({"Q": np.triu(np.ones((12, 12)))}, "positive semidefinite matrix, got a matrix that is not symm"),
+    "not finite": ({"R": [1, np.nan, 1, 1]}, "expected R of LQR to be finite"),
+    "text": ({"Q": "a"}, "expected Q of LQR as a number or array, got 'a'"),
+    "negative": ({"Q": [1] * 11 + [-1]}, r"positive semidefinite matrix, got the eigenvalue -1\. .* at least zero"),
+    "negative in one direction": ({"Q": np.eye(12) - 0.1}, r"semidefinite matrix, got the eigenvalue -0\.2"),
+    "input without weight": ({"R": [1, 1, 1, 0]}, r"positive definite matrix, got the eigenvalue 0\. .* positive num"),
     "no weight on the position": ({"Q": [0] * 3 + [1] * 9}, "stabilising solution"),
 }
 
@@ -91,7 +95,13 @@ BAD = {
 def test_wrong_weights(case):
     settings, message = BAD[case]
     with pytest.raises(ConfigError, match=message):
-        LQR(**settings).params(load_airframe("bumblebee"))
+        Sim(drone="bumblebee", control="state", controller=LQR(**settings))
+
+
+def test_weights_may_be_singular_matrices():
+    """That of the sum of two states, whose least eigenvalue is zero but for rounding."""
+    direction = np.array([0.1, 0.7, 0.3])
+    np.testing.assert_array_equal(as_weights("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
 
 
 def a_setpoint():

@@ -87,6 +87,12 @@ def test_an_episode_ends_for_all(env):
         env.step({})
 
 
+@pytest.mark.parametrize("seed", [-1, True, 1.5])
+def test_wrong_seeds_are_refused(env, seed):
+    with pytest.raises(ConfigError, match=r"expected one integer from 0 to 2\^63 - 1 as seed of all worlds"):
+        env.reset(seed=seed)
+
+
 def test_wrong_actions_are_refused(env):
     env.reset(seed=0)
     good = np.zeros(4)

@@ -177,8 +177,11 @@ def test_an_action_of_the_device_that_is_not_finite_ends_its_world(next_step):
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
-        ({"seed": [1, 2, 3]}, ConfigError, "expected one integer as seed of all worlds"),
-        ({"seed": 1.5}, ConfigError, "expected one integer as seed of all worlds"),
+        ({"seed": [1, 2, 3]}, ConfigError, r"expected one integer from 0 to 2\^63 - 1 as seed of all worlds"),
+        ({"seed": 1.5}, ConfigError, "as seed of all worlds, each of which draws its own numbers, got 1"),
+        ({"seed": True}, ConfigError, "as seed of all worlds, .*, got True"),
+        ({"seed": -1}, ConfigError, "as seed of all worlds, .*, got -1"),
+        ({"seed": 2**63}, ConfigError, "as seed of all worlds, .*, got 9223372036854775808"),
         ({"options": {"colour": 1}}, ConfigError, "expected no option of reset but reset_mask, got colour"),
         ({"options": {"reset_mask": [True]}}, ValueError, r"shape \(1,\)"),
         ({"options": {"reset_mask": np.ones(3)}}, ValueError, r"expected a mask of shape \(3,\) and bool"),
@@ -205,6 +208,7 @@ def test_wrong_resets(next_step, kwargs, error, message):
         ({"color": "red"}, "task 'hover' has no option 'color'"),
         ({"n_world": 2}, "did you mean n_worlds"),
         ({"freq": "fast", "max_episode_steps": 5}, "freq is 'fast'; it must be a positive whole number"),
+        ({"seconds": 2.0, "max_episode_steps": 5}, "expected max_episode_steps or seconds, got 5 and 2.0: both"),
         ({"freq": 300}, "expected an environment freq that divides the simulation's 500 Hz, got 300 Hz"),
     ],
 )
@@ -323,6 +327,9 @@ def test_one_world_is_an_environment_that_gymnasium_accepts():
     env = gymnasium.make(ID, seconds=1.0)
     check_env(env.unwrapped, skip_render_check=True)
     first = env.reset(seed=5)[0]
+    for seed in (-1, True):
+        with pytest.raises(ConfigError, match="expected one integer from 0"):
+            env.unwrapped.reset(seed=seed)
     vec = gymnasium.make_vec(ID, num_envs=1, seconds=1.0, autoreset_mode="Disabled")
     many = vec.reset(seed=5)[0]
     truncated = False

@@ -100,7 +100,8 @@ def motor_reference(speed: Array, acc: Array, car: CarParams) -> Array:
     return force / car.drive[..., :1]
 
 
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field,))
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(setting, dataclasses.field))
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class PathController:
     """Base class of controllers that follow paths, with the speed control that they share.
 
@@ -110,12 +111,12 @@ class PathController:
 
     backwards: ClassVar[bool] = True
     """True if it can drive backwards."""
-    position_gain: float = 4.0
+    position_gain: float = setting(default=4.0, low=0.0)
     """Acceleration over the distance from a reference by time, 1/s^2."""
-    speed_gain: float = 4.0
+    speed_gain: float = setting(default=4.0, low=0.0)
     """Acceleration over the error of speed, 1/s."""
-    reference_max: float = 0.25
-    """Largest motor reference."""
+    reference_max: float = setting(default=0.25, low=0.0)
+    """Largest size of the motor reference, in the unit of the vehicle's."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""

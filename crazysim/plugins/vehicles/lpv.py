@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.following import PathController, PathState
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.plugins.vehicles.parameters import CarParams
@@ -70,7 +71,18 @@ class LPV(PathController):
     lateral: Sequence[Sequence[float]] = LATERAL["aiml_head"]
     """Gains k1, k2, k3 as polynomials of the speed, highest power first."""
     longitudinal: Sequence[Sequence[float]] = LONGITUDINAL
-    """Gains kl1, kl2 as polynomials of p, highest power first."""
+    """Gains kl1, kl2 as polynomials of p, highest power first; in place of ``position_gain`` and ``speed_gain``."""
+
+    def __post_init__(self) -> None:
+        """Check the settings.
+
+        Raises:
+            ConfigError: If one is invalid, or gains are set that this controller does not use.
+        """
+        super().__post_init__()
+        for name in ("position_gain", "speed_gain"):
+            if getattr(self, name) != getattr(PathController, name):
+                raise ConfigError(f"expected no {name} of LPV, got {getattr(self, name)}. Use longitudinal=.")
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> LPVGains:
         """Return the gains; the feed-forward is ``(m / C_f) (1 - (l_r C_r - l_f C_f) / m)``."""

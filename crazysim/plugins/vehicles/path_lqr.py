@@ -49,7 +49,7 @@ class PathLQR(PathController):
 
     Q: ArrayLike = (100.0, 0.1, 10.0, 0.1)
     """Weights of offset, sideways velocity, heading error and yaw rate. (4,) or (4, 4)"""
-    R: float = setting(default=20.0, low=0.0)
+    R: float = setting(default=20.0, positive=True)
     """Weight of the steering angle."""
 
     def gains(self, vehicle: VehicleModel, car: CarParams, freq: int) -> PathLQRGains:

@@ -10,6 +10,10 @@ from cases import by_stages, with_states
 
 from crazysim import ConfigError, Sim, Terrain
 from crazysim.plugins.vehicles import LPV, Bicycles, Cars, Path, PathLQR, PurePursuit, Stanley, ackermann
+from crazysim.plugins.vehicles.following import PathState, motor_reference
+from crazysim.plugins.vehicles.model import load_vehicle
+from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.state import CarState
 from crazysim.trajectories import circle, figure_eight
 
 EIGHT = figure_eight(5, 1.5, period=14.0, height=0.0)
@@ -77,6 +81,24 @@ def test_cars_follow_a_path(name):
     assert np.shape(lags) == (20, 3)
     assert np.max(distances) < {"pursuit": 0.06, "stanley": 0.1, "lpv": 0.05, "lqr": 0.03}[name]
     assert np.abs(lags).max() < 0.15
+
+
+@pytest.mark.parametrize("kind", [PurePursuit, Stanley, PathLQR])
+def test_gains_of_the_speed_are_settings_of_controllers(kind):
+    """A car at 1 m/s that has to drive 1.5 m/s and is 0.2 m behind."""
+    car = CarParams.create(load_vehicle("f1tenth_ros"), 500)
+    zero, speed = jnp.zeros(1), jnp.float32([1.5])
+    state = CarState(jnp.zeros(3), zero, jnp.float32([1.0, 0.0]), zero, zero, zero)
+    at = PathState(None, None, zero, zero, zero, zero, speed, jnp.float32([0.2]))
+    controller = kind(position_gain=3.0, speed_gain=2.0, reference_max=0.05)
+    driven = controller.driving(state, at, None, car)
+    np.testing.assert_allclose(driven, motor_reference(speed, 3.0 * 0.2 + 2.0 * 0.5, car), rtol=1e-6)
+    if kind is Stanley:
+        assert driven > 0.05
+        assert controller.update(state, at, None, None, car)[0][0] == np.float32(0.05)
+        assert LPV(reference_max=0.05).reference_max == 0.05
+        with pytest.raises(ConfigError, match=r"expected no speed_gain of LPV, got 2\.0\. Use longitudinal="):
+            LPV(speed_gain=2.0)
 
 
 @pytest.mark.parametrize("controller", [PurePursuit(), PathLQR()], ids=["pursuit", "lqr"])
@@ -233,8 +255,8 @@ def test_cars_roll_down_a_slope():
 
 
 def test_a_negative_weight_is_an_error():
-    with pytest.raises(ConfigError, match=r"expected R of PathLQR to be finite and at least 0, got -1\.0"):
-        PathLQR(R=-1.0)
+    with pytest.raises(ConfigError, match=r"expected R of PathLQR to be positive, got 0\.0"):
+        PathLQR(R=0.0)
 
 
 @pytest.mark.parametrize(
