@@ -9,7 +9,7 @@ import itertools
 import sys
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple, TypeVar
 
@@ -71,6 +71,18 @@ def flag(name: str, value: object) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise ConfigError(f"expected {name} as True or False, got {shown(value)}")
     return bool(value)
+
+
+class Numbers:
+    """Stands for ``ArrayLike`` in annotations, which is a union of many types."""
+
+
+class NumbersByName:
+    """Stands for ``Mapping[str, float]`` among the types of a field."""
+
+
+NAMES = {Callable: "a function", Mapping: "a dict"}
+"""Names of types for messages, where they are not those of the classes."""
 
 
 class Setting(NamedTuple):
@@ -139,7 +151,8 @@ def check_settings(settings: Any) -> None:
     """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
-    finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them. None is
+    finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and those of
+    ``Callable`` and ``Mapping`` functions and mappings of any kind. None is
     accepted where the annotation or the default allows it. Shapes that depend on the simulation, as those of parameters
     do, are checked with it.
 
@@ -157,7 +170,7 @@ def check_settings(settings: Any) -> None:
         classes = tuple(kinds - NUMERIC)
         if kinds == {bool}:
             flag(name, value)
-        elif kinds == {Mapping}:
+        elif kinds == {NumbersByName}:
             if not isinstance(value, Mapping):
                 raise ConfigError(f"expected {name} as a dict of numbers by name, got {shown(value)}. {remedy}")
             for key, item in value.items():
@@ -167,7 +180,7 @@ def check_settings(settings: Any) -> None:
             whole = kinds & NUMERIC == {int} or declared.dtype is not None
             numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
         elif not isinstance(value, classes):
-            names = " or ".join(sorted(k.__name__ for k in kinds))
+            names = " or ".join(sorted(NAMES.get(k, k.__name__) for k in kinds))
             raise ConfigError(f"expected {name} as {names}, got {shown(value)}. {remedy}")
 
 
@@ -180,23 +193,25 @@ def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
     found = {}
     for base in reversed(kind.__mro__):
         module = getattr(sys.modules.get(base.__module__), "__dict__", {})  # a file that was run may have none
-        names = module | {"ArrayLike": np.ndarray}
+        names = module | {"ArrayLike": Numbers}
         for name, hint in inspect.get_annotations(base).items():
             found[name] = _types(hint, names)
     return {field.name: found.get(field.name, ()) for field in dataclasses.fields(kind)}
 
 
 def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
-    """Return the types of an annotation; an empty tuple if it has others than classes, numbers and mappings of them."""
+    """Return the types of an annotation; an empty tuple if it has others than classes, functions and numbers."""
     if isinstance(hint, str):
         try:
             hint = eval(hint, dict(names))
         except Exception:  # a name that is imported for type checkers alone
             return ()
-    if hint == ArrayLike:
+    if hint is Numbers or hint == ArrayLike:
         return (np.ndarray,)
-    if typing.get_origin(hint) is Mapping and typing.get_args(hint)[1:] == (float,):
-        return (Mapping,)
+    if typing.get_origin(hint) is Mapping:
+        return (NumbersByName,) if typing.get_args(hint)[1:] == (float,) else (Mapping,)
+    if typing.get_origin(hint) is Callable:
+        return (Callable,)
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         parts = [_types(part, names) for part in typing.get_args(hint)]
         return tuple(itertools.chain(*parts)) if all(parts) else ()
@@ -204,8 +219,8 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
         return (np.ndarray,) if NUMERIC.issuperset(inner) else ()
     if hint is None:
         return (type(None),)
-    # A JAX array may be one of NumPy, of any type.
-    is_class = inspect.isclass(hint) and hint not in (Any, object, Array) and not typing.get_args(hint)
+    # Arrays may be of any type, such as bool, and a JAX array one of NumPy; ``ArrayLike`` is for numbers.
+    is_class = inspect.isclass(hint) and hint not in (Any, object, Array, np.ndarray) and not typing.get_args(hint)
     return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()
 
 

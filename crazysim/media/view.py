@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import check_settings, color, positive, setting
 from crazysim.eager import to_host
-from crazysim.errors import ConfigError
+from crazysim.errors import ConfigError, shown
 from crazysim.media.trail import Trail, colors_of
 from crazysim.media.worlds import world_indices
 from crazysim.sim.sim import Sim
@@ -183,11 +183,17 @@ class View:
 
     def _cam_config(self, sim: Sim, k: int, time: float, pos: NDArray) -> dict[str, Any]:
         """Return the settings of the free camera for the k-th world, with drones at ``pos``."""
-        config = dict((self.cam_config(time) if callable(self.cam_config) else self.cam_config) or {})
+        config = self.cam_config(time) if callable(self.cam_config) else self.cam_config
+        if config is not None and not isinstance(config, Mapping):
+            raise ConfigError(f"expected cam_config to return a dict, got {shown(config)}. Use {{'distance': 3.0}}.")
+        config = dict(config or {})
         if self.follow is not None:
             config["lookat"] = self._smooth(k, time, pos[self.follow])
         if self.hold is not None:
-            points = np.concatenate([pos, np.asarray(self.hold(sim, self.worlds[k]), float).reshape(-1, 3)])
+            held = np.asarray(self.hold(sim, self.worlds[k]), float)
+            if held.shape[-1:] != (3,):
+                raise ConfigError(f"expected hold to return points of shape (n, 3), got shape {held.shape}.")
+            points = np.concatenate([pos, held.reshape(-1, 3)])
             aim = self._smooth(k, time, _aim_at(points, float(sim.mj_model.vis.global_.fovy)))
             config |= {"lookat": aim[:3], "distance": aim[3]}
         return config

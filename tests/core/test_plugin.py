@@ -554,6 +554,7 @@ class Chosen(Plugin):
     """A plugin with an array of any type."""
 
     which: jax.Array | None = None
+    mask: np.ndarray | None = None
     name: str = "chosen"
 
 
@@ -561,3 +562,4 @@ class Chosen(Plugin):
 @pytest.mark.parametrize("values", [[True, False], [1.0, 2.0]])
 def test_arrays_of_both_libraries_are_settings(xp, values):
     np.testing.assert_array_equal(Chosen(xp.asarray(values)).which, values)
+    np.testing.assert_array_equal(Chosen(mask=xp.asarray(values)).mask, values)

@@ -285,6 +285,11 @@ def test_text_changes_its_corner_and_nothing_else(sim):
         ({"camera": -1, "follow": 0, "lag": -1.0}, "lag of View to be finite and at least 0, got -1.0"),
         ({"trail": -1.0}, "trail of View to be finite and at least 0, got -1.0"),
         ({"text": "{drone}"}, "only, got '{drone}'"),
+        ({"cam_config": 3}, "expected cam_config of View as a dict or a function, got 3"),
+        ({"camera": -1, "cam_config": lambda time: time}, "expected cam_config to return a dict, got "),
+        ({"camera": -1, "hold": 3}, "expected hold of View as a function, got 3"),
+        ({"camera": -1, "hold": lambda sim, world: [1.0, 2.0]}, "to return points of shape (n, 3), got shape (2,)"),
+        ({"draw": "drones"}, "expected draw of View as a function, got 'drones'"),
         ({"text": "Zürich"}, "expected ASCII text, got 'Zürich' with 'ü'"),
     ],
 )

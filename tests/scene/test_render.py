@@ -256,6 +256,7 @@ def test_images_belong_to_the_caller(sim):
         ({"camera": -1, "cam_config": {"zoom": 2}}, "in cam_config, got 'zoom'"),
         ({"camera": -1, "cam_config": {"lookat": [1, 2]}}, "expected numbers for lookat"),
         ({"camera": -1, "cam_config": {"distance": "far"}}, "expected numbers for distance"),
+        ({"camera": -1, "cam_config": 3}, "expected cam_config as a dict, got 3. Use {"),
     ],
 )
 def test_wrong_arguments_of_render_are_refused(sim, wrong, message):
