@@ -34,8 +34,9 @@ SHARE_LEFT = 0.8
 """Share of the limit that is left by a removal, so that not every process has to remove files."""
 MIN_FREE = 50_000_000
 """Free space below which a disk counts as full, bytes: the programs of some simulations."""
-PATTERNS = ("*-cache", "*-atime", "crazysim/*.so", "crazysim/*.ptx", "crazysim/*.cubin")
-"""Names of the files that JAX and the engine write; other files in the folder are never removed."""
+PATTERNS = ("*-cache", "*-atime", "xla_gpu_per_fusion_autotune_cache_dir/*", "xla_gpu_kernel_cache_file",
+            "crazysim/*.so", "crazysim/*.ptx", "crazysim/*.cubin")  # fmt: skip
+"""Names of the files that JAX, XLA and the engine write; other files in the folder are never removed."""
 CPU_INFO = Path("/proc/cpuinfo")
 """File in which Linux lists the features of the CPU."""
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
+
 import jax
 
 LONGEST = 60
 """Most characters of a value in a message."""
+BETWEEN = ("crazysim", "jax", "contextlib", "functools", "importlib")
+"""Packages whose lines may stand between a warning and the line of the user's that caused it."""
 
 
 def shown(value: object) -> str:
@@ -19,6 +24,16 @@ def shown(value: object) -> str:
 
 def _kind(value: object) -> str:
     return f"a {type(value).__name__}"
+
+
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the user's that led here, the nearest one outside of ``BETWEEN``."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in BETWEEN:
+        frame = frame.f_back
+    names = frame.f_globals
+    registry = names.setdefault("__warningregistry__", {})
+    warnings.warn_explicit(text, category, frame.f_code.co_filename, frame.f_lineno, names.get("__name__"), registry)
 
 
 def not_installed(use: str, package: str, extra: str) -> str:

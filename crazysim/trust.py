@@ -9,6 +9,9 @@ from pathlib import Path
 REMEDY = "Remove it, since what it holds may not be yours, or use another."
 """End of the message for a folder that is refused."""
 
+SYSTEM = (0, 65534)
+"""Users that may own the folders above: root, also as containers and network file systems show it, as "nobody"."""
+
 
 def make_private(folder: Path) -> None:
     """Make a folder that only this user can enter, with the folders above it as usual; it may exist.
@@ -36,7 +39,9 @@ def distrust(path: Path) -> str:
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return "other users can write to it"
     for parent in path.resolve().parents:
-        mode = parent.stat().st_mode
-        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+        status = parent.stat()
+        if status.st_uid not in (os.geteuid(), *SYSTEM):
+            return f"the user {status.st_uid} can replace it, who owns {parent}"
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
             return f"other users can replace it, as they can write to {parent}"
     return ""

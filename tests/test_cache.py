@@ -240,8 +240,10 @@ def test_a_command_runs_where_the_folder_cannot_be_used(settings, monkeypatch, t
 
 
 def test_the_least_recently_used_programs_are_removed_and_no_other_file(tmp_path):
-    (tmp_path / "crazysim").mkdir()
-    names = ("jit_a-cache", "jit_b-cache", "crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache")
+    tuned = "xla_gpu_per_fusion_autotune_cache_dir"  # where JAX lets XLA keep what it has tried on a GPU
+    for folder in ("crazysim", tuned):
+        (tmp_path / folder).mkdir()
+    names = ("jit_a-cache", f"{tuned}/b", "crazysim/c.so", "letter.txt", "jit_d-cache", "jit_e-cache")
     for age, name in enumerate(reversed(names)):
         (tmp_path / name).write_bytes(bytes(10))
         os.utime(tmp_path / name, (time.time() - 1000 * age,) * 2)

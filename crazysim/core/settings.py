@@ -152,9 +152,8 @@ def check_settings(settings: Any) -> None:
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
     finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and those of
-    ``Callable`` and ``Mapping`` functions and mappings of any kind. None is
-    accepted where the annotation or the default allows it. Shapes that depend on the simulation, as those of parameters
-    do, are checked with it.
+    ``Callable`` and ``Mapping`` functions and mappings of any kind. None is accepted where the annotation or the
+    default allows it. Shapes that depend on the simulation, as those of parameters do, are checked with it.
 
     Raises:
         ConfigError: If a field has anything else.
@@ -211,7 +210,7 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
     if typing.get_origin(hint) is Mapping:
         return (NumbersByName,) if typing.get_args(hint)[1:] == (float,) else (Mapping,)
     if typing.get_origin(hint) is Callable:
-        return (Callable,)
+        return (Callable,)  # type: ignore[return-value]  # a class for ``isinstance``
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         parts = [_types(part, names) for part in typing.get_args(hint)]
         return tuple(itertools.chain(*parts)) if all(parts) else ()

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE, Airframe
 from crazysim.drones.keys import GUIDE, LAYOUT
-from crazysim.errors import AirframeWarning, ConfigError, shown
+from crazysim.errors import AirframeWarning, ConfigError, shown, warn
 from crazysim.tables import INERTIA, check_numbers
 
 MAX_ROTORS = 64
@@ -73,7 +71,7 @@ def _inertia(airframe: Airframe) -> str | None:
     if excess > ROUNDING:
         remedy = "Measure the moments again, or lower the largest."
         text = f"airframe {airframe.name!r}: {found}: {100 * excess:.1f}% more. {remedy}"
-        warnings.warn(text, AirframeWarning, stacklevel=2)
+        warn(text, AirframeWarning)
     return None
 
 

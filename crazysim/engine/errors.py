@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import jax
 
-from crazysim.errors import ConfigError, EngineWarning, UnsupportedError
+from crazysim.errors import ConfigError, EngineWarning, UnsupportedError, warn
 
 
 class LimitError(UnsupportedError):
@@ -37,4 +36,4 @@ def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str]
         raise ConfigError(f"{text}. {remedy}, or use strict=False.")
     if text not in reported:
         reported.add(text)
-        warnings.warn(f"{text}. strict=True raises an error instead.", EngineWarning, stacklevel=2)
+        warn(f"{text}. strict=True raises an error instead.", EngineWarning)

@@ -430,8 +430,9 @@ def test_moments_of_inertia_that_are_slightly_wrong_are_a_warning_with_the_figur
     def body(z):
         return {"base": "cf2x_L250", "rigid_body": {"mass": 0.03, "inertia": [1.43e-5, 1.43e-5, z]}}
 
-    with pytest.warns(AirframeWarning, match=r"largest moment is at most the sum .* 1\.0% more\. Measure"):
+    with pytest.warns(AirframeWarning, match=r"largest moment is at most the sum .* 1\.0% more\. Measure") as given:
         assert Sim(drone=body(2.89e-5)).data.params.J[..., 2, 2] == np.float32(2.89e-5)
+    assert given[0].filename == __file__, "a warning points to the user's line"
     with pytest.raises(ConfigError, match="largest moment is at most the sum of the others"):
         load_airframe(body(3.04e-5))
     load_airframe(body(2.86e-5 * 1.000005))

@@ -82,6 +82,16 @@ def test_a_folder_of_another_user_is_refused(cache):
 
 
 @as_root
+def test_a_folder_in_one_of_another_user_is_refused(cache):
+    """Who owns a folder can put another one in the place of what is in it."""
+    shared = kernel_cache.folder()
+    os.chown(cache, OTHERS, OTHERS)
+    assert distrust(shared) == f"the user {OTHERS} can replace it, who owns {cache}"
+    os.chown(cache, 65534, 65534)  # root, as containers and network file systems show it
+    assert not distrust(shared)
+
+
+@as_root
 def test_a_file_of_another_user_is_not_loaded(cache):
     """It may have been put there before the folder was closed."""
     folder = kernel_cache.folder()
@@ -145,6 +155,16 @@ def test_remains_of_killed_processes_are_removed(tmp_path, kept):
         kernel_cache.sweep(tmp_path, pattern)
     assert sorted(tmp_path.iterdir()) == sorted(needed)
     assert not any(path.exists() for path in remains)
+
+
+def test_no_process_is_asked_for_on_windows(monkeypatch):
+    """There the call that asks on POSIX systems sends Ctrl+C."""
+    name = f"key.{kernel_cache.owner()}-140.tmp"
+    with monkeypatch.context() as faked:
+        faked.setattr(kernel_cache.os, "kill", None)
+        faked.setattr(kernel_cache.os, "name", "nt")
+        found = [kernel_cache._abandoned(name, age * kernel_cache.DAY) for age in (0.9, 1.1)]
+    assert found == [False, True]
 
 
 def test_the_folders_are_swept_at_the_next_start(cache, kept):

@@ -1,6 +1,7 @@
 """Compiled host kernels: found again where they fit, and only there."""
 
 import ctypes
+import errno
 import os
 import shutil
 import signal
@@ -143,6 +144,15 @@ def test_a_folder_that_forbids_execution_does_no_harm(source, place, compilation
     monkeypatch.setattr(native, "_loaded", lambda path: None if path.is_relative_to(place) else real(path))
     native.target(source)
     assert len(compilations) == 1
+
+
+def test_a_kernel_that_cannot_be_written_says_so(source, place, compilations, monkeypatch):
+    def full(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(kernel_cache, "store", full)
+    with pytest.raises(KernelError, match=r"cannot be written: .*No space left on device; make room, or set TMPDIR"):
+        native.target(source)
 
 
 def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):

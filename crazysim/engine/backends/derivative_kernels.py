@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -23,7 +22,7 @@ from crazysim.engine.backends.reverse import Reverse
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.engine.lowering.tangents import with_tangents
-from crazysim.errors import EngineWarning
+from crazysim.errors import EngineWarning, warn
 
 Leaves = dict[int, Any]
 """Arrays by leaf."""
@@ -96,7 +95,7 @@ class DerivativeKernels:
             announce("compiling a derivative of the steps on lanes", "10 to 40 s")
             self.used[f"{kind}: on lanes ({error})"] = None
             if not isinstance(error, LimitError):
-                warnings.warn(f"the {kind} of the step runs on 'lanes': {error}", EngineWarning, stacklevel=2)
+                warn(f"the {kind} of the step runs on 'lanes': {error}", EngineWarning)
         launch = self._launches.get(place)
         return None if launch is None else (self._programs[key], launch)
 

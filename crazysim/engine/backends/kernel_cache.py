@@ -24,11 +24,11 @@ import stat
 import tempfile
 import threading
 import time
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 from crazysim import cache
+from crazysim.errors import warn
 from crazysim.trust import REMEDY, distrust, make_private
 
 LENGTH = 24
@@ -66,10 +66,9 @@ def folder() -> Path:
 @functools.cache
 def _refuse(shared: Path, reason: str) -> None:
     """Warn, once, that a folder is not used."""
-    warnings.warn(
+    warn(
         f"expected a folder of kernels that only this user can write, got {str(shared)!r}: {reason}, so kernels are "
-        f"compiled again in every process. {REMEDY}",
-        stacklevel=2,
+        f"compiled again in every process. {REMEDY}"
     )
 
 
@@ -144,7 +143,7 @@ def _abandoned(name: str, age: float) -> bool:
     if named is None:
         return name.endswith(".tmp") and age > DAY
     machine, pid = named.groups()
-    if machine != _machine():
+    if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
         return age > DAY
     try:
         os.kill(int(pid), 0)

@@ -229,13 +229,18 @@ def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
         library = _loaded(path)
         if library is not None:
             return library
-    made = _compile(words, source)
+    made, lost = _compile(words, source), None
     for where in dict.fromkeys((place, kernel_cache.temporary())):  # code in a shared folder may not be executable
-        with contextlib.suppress(OSError):  # its disk is full
+        try:
             library = _loaded(kernel_cache.store(where, key, made, ".so"))
-            if library is not None:
-                return library
-    raise KernelError(f"the kernel that {words[0]} compiled cannot be loaded; check that it compiles for this machine")
+        except OSError as error:
+            lost = f"the kernel that {words[0]} compiled cannot be written: {error}; make room, or set TMPDIR"
+            continue
+        if library is not None:
+            return library
+    raise KernelError(
+        lost or f"the kernel that {words[0]} compiled cannot be loaded; check that it compiles for this machine"
+    )
 
 
 def _loaded(path: Path) -> ctypes.CDLL | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Hashable
 from typing import ClassVar
 
@@ -18,7 +17,7 @@ from crazysim.envs.fused_step import Action, FusedEnvStep
 from crazysim.envs.reset_policy import POLICIES, AutoresetMode
 from crazysim.envs.state import EnvState, validate_action
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import EngineWarning
+from crazysim.errors import EngineWarning, warn
 
 
 class AutoReset(Wrapper):
@@ -93,5 +92,5 @@ class AutoReset(Wrapper):
                 if self.base.strict:
                     raise
                 self._fused[key] = None, str(error).partition("\n")[0]
-                warnings.warn(f"environment steps run unfused: {error}", EngineWarning, stacklevel=3)
+                warn(f"environment steps run unfused: {error}", EngineWarning)
         return self._fused[key]
