@@ -6,9 +6,12 @@ really fails is raised as an exception.
 
 MuJoCo draws through GLFW, which needs a screen. Without a screen, and where EGL is installed, it draws through EGL. A
 ``MUJOCO_GL`` that it refuses would end the import of crazysim, so MuJoCo is imported here, and then without drawing.
+
+Where JAX or MuJoCo is broken, the command ``crazysim``, whose ``info`` is for finding out just that, ends with a line.
 """
 
 import ctypes
+import importlib
 import os
 import sys
 import warnings
@@ -51,5 +54,33 @@ def _has_egl() -> bool:
     return True
 
 
+def _is_command() -> bool:
+    """Return True in a process of the command ``crazysim``, or of ``python -m crazysim``."""
+    name = os.path.basename(sys.argv[0] if sys.argv else "")
+    return name in ("crazysim", "crazysim.exe") or (name == "-m" and "crazysim" in sys.orig_argv)
+
+
+def import_required() -> None:
+    """Import JAX and MuJoCo.
+
+    Raises:
+        ImportError: If one of them is broken or missing, with its name.
+        SystemExit: Instead, in the command ``crazysim``, after the same line.
+    """
+    for name, load in (("jax", lambda: importlib.import_module("jax")), ("mujoco", import_mujoco)):
+        try:
+            load()
+        except Exception as error:  # whatever a damaged package raises
+            reason = str(error).strip().partition("\n")[0][:300]
+            text = (
+                f"expected the package {name!r} to be importable, got {type(error).__name__}: {reason}. Install it "
+                f"again: pip install --force-reinstall {name}"
+            )
+            if _is_command():
+                print(f"crazysim: {text}", file=sys.stderr)
+                sys.exit(2)
+            raise ImportError(text, name=name) from error
+
+
 set_variables()
-import_mujoco()
+import_required()

@@ -72,6 +72,25 @@ def test_broken_settings_are_lines_with_the_reason(monkeypatch, capsys):
     assert "words in CXXFLAGS" in lines(capsys.readouterr().out)["C++ compiler"]
 
 
+@pytest.mark.parametrize("package", ["jax", "mujoco"])
+def test_a_broken_package_is_a_line_and_no_traceback(tmp_path, package):
+    (tmp_path / f"{package}.py").write_text("raise ImportError('libbroken.so: no such file')")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+
+    def run(*words):
+        done = subprocess.run([sys.executable, *words], capture_output=True, text=True, env=environment)
+        return done.returncode, done.stderr
+
+    words = (
+        f"expected the package '{package}' to be importable, got ImportError: libbroken.so: no such file. Install it "
+        f"again: pip install --force-reinstall {package}\n"
+    )
+    assert run("-m", "crazysim", "info") == (2, f"crazysim: {words}")
+    status, text = run("-c", "import crazysim")
+    assert status == 1
+    assert text.endswith(f"ImportError: {words}")
+
+
 def test_a_backend_that_cannot_be_used_is_a_line():
     """MuJoCo ends its import at a ``MUJOCO_GL`` that it does not have, or whose library is missing."""
     done = subprocess.run(
