@@ -23,7 +23,7 @@ from crazysim.live.interaction import Interaction
 from crazysim.live.pace import LiveReport, Pace, Speed, undisturbed
 from crazysim.live.process import Event, OnError, Process, RateLimit, period_of
 from crazysim.live.recordings import Recordings
-from crazysim.live.staging import StagedCommands
+from crazysim.live.staging import StagedCommands, compile_step
 from crazysim.live.viewer import Viewer
 from crazysim.live.viewers import Viewers
 from crazysim.sim.sim import Sim
@@ -386,10 +386,7 @@ class Live(Interaction, Closing):
     def _warm_up(self) -> None:
         """Compile what a control step needs, before time begins to run."""
         self._commands.stage()
-        data = self.sim.data
-        self.sim.step(self.n_substeps)
-        jax.block_until_ready(self.sim.data.states.pos)
-        self.sim.data = data
+        compile_step(self.sim, self.n_substeps)
         self._viewers.update(self)
         self._viewers.next_at = perf_counter()
 

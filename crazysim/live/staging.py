@@ -1,7 +1,8 @@
-"""Commands of a live simulation: one array that processes write into, staged once per control step."""
+"""Commands of a live simulation, one array that processes write into, staged once per control step; its compilation."""
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +48,15 @@ class StagedCommands:
             self.array[:] = array
         elif self._array is not None:
             self._array[:] = _present(self._sim)
+
+
+def compile_step(sim: Sim, n_steps: int) -> None:
+    """Compile what steps need, before others wait for them: take some, and return to the data before."""
+    with sim.lock:
+        data = sim.data
+        sim.step(n_steps)
+        jax.block_until_ready(sim.data.states.pos)
+        sim.data = data
 
 
 def _present(sim: Sim) -> NDArray:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from waiting import wait_for
 
 from crazysim import Sim
+from crazysim.core.pipeline import append_fn
 from crazysim.errors import ConfigError
 from crazysim.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
 from crazysim.live.crtp.setpoints import unpack_quat
@@ -320,6 +321,21 @@ def test_a_server_answers_scans_and_says_when_it_is_open_to_a_network(swarm, cap
         peer.close()
     with CrtpServer(swarm, host="0.0.0.0", port=0):
         assert "every machine of that network can fly the drones" in caplog.text
+
+
+@pytest.mark.parametrize("wait", ["server", "start"])
+def test_a_step_is_compiled_before_clients_wait(wait):
+    """``aiocflib`` gives up after 0.6 s without an answer, which no step compiles in."""
+    sim, traced = Sim(control="state", engine="interpret"), []
+    append_fn(sim.step_pipeline, lambda data: (traced.append(1), data)[1], "traced")
+    swarm = Swarm(sim)
+    waiting = CrtpServer(swarm, port=0) if wait == "server" else swarm.start(speed=1e-6)
+    n = len(traced)
+    waiting.close()
+    assert n > 0
+    assert float(sim.time[0, 0]) <= (0.0 if wait == "server" else 0.011)  # the thread may have taken its first
+    swarm.advance(0.02)
+    assert len(traced) == n
 
 
 # Packets ------------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ class CrtpServer(Closing):
     """Drones of a swarm on UDP, answered by a thread."""
 
     def __init__(self, swarm: Swarm, host: str = "127.0.0.1", port: int = PORT):
-        """Listen.
+        """Compile a step of the swarm, since clients wait for less time than that takes, and listen.
 
         Args:
             swarm: Swarm, which something else advances, such as ``swarm.start()``.
@@ -40,6 +40,7 @@ class CrtpServer(Closing):
         """
         if host not in ("127.0.0.1", "localhost"):
             log.warning("listening at %s: every machine of that network can fly the drones", host)
+        swarm.compile_step()
         self.swarm = swarm
         self.devices = [CrtpDevice(swarm, k) for k in range(len(swarm.names))]
         self._clients: list[tuple[str, int] | None] = [None] * len(self.devices)

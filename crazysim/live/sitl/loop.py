@@ -20,6 +20,7 @@ from crazysim.live.attitude import rotate
 from crazysim.live.pace import Pace, Speed
 from crazysim.live.sitl.link import ROUNDING, TIMEOUT, FirmwareLink
 from crazysim.live.sitl.measured import Measured
+from crazysim.live.staging import compile_step
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.sim import Sim
@@ -97,6 +98,7 @@ class SoftwareInTheLoop(Closing):
         self._taken: NDArray | None = None
         self._heard = [0.0] * len(self.links)
         self._exchanges = 0
+        self._compiled = False
 
     def run(self, seconds: float, speed: Speed | None = None) -> None:
         """Fly for a simulated time.
@@ -112,6 +114,9 @@ class SoftwareInTheLoop(Closing):
         seconds = number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
+        if not self._compiled:  # a firmware with a clock of its own does not wait
+            compile_step(self.sim, self._n_steps)
+            self._compiled = True
         dt, began = self._n_steps / self.sim.freq, time.monotonic()
         self._heard = [began] * len(self.links)
         pace = Pace(dt, speed)

@@ -23,6 +23,7 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.live.attitude import from_yaw, rotate, to_rpy
 from crazysim.live.loop import Live
 from crazysim.live.mocap.source_events import Reports
+from crazysim.live.staging import compile_step
 from crazysim.live.swarm.commander import Commander
 from crazysim.live.swarm.parameters import LIGHTS, Parameters, parameters_of
 from crazysim.live.swarm.sensors import ranges_of
@@ -215,14 +216,20 @@ class Swarm(Closing):
         while self.time < end - 1e-9 and self._thread.is_alive():
             time.sleep(0.001)
 
+    def compile_step(self) -> None:
+        """Compile what a control step needs, before programs wait for answers: they give up sooner than it takes."""
+        with self.lock:
+            compile_step(self.sim, self._period)
+
     def start(self, speed: float = 1.0) -> Swarm:
-        """Advance in a thread, in real time or at another speed, and return the swarm.
+        """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm.
 
         Raises:
             ConfigError: If a live loop advances the simulation.
         """
         if self._live is not None:
             raise ConfigError("expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
+        self.compile_step()
         self._stopped.clear()
         self._thread = threading.Thread(target=self._run, args=(speed,), name="swarm", daemon=True)
         self._thread.start()
