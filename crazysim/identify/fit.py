@@ -30,7 +30,7 @@ DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
 SLOW_CORNER = 0.2
 """Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
-samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples."""
+samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples, whose cause is unknown."""
 LARGEST = 10.0
 """Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
 checked, a thrust factor stays below 2.5 squared times that of the mass."""
