@@ -10,7 +10,7 @@ REMEDY = "Remove it, since what it holds may not be yours, or use another."
 """End of the message for a folder that is refused."""
 
 SYSTEM = (0, 65534)
-"""Users that may own the folders above: root, also as containers and network file systems show it, as "nobody"."""
+"""Users that may own the folders above: root, and the one that stands for root in containers that do not map it."""
 
 
 def make_private(folder: Path) -> None:

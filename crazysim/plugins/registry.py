@@ -139,13 +139,10 @@ class PluginRegistry(Mapping[str, Plugin]):
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
             self._checked = False
             return plugin
-        present_pipeline = sim.step_pipeline
-        sim.step_pipeline = _without(dict(present_pipeline), self._installed[name])
-        try:  # the stages are made for a pipeline without the plugin
-            pipeline, installed = _with(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
-            pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
-        finally:
-            sim.step_pipeline = present_pipeline
+        # The stages are made for a pipeline without the plugin.
+        sim.step_pipeline = _without(dict(sim.step_pipeline), self._installed[name])
+        pipeline, installed = _with(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
+        pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
         if _begins_at_resets(plugin) and (name in resets or not _begins_at_resets(before)):
             resets[name] = Stage(plugin.begin_episode, "drone")

@@ -161,7 +161,7 @@ def as_poses(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | Non
 
 
 class Mark(NamedTuple):
-    """What there was in a scene at some time."""
+    """Contents of a scene at some time, to which ``take_back`` returns."""
 
     names: list[set[str]]
     """Names of the elements of the spec, as ``_elements`` has them."""
@@ -224,7 +224,7 @@ class SceneObjects:
         return sum(len(handle) for handle in self._handles if handle.name == name)
 
     def mark(self, spec: mujoco.MjSpec) -> Mark:
-        """Return what there is in a spec now, for ``take_back``."""
+        """Return the contents of a spec as they are now, for ``take_back``."""
         return Mark([{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial[:])
 
     def take_back(self, spec: mujoco.MjSpec, mark: Mark) -> bool:
