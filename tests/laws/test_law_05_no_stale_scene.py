@@ -203,12 +203,11 @@ def test_the_flag_of_the_data_follows(two):
 
 
 def test_an_edit_of_the_scene_has_the_next_question_sync_once(syncs):
-    """An edit compiles the scene at the next question, and clears the one flag, whoever asks for the data first."""
+    """An edit compiles the scene at the next question, and clears the one flag."""
     sim = Sim(n_worlds=2)
     edits = {
         "add": lambda: sim.scene.add("sphere", pos=(0.0, 0.0, 9.0)),
         "build_mjx": sim.build_mjx,
-        "the model before the data": lambda: (sim.scene.add("box", pos=(9.0, 0.0, 1.0)), sim.mj_model),
     }
     for name, edit in edits.items():
         sim.contacts()
