@@ -211,7 +211,7 @@ def responses(name: str, airframes: list[Airframe], level: str, device: str = "c
 
 def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions of all drones after each step of 15 s, m, and those of the figure eight."""
-    step, feeds = sim.build_step_fn(), sim.data.controls.controller is not None
+    step, feeds = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
 

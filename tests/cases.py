@@ -122,7 +122,7 @@ def with_airframes(sim, airframes):
     settings = sim.configuration.control_freqs, sim.configuration.controller
     each = [SimControls.create(1, 1, sim.control, sim.dynamics, airframe, *settings) for airframe in kinds]
     controls = sim.data.controls
-    for name in ("state", "attitude", "body_rate", "force_torque", "controller"):
+    for name in ("state", "attitude", "body_rate", "force_torque"):
         ctrl = getattr(controls, name)
         if ctrl is not None and ctrl.params is not None:
             own = stacked([getattr(c, name).params for c in each])

@@ -14,7 +14,8 @@ from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.control.allocation import hover_rotor_vel, level_thrust, yaw_arm
 from crazysim.control.auto import Auto
 from crazysim.control.bandwidth import authority, precession, rotor_rate
-from crazysim.control.controllers import CASCADE, find_controller
+from crazysim.control.controllers import find_controller
+from crazysim.control.crazyflow import Crazyflow
 from crazysim.drones import Airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics, supported_dynamics
@@ -139,7 +140,7 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
     if Dynamics.first_principles not in dynamics:
         if dynamics:
             yield "  auto", "state, above the response of the fitted model"
-            yield f"  {CASCADE}", _levels({"state": _lack(lambda: StateParams.create(airframe)), "attitude": ""})
+            yield f"  {Crazyflow.name}", _levels({"state": _lack(lambda: StateParams.create(airframe)), "attitude": ""})
         return
     for name in STATE:
         found: Any = find_controller(name)
@@ -147,7 +148,7 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
         yield f"  {name}", _levels({", ".join(level.value for level in found.levels): lack})
     stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
     lacks = {levels: _lack(functools.partial(params.create, airframe)) for levels, params in stages.items()}
-    yield f"  {CASCADE}", _levels(lacks)
+    yield f"  {Crazyflow.name}", _levels(lacks)
 
 
 def _levels(lacks: Mapping[str, str]) -> str:

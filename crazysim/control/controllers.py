@@ -9,12 +9,11 @@ from crazysim.control.protocol import Controller
 from crazysim.control.switch import switch_of
 from crazysim.errors import ConfigError, UnknownNameError
 
-CASCADE = "crazyflow"
-"""Name of Crazyflow's cascade, which is made of stages of its own and follows every command level."""
 DEFAULT = "auto"
 """Name of the default controller."""
 CONTROLLERS = {
     "auto": "crazysim.control.auto:Auto",
+    "crazyflow": "crazysim.control.crazyflow:Crazyflow",
     "pid": "crazysim.control.pid:PID",
     "mellinger": "crazysim.control.mellinger:Mellinger",
     "geometric": "crazysim.control.geometric:Geometric",
@@ -26,8 +25,8 @@ CONTROLLERS = {
 """Controllers by name, as ``"module:class"``; each is imported at its first use."""
 
 
-def find_controller(controller: Any, switch: Any = None) -> Controller | None:
-    """Return the controller of a simulation; None for Crazyflow's cascade.
+def find_controller(controller: Any, switch: Any = None) -> Controller:
+    """Return the controller of a simulation.
 
     Args:
         controller: Name, ``Controller``, or a list of them, which ``switch`` chooses from.
@@ -38,24 +37,18 @@ def find_controller(controller: Any, switch: Any = None) -> Controller | None:
         ConfigError: If it is neither a name nor a controller, or the switch does not fit.
     """
     if isinstance(controller, (list, tuple)):
-        found = [find_controller(each) for each in controller]
-        if None in found:
-            raise ConfigError(
-                f"expected controllers other than {CASCADE!r}, which is made of stages of its own, in a list. Use "
-                f"'mellinger'."
-            )
-        return switch_of([each for each in found if each is not None], switch)
+        return switch_of([find_controller(each) for each in controller], switch)
     if switch is not None:
         raise ConfigError(f"expected a list of controllers for a switch, got {controller!r}. Use controller=[...].")
-    if isinstance(controller, Controller) or controller == CASCADE:
-        return None if controller == CASCADE else controller
+    if isinstance(controller, Controller):
+        return controller
     if not isinstance(controller, str):
         raise ConfigError(
             f"expected a controller as a name or a Controller, got {controller!r}. Use controller='pid', or an "
             f"instance of a subclass of crazysim.control.Controller."
         )
     if controller not in CONTROLLERS:
-        names = ", ".join(repr(name) for name in sorted((CASCADE, *CONTROLLERS)))
+        names = ", ".join(repr(name) for name in sorted(CONTROLLERS))
         library = controller.endswith((".so", ".dylib"))
         remedy = f" Use CFirmware({controller!r}) for a compiled controller." if library else ""
         raise UnknownNameError(f"expected controller as one of {names}, got {controller!r}.{remedy}")

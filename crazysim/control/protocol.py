@@ -84,11 +84,18 @@ class Controller:
     levels: ClassVar[tuple[Control, ...]]
     """Command levels that it follows."""
     output: ClassVar[Control]
-    """Level of the command that it returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted dynamics."""
+    """Level of the command that it returns: ``force_torque`` or ``rotor_vel``, or ``attitude`` with fitted dynamics or
+    an ``inner`` controller."""
     freq: int
     """Rate of ``update``, Hz. A default that does not divide the simulation's rate is lowered to the next divisor."""
     outer_freq: int | None = None
     """Rate of ``outer``, Hz; None for a controller without an outer loop."""
+    inner: Controller | None = None
+    """Controller that follows the commands of this one; None where the allocation, rotors or fitted dynamics do."""
+    follows_feedforward: ClassVar[bool] = True
+    """False if the state command is all that it follows, without ``feedforward``, which is then an error."""
+    follows_rates: ClassVar[bool] = False
+    """True if it follows an attitude command together with ``data.controls.attitude.staged_ang_vel_des``."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass, and check its declarations."""
@@ -131,7 +138,8 @@ class Controller:
         Args:
             data: ``SimData`` of one drone, with the command in force in ``data.controls``; body rates of a state
                 command, which a ``Setpoint`` lacks, are ``data.controls.state.cmd[13:16]``.
-            command: Setpoint at the level ``state``; otherwise the command of the level ``data.controls.mode``. (4,)
+            command: Setpoint at the level ``state``; otherwise the command in force of the level that it follows, which
+                is ``data.controls.mode`` or the output of the controller whose ``inner`` it is. (4,)
             memory: Memory of the drone.
             params: Parameters of the drone.
 
@@ -173,3 +181,17 @@ class Controller:
     def has_outer(self) -> bool:
         """True if the controller has an outer loop."""
         return self.outer_freq is not None
+
+
+def in_series(controller: Controller | None, control: Control) -> tuple[list[tuple[Control, Controller]], Control]:
+    """Return the controllers from a command level down, each with the level that it follows, and the last output.
+
+    Args:
+        controller: Controller of the command level; None if commands need none.
+        control: Command level, which is the last output if there is no controller.
+    """
+    found = []
+    while controller is not None:
+        found.append((control, controller))
+        control, controller = controller.output, controller.inner
+    return found, control

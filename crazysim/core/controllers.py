@@ -1,4 +1,4 @@
-"""Stages of the controllers that take the place of Crazyflow's cascade."""
+"""Stages of controllers: staged commands take effect, and the controller's command is staged for what follows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from crazysim.core.stage import Stage, tick
 
 
 def controller_stages(controller: Controller, control: Control) -> Pipeline:
-    """Return the stages of a controller, in order.
+    """Return the stages of a controller that follows a command level, in order.
 
     One stage puts the staged command in force and commands the rotors or the allocation. With an outer loop there are
     two: the first puts the setpoint in force at the rate of the outer loop, the second commands at the controller's.
@@ -24,28 +24,21 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
         return tick(data, getattr(data.controls, level).freq)
 
     def controller_ticks(data: SimData) -> Array | None:
-        return tick(data, data.controls.controller.freq)
+        return tick(data, getattr(data.controls, level).controller.freq)
 
     def outer(data: SimData) -> SimData:
-        data = with_staged_command(data)
-        own = data.controls.controller
-        setpoint: Any = command_in_force(data)
-        memory = controller.outer(data, setpoint, own.memory, own.params)
-        return data.replace(controls=data.controls.replace(controller=own.replace(memory=memory)))
+        data = _with_staged_command(data, control)
+        own = getattr(data.controls, level).controller
+        setpoint: Any = _command_in_force(data, control)
+        return _with_memory(data, control, controller.outer(data, setpoint, own.memory, own.params))
 
     def inner(data: SimData) -> SimData:
-        own, controls = data.controls.controller, data.controls
-        command, memory = controller.update(data, command_in_force(data), own.memory, own.params)
-        if controller.output == Control.rotor_vel:
-            controls = controls.replace(rotor_vel=command)
-        elif controller.output == Control.attitude:
-            controls = controls.replace(attitude=controls.attitude.replace(staged_cmd=command))
-        else:
-            controls = controls.replace(force_torque=controls.force_torque.replace(staged_cmd=command))
-        return data.replace(controls=controls.replace(controller=own.replace(memory=memory)))
+        own = getattr(data.controls, level).controller
+        command, memory = controller.update(data, _command_in_force(data, control), own.memory, own.params)
+        return _with_memory(_staged_below(data, controller.output, command), control, memory)
 
     def both(data: SimData) -> SimData:
-        return inner(with_staged_command(data))
+        return inner(_with_staged_command(data, control))
 
     name = f"{level}_controller"
     if control == Control.state and controller.has_outer:
@@ -56,19 +49,35 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
     return {name: Stage(both, "drone", controller_ticks, name=name)}
 
 
-def with_staged_command(data: SimData) -> SimData:
-    """Return the data of one drone with the staged command in force."""
+def _with_staged_command(data: SimData, level: Control) -> SimData:
+    """Return the data of one drone with the staged command of a level in force."""
     controls = controls_of(data)
-    ctrl = getattr(controls, controls.mode.value)
+    ctrl = getattr(controls, level.value)
     ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
-    if controls.mode == Control.state:
+    if level == Control.state:
         ctrl = ctrl.replace(feedforward=ctrl.staged_feedforward)
-    return data.replace(controls=controls.replace(**{controls.mode.value: ctrl}))
+    return data.replace(controls=controls.replace(**{level.value: ctrl}))
 
 
-def command_in_force(data: SimData) -> Setpoint | Array:
+def _command_in_force(data: SimData, level: Control) -> Setpoint | Array:
     """Return the command in force of one drone: a setpoint at the level ``state``, otherwise four numbers."""
+    ctrl = getattr(data.controls, level.value)
+    return Setpoint.of_command(ctrl.cmd, ctrl.feedforward) if level == Control.state else ctrl.cmd
+
+
+def _staged_below(data: SimData, level: Control, command: Array) -> SimData:
+    """Return the data of one drone with the command of its controller staged; rotor speeds are in force at once."""
     controls = controls_of(data)
-    if controls.mode == Control.state:
-        return Setpoint.of_command(controls.state.cmd, controls.state.feedforward)
-    return getattr(controls, controls.mode.value).cmd
+    if level == Control.rotor_vel:
+        return data.replace(controls=controls.replace(rotor_vel=command))
+    ctrl = getattr(controls, level.value).replace(staged_cmd=command)
+    if level == Control.attitude and ctrl.staged_ang_vel_des is not None:
+        ctrl = ctrl.replace(staged_ang_vel_des=controls.state.cmd[..., 13:16])
+    return data.replace(controls=controls.replace(**{level.value: ctrl}))
+
+
+def _with_memory(data: SimData, level: Control, memory: Any) -> SimData:
+    """Return the data of one drone with the memory of the controller that follows a level."""
+    ctrl = getattr(data.controls, level.value)
+    ctrl = ctrl.replace(controller=ctrl.controller.replace(memory=memory))
+    return data.replace(controls=data.controls.replace(**{level.value: ctrl}))

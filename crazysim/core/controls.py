@@ -2,100 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 import jax
 import numpy as np
 from jax import Array
 
-from crazysim.control import AllocationParams, AttitudeParams, Control, Controller, StateParams
-from crazysim.control import attitude as attitude_control
-from crazysim.control import state as state_control
-from crazysim.control.controllers import CASCADE
-from crazysim.control.gains import require_gains
+from crazysim.control import AllocationParams, Control, Controller
+from crazysim.control.protocol import in_series
 from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
-from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, host_array, leaf, scopes, static
 
 
-class StateControlData(PyTree):
-    """Command and internal state of the state controller."""
-
-    cmd: Array = leaf("drone", 1)
-    """Setpoint in force: position, velocity, acceleration, quaternion, body rates. (n_worlds, n_drones, 16)"""
-    staged_cmd: Array = leaf("drone", 1)
-    """Setpoint that takes effect at the next tick. (n_worlds, n_drones, 16)"""
-    freq: int = static()
-    """Rate of the controller, Hz."""
-    pos_err_i: Array | None = leaf("drone", 1)
-    """Integral of the position error, m s; None with another controller. (n_worlds, n_drones, 3)"""
-    params: StateParams | None
-    """Gains and constants; None with another controller."""
-    feedforward: Array | None = leaf("drone", 1)
-    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, and yaw acceleration, rad/s^2, of the setpoint in force; None in
-    Crazyflow's cascade. (n_worlds, n_drones, 8)"""
-    staged_feedforward: Array | None = leaf("drone", 1)
-    """The same of the staged setpoint; None in Crazyflow's cascade. (n_worlds, n_drones, 8)"""
-
-
-class AttitudeControlData(PyTree):
-    """Command and internal state of the attitude controller."""
-
-    cmd: Array = leaf("drone", 1)
-    """Command in force: roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
-    staged_cmd: Array = leaf("drone", 1)
-    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
-    freq: int = static()
-    """Rate of the controller, Hz."""
-    ang_vel_des: Array | None = leaf("drone", 1)
-    """Desired body rates in force, rad/s; None in fitted dynamics and with another controller.
-    (n_worlds, n_drones, 3)"""
-    staged_ang_vel_des: Array | None = leaf("drone", 1)
-    """Desired body rates that take effect at the next tick, rad/s; None likewise. (n_worlds, n_drones, 3)"""
-    r_int_error: Array | None = leaf("drone", 1)
-    """Integral of the rotation error, rad s; None likewise. (n_worlds, n_drones, 3)"""
-    prev_ang_vel: Array | None = leaf("drone", 1)
-    """Angular velocity at the previous tick, rad/s; None likewise. (n_worlds, n_drones, 3)"""
-    params: Any
-    """Gains and constants, ``AttitudeParams``; None in fitted dynamics, which contain the controller, and with another
-    controller."""
-
-
-class BodyRateControlData(PyTree):
-    """Command and internal state of the body-rate controller."""
-
-    cmd: Array = leaf("drone", 1)
-    """Command in force: body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
-    staged_cmd: Array = leaf("drone", 1)
-    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
-    freq: int = static()
-    """Rate of the controller, Hz."""
-    r_int_error: Array | None = leaf("drone", 1)
-    """Integral of the rotation error, rad s; None with another controller. (n_worlds, n_drones, 3)"""
-    prev_ang_vel: Array | None = leaf("drone", 1)
-    """Angular velocity at the previous tick, rad/s; None with another controller. (n_worlds, n_drones, 3)"""
-    params: AttitudeParams | None
-    """Gains and constants; None with another controller."""
-
-
-class ForceTorqueControlData(PyTree):
-    """Command of the allocation."""
-
-    cmd: Array = leaf("drone", 1)
-    """Command in force: collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
-    staged_cmd: Array = leaf("drone", 1)
-    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
-    freq: int = static()
-    """Rate of the allocation, Hz."""
-    params: AllocationParams
-    """Limits and constants."""
-
-
 class ControllerData(PyTree):
-    """Memory and parameters of the controller that ``Sim(controller=...)`` names."""
+    """Memory and parameters of a controller, in the record of the command level that it follows."""
 
     memory: Any
     """Memory of the drones, a record of the controller's own, or None."""
@@ -138,16 +61,119 @@ class ControllerData(PyTree):
         return ControllerData(jax.tree.map(of_all, memory, one), params, controller.freq)
 
 
-def controller_layout(controller: ControllerData | None) -> tuple[object, list[tuple[int, ...]]]:
-    """Return what the data of two simulations with the same controller have in common."""
-    memory = None if controller is None else controller.memory
-    return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(memory)]
+class _Followed(PyTree):
+    """Crazyflow's names for gains and memory of the controller of a level; None where it has none of that name."""
+
+    controller: ControllerData | None
+    """Controller that follows the commands; None in fitted dynamics, which follow attitudes."""
+
+    @property
+    def params(self) -> Any:
+        """Gains and constants, a record."""
+        return None if self.controller is None else self.controller.params
+
+    @property
+    def pos_err_i(self) -> Array | None:
+        """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
+        return self._remembered("pos_err_i")
+
+    @property
+    def ang_vel_des(self) -> Array | None:
+        """Desired body rates in force, rad/s. (n_worlds, n_drones, 3)"""
+        return self._remembered("ang_vel_des")
+
+    @property
+    def r_int_error(self) -> Array | None:
+        """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
+        return self._remembered("r_int_error")
+
+    @property
+    def prev_ang_vel(self) -> Array | None:
+        """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
+        return self._remembered("prev_ang_vel")
+
+    def _remembered(self, name: str) -> Array | None:
+        return None if self.controller is None else getattr(self.controller.memory, name, None)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with the given fields replaced; ``params`` are those of the controller."""
+        if self.controller is not None and "params" in changes:
+            controller = changes.get("controller", self.controller)
+            changes["controller"] = controller.replace(params=changes.pop("params"))
+        return super().replace(**changes)
 
 
-def described_controller(controller: ControllerData | None) -> str:
-    """Return the records of a controller for a message."""
-    if controller is None:
-        return "no records"
+class StateControlData(_Followed):
+    """State command, and the controller that follows it."""
+
+    cmd: Array = leaf("drone", 1)
+    """Setpoint in force: position, velocity, acceleration, quaternion, body rates. (n_worlds, n_drones, 16)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Setpoint that takes effect at the next tick. (n_worlds, n_drones, 16)"""
+    freq: int = static()
+    """Rate at which setpoints take effect, Hz."""
+    feedforward: Array | None = leaf("drone", 1)
+    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, and yaw acceleration, rad/s^2, of the setpoint in force; None with a
+    controller that follows none, as Crazyflow's. (n_worlds, n_drones, 8)"""
+    staged_feedforward: Array | None = leaf("drone", 1)
+    """The same of the staged setpoint; None likewise. (n_worlds, n_drones, 8)"""
+
+
+class AttitudeControlData(_Followed):
+    """Attitude command, and the controller that follows it."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: roll, pitch, yaw, rad, and collective thrust, N. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate at which commands take effect, Hz."""
+    staged_ang_vel_des: Array | None = leaf("drone", 1)
+    """Desired body rates that take effect at the next tick, rad/s: those of a state command, or zero. None with
+    controllers other than Crazyflow's. (n_worlds, n_drones, 3)"""
+
+
+class BodyRateControlData(_Followed):
+    """Body-rate command, and the controller that follows it."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: body rates, rad/s, and collective thrust, N. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate at which commands take effect, Hz."""
+
+
+class ForceTorqueControlData(PyTree):
+    """Command of the allocation."""
+
+    cmd: Array = leaf("drone", 1)
+    """Command in force: collective thrust, N, and body torque, N m. (n_worlds, n_drones, 4)"""
+    staged_cmd: Array = leaf("drone", 1)
+    """Command that takes effect at the next tick. (n_worlds, n_drones, 4)"""
+    freq: int = static()
+    """Rate of the allocation, Hz."""
+    params: AllocationParams
+    """Limits and constants."""
+
+
+def controllers_of(controls: SimControls) -> list[ControllerData]:
+    """Return the records of all controllers, from the command level down."""
+    levels = (controls.state, controls.attitude, controls.body_rate)
+    return [level.controller for level in levels if level is not None and level.controller is not None]
+
+
+def layout_of(controllers: list[ControllerData]) -> list[tuple[object, list[tuple[int, ...]]]]:
+    """Return what the data of two simulations with the same controllers have in common."""
+    return [(jax.tree.structure(each), [np.shape(x) for x in jax.tree.leaves(each.memory)]) for each in controllers]
+
+
+def described(controllers: list[ControllerData]) -> str:
+    """Return the records of controllers for a message."""
+    return ", then ".join(map(_described, controllers)) or "no records"
+
+
+def _described(controller: ControllerData) -> str:
     shapes = [np.shape(x) for x in jax.tree.leaves(controller.memory)]
     memory, params = _kind(controller.memory), _kind(controller.params)
     return f"memory {memory} of shapes {shapes}, parameters {params} and freq={controller.freq}"
@@ -160,22 +186,32 @@ def _kind(record: object) -> str:
 
 
 class SimControls(PyTree):
-    """Controllers of a simulation; those not in use are None."""
+    """Commands of a simulation, and the controllers that follow them; levels not in use are None."""
 
     mode: Control = static()
     """Command level."""
     state: StateControlData | None
-    """State controller."""
+    """State commands."""
     attitude: AttitudeControlData | None
-    """Attitude controller."""
+    """Attitude commands: those of the simulation, or of the controller that follows state commands."""
     body_rate: BodyRateControlData | None
-    """Body-rate controller."""
+    """Body-rate commands."""
     force_torque: ForceTorqueControlData | None
     """Allocation."""
     rotor_vel: Array | None = leaf("drone", 1)
     """Commanded rotor speeds, rpm; None in fitted dynamics. (n_worlds, n_drones, n_rotors)"""
-    controller: ControllerData | None = None
-    """Controller in place of Crazyflow's cascade; None with the cascade."""
+
+    @property
+    def controller(self) -> Any:
+        """Record of the controller that follows the simulation's commands, ``ControllerData``; None if none does."""
+        return getattr(getattr(self, self.mode.value), "controller", None)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with the given fields replaced; ``controller`` is that of the command level."""
+        if "controller" in changes:
+            level = changes.get(self.mode.value, getattr(self, self.mode.value))
+            changes[self.mode.value] = level.replace(controller=changes.pop("controller"))
+        return super().replace(**changes)
 
     @staticmethod
     def create(
@@ -184,78 +220,62 @@ class SimControls(PyTree):
         control: Control,
         dynamics: Dynamics,
         airframes: Airframes,
-        freqs: dict[Control, int],
-        controller: Controller | None = None,
+        freqs: Mapping[Control, int],
+        controller: Controller | None,
     ) -> SimControls:
-        """Return controllers at rest, with the gains of each drone's airframe; ``controller`` None is the cascade.
+        """Return controllers at rest, with the gains of each drone's airframe.
+
+        Args:
+            n_worlds: Number of worlds.
+            n_drones: Number of drones per world.
+            control: Command level.
+            dynamics: Dynamics model.
+            airframes: Airframe of all drones, or of each.
+            freqs: Rates at which commands of each level take effect, Hz.
+            controller: Controller of the command level; None if commands need none.
 
         Raises:
-            ConfigError: If the dynamics do not support the command level.
+            ConfigError: If the dynamics do not support the command level, or an airframe lacks gains.
         """
         shape = (n_worlds, n_drones)
-        with_rotors = dynamics == Dynamics.first_principles
         require_pair(dynamics, control)
         require_controller(dynamics, control, controller)
+        followers, last = in_series(controller, control)
+        by_level = dict(followers)
+        data = {level: ControllerData.create(*shape, each, airframes) for level, each in followers}
 
         def zeros(n: int) -> Any:
             return host_array(0.0, *shape, n)
 
-        def gains(create: Callable[[Airframe], Any]) -> Any:
-            return for_drones(airframes, create, n_worlds)
-
-        cascade = with_rotors and controller is None
-
-        if controller is None:
-            for airframe in as_airframes(airframes):
-                require_gains(airframe, _gains_of_cascade(control, with_rotors), CASCADE)
-
         state = attitude = body_rate = force_torque = rotor_vel = None
         if control == Control.state:
-            cmd = host_array(np.eye(16)[12], *shape, 16)
+            cmd, feeds = host_array(np.eye(16)[12], *shape, 16), by_level[control].follows_feedforward
             # A copy, because two leaves that share a buffer cannot both be donated.
             state = StateControlData(
+                data[control],
                 cmd,
                 cmd.copy(),
                 freqs[Control.state],
-                pos_err_i=zeros(3) if controller is None else None,
-                params=gains(StateParams.create) if controller is None else None,
-                feedforward=None if controller is None else zeros(8),
-                staged_feedforward=None if controller is None else zeros(8),
+                feedforward=zeros(8) if feeds else None,
+                staged_feedforward=zeros(8) if feeds else None,
             )
-        commands_attitude = controller is None or controller.output == Control.attitude
-        if control == Control.attitude or (control == Control.state and commands_attitude):
+        if Control.attitude in (*by_level, last):
+            follower = by_level.get(Control.attitude)
             attitude = AttitudeControlData(
-                cmd=zeros(4),
-                staged_cmd=zeros(4),
-                freq=freqs[Control.attitude],
-                ang_vel_des=zeros(3) if cascade else None,
-                staged_ang_vel_des=zeros(3) if cascade else None,
-                r_int_error=zeros(3) if cascade else None,
-                prev_ang_vel=zeros(3) if cascade else None,
-                params=gains(AttitudeParams.create) if cascade else None,
+                data.get(Control.attitude),
+                zeros(4),
+                zeros(4),
+                freqs[Control.attitude],
+                staged_ang_vel_des=zeros(3) if follower is not None and follower.follows_rates else None,
             )
         if control == Control.body_rate:
-            body_rate = BodyRateControlData(
-                zeros(4),
-                zeros(4),
-                freqs[control],
-                r_int_error=zeros(3) if cascade else None,
-                prev_ang_vel=zeros(3) if cascade else None,
-                params=gains(AttitudeParams.create) if cascade else None,
-            )
-        if with_rotors:
+            body_rate = BodyRateControlData(data[control], zeros(4), zeros(4), freqs[control])
+        if dynamics == Dynamics.first_principles:
             rotor_vel = zeros(n_rotors_of(airframes))
-        if with_rotors and Control.rotor_vel not in (control, controller and controller.output):
-            params = gains(AllocationParams.create)
+        if last == Control.force_torque:
+            params = for_drones(airframes, AllocationParams.create, n_worlds)
             force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
-        data = None if controller is None else ControllerData.create(*shape, controller, airframes)
-        return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel, data)
-
-
-def _gains_of_cascade(control: Control, with_rotors: bool) -> tuple[str, ...]:
-    """Return the values of an airframe that Crazyflow's cascade needs at a level and at those below it."""
-    rotates = with_rotors and control in (Control.state, Control.attitude, Control.body_rate)
-    return (state_control.KEYS if control == Control.state else ()) + (attitude_control.KEYS if rotates else ())
+        return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel)
 
 
 def require_pair(dynamics: Dynamics, control: Control) -> None:
@@ -272,26 +292,27 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
 
 
 def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
-    """Check that a controller follows a command level and has rotors to command; None is Crazyflow's cascade.
+    """Check that controllers follow their levels, and that the dynamics follow the last command.
 
     Raises:
-        ConfigError: If it does not.
+        ConfigError: If they do not.
     """
-    if controller is None:
-        return
-    for member in controller.members:
-        if control not in member.levels:
-            raise ConfigError(
-                f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, got "
-                f"control={control.value!r}. Use another level, or controller='crazyflow', which follows all."
-            )
-    if dynamics != Dynamics.first_principles and controller.output != Control.attitude:
+    followers, last = in_series(controller, control)
+    for level, each in followers:
+        for member in each.members:
+            if level not in member.levels:
+                raise ConfigError(
+                    f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, "
+                    f"got control={level.value!r}. Use another level, or controller='auto', which follows all."
+                )
+    name = followers[-1][1].name if followers else None
+    if dynamics != Dynamics.first_principles and last != Control.attitude:
         raise ConfigError(
-            f"expected dynamics with rotors for controller {controller.name!r}, got {dynamics.value!r}, which contains "
+            f"expected dynamics with rotors for controller {name!r}, got {dynamics.value!r}, which contains "
             f"a controller of its own. Use dynamics='first_principles' or controller='auto'."
         )
-    if dynamics == Dynamics.first_principles and controller.output == Control.attitude:
+    if dynamics == Dynamics.first_principles and last not in (Control.force_torque, Control.rotor_vel):
         raise ConfigError(
-            f"expected a controller that commands rotors for dynamics {dynamics.value!r}, got {controller.name!r} with "
-            f"output 'attitude'. Use output = Control.force_torque."
+            f"expected a controller that commands rotors for dynamics {dynamics.value!r}, got {name!r} with "
+            f"output {last.value!r}. Use output = Control.force_torque."
         )

@@ -196,12 +196,12 @@ class SimData(PyTree):
         freqs: dict[Control, int],
         drone_mocap_ids: ArrayLike,
         rng_key: int | Array,
-        controller: Controller | None = None,
+        controller: Controller | None,
     ) -> SimData:
         """Return data of drones at rest, without plugins.
 
-        ``airframe`` is that of all drones, or a list of those of each; ``freqs`` are the rates of the controllers, Hz;
-        ``controller`` None is Crazyflow's cascade.
+        ``airframe`` is that of all drones, or a list of those of each; ``freqs`` are the rates of commands, Hz;
+        ``controller`` is None where commands need none.
         """
         airframes = as_airframes(airframe, n_drones)
         return SimData(

@@ -49,7 +49,7 @@ def state_control(
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
         yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2; None for the yaw rate of the
-            setpoint and zeros. Crazyflow's cascade takes none. (n_worlds, n_drones, 8)
+            setpoint and zeros. Crazyflow's controller follows none. (n_worlds, n_drones, 8)
 
     Raises:
         ValueError: Wrong shape, type or command level, a NaN or infinite command, or both forms at once.
@@ -85,7 +85,10 @@ def check_setpoint(
     if feedforward is None:
         return command, None
     if data.controls.state.staged_feedforward is None:
-        raise ConfigError("expected no feedforward, which Crazyflow's cascade cannot follow. Use Sim(controller=...).")
+        raise ConfigError(
+            "expected no feedforward, which the controller of this simulation does not follow, got one. Use "
+            "controller='auto', or leave it out."
+        )
     shape = (*command.shape[:-1], 8)
     return command, _as_command(data, "feedforward", shape, FEEDFORWARD, feedforward, check_finite)
 

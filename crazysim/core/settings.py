@@ -20,6 +20,7 @@ from jax import Array
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from crazysim.control import Control, Controller
+from crazysim.control.protocol import in_series
 from crazysim.control.switch import Switch
 from crazysim.errors import ConfigError, UnknownNameError, shown
 from crazysim.tables import ANY, Range, Shapes, bounds, numbers
@@ -329,50 +330,48 @@ def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Arra
     return jnp.asarray(array)
 
 
-def control_freqs(
-    control: Control,
-    freq: int,
-    given: Mapping[Control, int | None],
-    is_fitted: bool = False,
-    controller: Controller | None = None,
-) -> dict[Control, int]:
-    """Return the rate of every controller, Hz: as given, or else the largest divisor of ``freq`` up to the default.
-
-    Args:
-        control: Command level, which determines the controllers in use.
-        freq: Rate of physics steps, Hz.
-        given: Requested rates, Hz; None for the default.
-        is_fitted: True for fitted dynamics, which contain the controllers below the state controller. Like the
-            allocation, which has no memory, these may be as slow as the physics.
-        controller: Controller in place of the cascade; ``controller_at_rates`` checks its rates.
+def check_rates(control: Control, freq: int, given: Mapping[Control, int | None]) -> None:
+    """Check requested rates, Hz; None is that of a controller.
 
     Raises:
-        ConfigError: If the rate of a controller in use does not divide ``freq``, or is far below its default.
+        ConfigError: If one is not positive, or does not divide ``freq`` at or below the command level.
     """
     in_use = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
     }.get(control, (control, Control.force_torque))
-    checked = in_use
-    if controller is not None:
-        checked = () if controller.output == Control.rotor_vel else (Control.force_torque,)
-    freqs, defaults = {}, {}
     for level, requested in given.items():
-        if requested is None:
-            as_fast_as_physics = is_fitted or level == Control.force_torque
-            default = 100 if level == Control.state else min(500, freq) if as_fast_as_physics else 500
-            freqs[level] = _largest_divisor(freq, default)
-            if level in checked:
-                defaults[f"{level.value}_freq"] = default
-            continue
-        freqs[level] = positive(f"{level.value}_freq", requested)
-        if level in in_use and freq % requested:
-            nearest = _largest_divisor(freq, requested)
+        if requested is not None and freq % positive(f"{level.value}_freq", requested) and level in in_use:
             raise ConfigError(
                 f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
-                f"every whole number of steps. Use the nearest rate below, {nearest} Hz."
+                f"every whole number of steps. Use the nearest rate below, {_largest_divisor(freq, requested)} Hz."
             )
-    default_rates(freq, defaults)
+
+
+def control_freqs(
+    control: Control, freq: int, given: Mapping[Control, int | None], controller: Controller | None
+) -> dict[Control, int]:
+    """Return the rate at which commands of each level in use take effect, Hz.
+
+    The allocation and fitted dynamics, which have no memory, may be as slow as the physics.
+
+    Args:
+        control: Command level.
+        freq: Rate of physics steps, Hz.
+        given: Requested rates, Hz; None for the default, the largest divisor of ``freq`` up to 500 Hz.
+        controller: Controller of the command level, from ``controller_at_rates``; None if commands need none.
+
+    Raises:
+        ConfigError: If a default is far below 500 Hz.
+    """
+    followers, last = in_series(controller, control)
+    freqs = {}
+    for level, each in followers:
+        outer_freq = each.outer_freq if level == Control.state else None
+        freqs[level] = each.freq if outer_freq is None else outer_freq
+    if last != Control.rotor_vel:
+        name = f"{last.value}_freq"
+        freqs[last] = given.get(last) or default_rates(freq, {name: min(500, freq)})[name]
     return freqs
 
 
@@ -445,14 +444,18 @@ def controller_at_rates(
     if control == Control.state and controller.has_outer:
         requested = {"outer_freq": given.get(control), "freq": given.get(Control.attitude)}
     own = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
-    rates, defaults, of = {}, {}, f" of controller {controller.name!r}"
+    rates: dict[str, Any] = {}
+    defaults, of = {}, f" of controller {controller.name!r}"
     for name, given_rate in requested.items():
         rate = getattr(controller, name) if given_rate is None else given_rate
         if given_rate is None and rate == own[name]:
             defaults[name] = positive(name + of, rate)
         else:
             rates[name] = dividing_rate(name + of, rate, freq)
-    return dataclasses.replace(controller, **rates, **default_rates(freq, defaults, of))  # type: ignore[type-var]
+    rates |= default_rates(freq, defaults, of)
+    if inner := controller.inner:
+        rates["inner"] = controller_at_rates(inner, controller.output, freq, given)
+    return dataclasses.replace(controller, **rates)  # type: ignore[type-var]
 
 
 def _largest_divisor(freq: int, limit: int) -> int:

@@ -10,14 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.control import (
-    Control,
-    Controller,
-    attitude2force_torque,
-    body_rate2force_torque,
-    force_torque2rotor_vel,
-    state2attitude,
-)
+from crazysim.control import Control, Controller, force_torque2rotor_vel
+from crazysim.control.protocol import in_series
 from crazysim.core.controllers import controller_stages
 from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
@@ -42,14 +36,17 @@ def _ticks(controller: str) -> Callable[[SimData], Array | None]:
 
 
 def build_step_pipeline(
-    control: Control, dynamics: Dynamics, integrator: Integrator, controller: Controller | None = None
+    control: Control, dynamics: Dynamics, integrator: Integrator, controller: Controller | None
 ) -> Pipeline:
-    """Return the stages of one physics step, in order; ``controller`` None is Crazyflow's cascade."""
+    """Return the stages of one physics step, in order; ``controller`` is None where commands need none."""
     fitted_model = dynamics != Dynamics.first_principles
-    stages = cascade_stages(control, fitted_model) if controller is None else controller_stages(controller, control)
-    if controller is not None and controller.output == Control.attitude:
+    stages: Pipeline = {}
+    followers, last = in_series(controller, control)
+    for level, each in followers:
+        stages |= controller_stages(each, level)
+    if last == Control.attitude:
         stages["commit_attitude"] = commit_attitude
-    if not fitted_model and Control.rotor_vel not in (control, controller and controller.output):
+    if last == Control.force_torque:
         stages["force_torque_controller"] = force_torque_controller
     stages["clip_rotor_vel_cmd"] = clip_thrust_cmd if fitted_model else clip_rotor_vel_cmd
     deriv_fn: DerivFn = first_principles_derivative
@@ -65,90 +62,12 @@ def build_step_pipeline(
     return stages
 
 
-def cascade_stages(control: Control, fitted_model: bool) -> Pipeline:
-    """Return the stages of Crazyflow's cascade from a command level down to the wrench, in order."""
-    stages: Pipeline = {}
-    if control == Control.state:
-        stages["state_controller"] = state_controller
-    if control in (Control.state, Control.attitude):
-        if fitted_model:
-            stages["attitude_controller" if control == Control.state else "commit_attitude"] = commit_attitude
-        else:
-            stages["attitude_controller"] = attitude_controller
-    if control == Control.body_rate:
-        stages["body_rate_controller"] = body_rate_controller
-    return stages
-
-
-@_built_in("drone", when=_ticks("state"))
-def state_controller(data: SimData) -> SimData:
-    """Take over the staged setpoint, and stage the attitude, thrust and body rates that lead to it."""
-    states, controls = data.states, controls_of(data)
-    ctrl, attitude = controls.state, controls.attitude
-    cmd = ctrl.staged_cmd
-    attitude_cmd, pos_err_i = state2attitude(
-        states.pos, states.quat, states.vel, cmd, ctrl.pos_err_i, ctrl.freq, params=ctrl.params
-    )
-    ctrl = ctrl.replace(cmd=cmd, pos_err_i=pos_err_i)
-    attitude = attitude.replace(staged_cmd=attitude_cmd)
-    if attitude.staged_ang_vel_des is not None:
-        attitude = attitude.replace(staged_ang_vel_des=cmd[..., 13:16])
-    return data.replace(controls=controls.replace(state=ctrl, attitude=attitude))
-
-
 @_built_in("drone", when=_ticks("attitude"))
 def commit_attitude(data: SimData) -> SimData:
     """Take over the staged attitude command; fitted dynamics contain the controller that follows it."""
     ctrl = data.controls.attitude
     ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
     return data.replace(controls=data.controls.replace(attitude=ctrl))
-
-
-@_built_in("drone", when=_ticks("attitude"))
-def attitude_controller(data: SimData) -> SimData:
-    """Take over the staged attitude command, and stage the wrench that turns the drone there."""
-    states, controls = data.states, controls_of(data)
-    ctrl = controls.attitude
-    wrench, r_int_error = attitude2force_torque(
-        states.quat,
-        states.ang_vel,
-        ctrl.staged_cmd,
-        ctrl.staged_ang_vel_des,
-        ctrl.prev_ang_vel,
-        ctrl.ang_vel_des,
-        ctrl.r_int_error,
-        ctrl.freq,
-        params=ctrl.params,
-    )
-    ctrl = ctrl.replace(
-        cmd=ctrl.staged_cmd,
-        ang_vel_des=ctrl.staged_ang_vel_des,
-        r_int_error=r_int_error,
-        prev_ang_vel=states.ang_vel,
-    )
-    force_torque = controls.force_torque.replace(staged_cmd=wrench)
-    return data.replace(controls=controls.replace(attitude=ctrl, force_torque=force_torque))
-
-
-@_built_in("drone", when=_ticks("body_rate"))
-def body_rate_controller(data: SimData) -> SimData:
-    """Take over the staged body rates, and stage the wrench that follows them."""
-    states, controls = data.states, controls_of(data)
-    ctrl = controls.body_rate
-    cmd = ctrl.staged_cmd
-    wrench, r_int_error = body_rate2force_torque(
-        states.quat,
-        states.ang_vel,
-        cmd,
-        ctrl.prev_ang_vel,
-        ctrl.cmd,
-        ctrl.r_int_error,
-        ctrl.freq,
-        params=ctrl.params,
-    )
-    ctrl = ctrl.replace(cmd=cmd, r_int_error=r_int_error, prev_ang_vel=states.ang_vel)
-    force_torque = controls.force_torque.replace(staged_cmd=wrench)
-    return data.replace(controls=controls.replace(body_rate=ctrl, force_torque=force_torque))
 
 
 @_built_in("drone", when=_ticks("force_torque"))

@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_list, load_airframes
-from crazysim.core.controls import controller_layout, described_controller, require_controller, require_pair
+from crazysim.core.controls import controllers_of, described, layout_of, require_controller, require_pair
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import (
+    check_rates,
     check_settings,
     control_freqs,
     controller_at_rates,
@@ -55,9 +56,9 @@ class Configuration:
     freq: int
     """Physics steps per second, Hz."""
     control_freqs: Mapping[Control, int]
-    """Rate of the commands of each level, Hz."""
+    """Rate at which commands of each level in use take effect, Hz."""
     controller: Controller | None
-    """Controller at its rates; None for Crazyflow's cascade."""
+    """Controller of the command level at its rates; None if commands need none."""
     device: jax.Device
     """Device of the data."""
     mesh: Mesh | None
@@ -81,25 +82,24 @@ class Configuration:
         """
         try:
             core, controls = data.core, data.controls
-            cascade, fitted = controls.controller is None, controls.rotor_vel is None
-            given = core.n_worlds, core.n_drones, core.freq, controls.mode, cascade, fitted
+            given = core.n_worlds, core.n_drones, core.freq, controls.mode, controls.rotor_vel is None
         except AttributeError:
             raise ConfigError(
                 f"expected the data of a simulation, got {type(data).__name__}. Use sim.data = sim.data.replace(...)."
             ) from None
-        cascade, fitted = self.controller is None, self.dynamics != Dynamics.first_principles
-        needed = self.n_worlds, self.n_drones, self.freq, self.control, cascade, fitted
+        fitted = self.dynamics != Dynamics.first_principles
+        needed = self.n_worlds, self.n_drones, self.freq, self.control, fitted
         if given != needed:
             raise ConfigError(
                 f"expected data of {_described(*needed)}, got data of {_described(*given)}. Use data of this "
                 f"simulation, or of one with the same settings."
             )
-        present, needed = controls.controller, like.controls.controller
-        if present is not needed and controller_layout(present) != controller_layout(needed):
+        present, like_present = controllers_of(controls), controllers_of(like.controls)
+        if present != like_present and layout_of(present) != layout_of(like_present):  # records differ by identity
             name = getattr(self.controller, "name", None)
             raise ConfigError(
-                f"expected data of controller {name!r} with {described_controller(needed)}, got "
-                f"{described_controller(present)}. Use data of this simulation, or of one with the same settings."
+                f"expected data of controller {name!r} with {described(like_present)}, got {described(present)}. Use "
+                f"data of this simulation, or of one with the same settings."
             )
 
     @staticmethod
@@ -133,17 +133,13 @@ class Configuration:
         for airframe in dict.fromkeys(airframes):
             require_support(airframe, dynamics)
         controller = find_controller(controllers, switch)
-        if controller is not None:
-            for each in controller.members:
-                check_settings(each)
-            controller = controller.adapted(control, None if dynamics == Dynamics.first_principles else dynamics)
-        if controller is not None:
-            require_controller(dynamics, control, controller)
-        freqs = control_freqs(control, freq, rates, dynamics != Dynamics.first_principles, controller)
-        if controller is not None:
-            controller = controller_at_rates(controller, control, freq, rates)
-            with_outer = control == Control.state and controller.has_outer
-            freqs = {**freqs, control: controller.outer_freq if with_outer else controller.freq}
+        for each in controller.members:
+            check_settings(each)
+        controller = controller.adapted(control, None if dynamics == Dynamics.first_principles else dynamics)
+        require_controller(dynamics, control, controller)
+        check_rates(control, freq, rates)
+        controller = controller and controller_at_rates(controller, control, freq, rates)
+        freqs = control_freqs(control, freq, rates, controller)
         for airframe in dict.fromkeys(airframes):
             require_freq(airframe, dynamics, freq)  # after the rates, which need a higher freq
         return Configuration(
@@ -172,11 +168,9 @@ def plugins_of(plugins: Sequence[Plugin], estimator: str | Estimator | None, aer
     return [*found, *plugin_list("plugins", plugins)]
 
 
-def _described(n_worlds: int, n_drones: int, freq: int, control: Control, cascade: bool, fitted: bool) -> str:
+def _described(n_worlds: int, n_drones: int, freq: int, control: Control, fitted: bool) -> str:
     """Return the settings of data for a message."""
-    controller = "Crazyflow's cascade" if cascade else "another controller"
     dynamics = "fitted" if fitted else "first-principles"
     return (
-        f"{n_worlds} worlds of {n_drones} drones at {freq} Hz with {control.value!r} commands, {controller} and "
-        f"{dynamics} dynamics"
+        f"{n_worlds} worlds of {n_drones} drones at {freq} Hz with {control.value!r} commands and {dynamics} dynamics"
     )

@@ -150,7 +150,7 @@ class MPPI:
         freq = c.freq if freq is None else positive("freq", freq)
         self._sim = Sim(
             sim.n_worlds * self.samples, sim.n_drones, c.airframes, c.dynamics, c.control, c.integrator, freq,
-            device=c.device, engine=c.engine, controller="crazyflow" if c.controller is None else c.controller,
+            device=c.device, engine=c.engine, controller=c.controller or "auto",
         )  # fmt: skip
         for plugin in sim.plugins.values():
             self._sim.add(plugin)

@@ -130,9 +130,8 @@ class Sim:
                 can run the step pipeline here. ``explain`` says which that is.
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
             controller: Controller that follows the commands: ``"auto"`` for any airframe, another name of
-                ``crazysim.control.controllers.CONTROLLERS``, a ``crazysim.control.Controller``, or ``"crazyflow"`` for
-                the cascade of Crazyflow; or a list of several.
-                The rates above replace its own.
+                ``crazysim.control.controllers.CONTROLLERS``, such as ``"crazyflow"`` for the cascade of Crazyflow, or a
+                ``crazysim.control.Controller``; or a list of several. The rates above replace its own.
             switch: Chooses among several controllers: a function ``(state, setpoint, time) -> index`` of one drone, or
                 indices, () or (n_worlds, n_drones).
             estimator: Filter on whose estimate the controllers fly: ``"kalman"``, with an ``IMU`` and a

@@ -67,12 +67,120 @@ def memory_of(sim):
     return sim.data.controls.controller.memory
 
 
-def test_the_cascade_of_crazyflow_has_no_controller_record():
-    sim = Sim(control="state", controller="crazyflow")
-    assert sim.data.controls.controller is None
-    assert sim.data.controls.state.feedforward is sim.data.controls.state.staged_feedforward is None
-    assert list(sim.step_pipeline)[:3] == ["state_controller", "attitude_controller", "force_torque_controller"]
-    assert len(jax.tree.leaves(sim.data)) == 64
+CRAZYFLOW = {
+    "state": {"state": ("pos_err_i",), "attitude": ("ang_vel_des", "r_int_error", "prev_ang_vel")},
+    "attitude": {"attitude": ("ang_vel_des", "r_int_error", "prev_ang_vel")},
+    "body_rate": {"body_rate": ("r_int_error", "prev_ang_vel")},
+}
+"""Names of the controllers' memory in Crazyflow, by command level and record."""
+
+
+@pytest.mark.parametrize("control", CRAZYFLOW)
+def test_the_cascade_of_crazyflow_keeps_its_memory_where_all_do_and_is_read_under_crazyflows_names(control):
+    sim = Sim(control=control, controller="crazyflow", engine="interpret")
+    stages = [f"{level}_controller" for level in (*CRAZYFLOW[control], "force_torque")]
+    assert list(sim.step_pipeline)[: len(stages)] == stages
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], ang_vel=[0.1, 0.2, 0.3])
+    command = np.full((1, 1, 16 if control == "state" else 4), 0.125)
+    getattr(sim, f"{control}_control")(command)
+    sim.step(10)
+    controls, names = sim.data.controls, CRAZYFLOW[control]
+    assert controls.controller is getattr(controls, control).controller
+    for level, memory in names.items():
+        record = getattr(controls, level)
+        assert record.params is record.controller.params
+        assert {name: getattr(record, name) is getattr(record.controller.memory, name) for name in memory} == (
+            dict.fromkeys(memory, True)
+        )
+        assert all(np.any(getattr(record, name)) for name in memory if (control, name) != ("attitude", "ang_vel_des"))
+    if control == "state":  # the body rates of a state command go along with the attitude
+        assert controls.state.feedforward is controls.state.staged_feedforward is None
+        np.testing.assert_array_equal(controls.attitude.staged_ang_vel_des, command[..., 13:])
+    others = Sim(control=control).data.controls
+    for level, memory in names.items():
+        record = getattr(others, level)
+        assert record is None or all(getattr(record, name) is None for name in memory)
+
+
+def test_gains_of_crazyflow_are_set_under_crazyflows_names():
+    sim = Sim(control="attitude", controller="crazyflow", engine="interpret")
+    controls, ctrl = sim.data.controls, sim.data.controls.attitude
+    twice = ctrl.params.replace(kR=2 * ctrl.params.kR)
+    sim.data = sim.data.replace(controls=controls.replace(attitude=ctrl.replace(params=twice)))
+    np.testing.assert_array_equal(sim.data.controls.controller.params.kR, 2 * ctrl.params.kR)
+    own = sim.data.controls.controller
+    sim.data = sim.data.replace(controls=sim.data.controls.replace(controller=own.replace(params=ctrl.params)))
+    np.testing.assert_array_equal(sim.data.controls.attitude.params.kR, ctrl.params.kR)
+    fitted = Sim(dynamics="so_rpy").data.controls
+    assert fitted.controller is fitted.attitude.controller is fitted.attitude.params is None
+
+
+def test_desired_body_rates_go_along_with_an_attitude_in_crazyflow():
+    sim = Sim(control="attitude", controller="crazyflow", engine="interpret")
+    sim.data = with_states(sim.data, pos=[0, 0, 10.0])
+    sim.attitude_control(np.array([[[0.0, 0.0, 0.0, 0.3]]]))
+    ctrl = sim.data.controls.attitude
+    ctrl = ctrl.replace(staged_ang_vel_des=ctrl.staged_ang_vel_des + np.float32([0.5, 0, 0]))
+    sim.data = sim.data.replace(controls=sim.data.controls.replace(attitude=ctrl))
+    sim.step(5)
+    np.testing.assert_array_equal(sim.data.controls.attitude.ang_vel_des, [[[0.5, 0, 0]]])
+    assert sim.data.states.ang_vel[0, 0, 0] > 0.001  # otherwise it is zero
+
+
+class Height(Controller):
+    """Thrust that climbs to a setpoint, and a level attitude, which another controller follows."""
+
+    name = "height"
+    levels = (Control.state,)
+    output = Control.attitude
+    freq: int = 50
+    inner: Controller | None = PID(hold_yaw=True)
+
+    def update(self, data, command, memory, params):
+        s = data.states
+        thrust = 0.32 + 0.2 * (command.pos - s.pos)[2:] - 0.15 * s.vel[2:]
+        return jnp.concatenate([jnp.zeros(3), thrust]), memory
+
+
+def test_a_controller_of_attitudes_is_followed_by_its_inner_one():
+    sim = Sim(drone="cf2x_L250", control="state", controller=Height(), attitude_freq=250)
+    rates = sim.control_freq, sim.data.controls.attitude.freq, sim.data.controls.attitude.controller.freq
+    assert rates == (50, 250, 250)
+    sim.data = with_states(sim.data, pos=[0, 0, 1.0], ang_vel=[0.5, 0, 0], rotor_vel=[1.5e4] * 4)
+    sim.state_control(pos=[0, 0, 2.0])
+    sim.step(10)
+    attitude = np.asarray(sim.data.controls.attitude.cmd)[0, 0]
+    np.testing.assert_allclose(attitude, [0, 0, 0, 0.32 + 0.2], atol=2e-2)
+    sim.step(390)
+    assert sim.data.states.pos[0, 0, 2] > 1.2
+    assert abs(sim.data.states.ang_vel[0, 0, 0]) < 0.2
+    with pytest.raises(ConfigError, match=r"a controller that commands rotors .* got 'height' with output 'attitude'"):
+        Sim(control="state", controller=Height(inner=None))
+    with pytest.raises(ConfigError, match="controller 'towards' follows, state, got control='attitude'"):
+        Sim(control="state", controller=Height(inner=Towards()))
+
+
+def test_the_cascade_of_crazyflow_takes_turns_with_another_controller():
+    """At the levels that it follows by itself; it flies as it does alone."""
+    command = np.array([[[0.1, -0.1, 0.3, 0.33]]])
+
+    def fly(**settings):
+        sim = Sim(drone="cf2x_L250", control="attitude", engine="interpret", **settings)
+        sim.data = with_states(sim.data, pos=[0, 0, 10.0])
+        sim.attitude_control(command)
+        sim.step(50)
+        return np.asarray(sim.data.states.quat)
+
+    alone, first, second = (
+        fly(**settings)
+        for settings in (
+            {"controller": "crazyflow"},
+            {"controller": ["crazyflow", "mellinger"], "switch": 0},
+            {"controller": ["crazyflow", "mellinger"], "switch": 1},
+        )
+    )
+    np.testing.assert_allclose(first, alone, atol=1e-6)
+    assert np.abs(second - alone).max() > 1e-4
 
 
 @pytest.mark.parametrize("controller", ["pid", "mellinger", Towards()], ids=["pid", "mellinger", "own"])
@@ -146,7 +254,7 @@ def test_feedforward_reaches_the_controller():
     np.testing.assert_allclose(memory_of(sim).feedforward, forward)
     with pytest.raises(ValueError, match=r"feedforward command has shape.*jerk"):
         sim.state_control(cmd, feedforward=forward[0])
-    with pytest.raises(ConfigError, match="Crazyflow's cascade"):
+    with pytest.raises(ConfigError, match=r"no feedforward, which .* does not follow, got one. Use controller='auto'"):
         Sim(control="state", controller="crazyflow").state_control(cmd[:1, :1], feedforward=forward[:1, :1])
 
 
@@ -186,7 +294,10 @@ def test_rates_of_the_simulation_replace_those_of_the_controller():
         ({"controller": ["pid", "mellinger"]}, r"expected a switch for several controllers, got None"),
         ({"controller": "pid", "switch": 0}, r"expected a list of controllers for a switch"),
         ({"controller": [], "switch": 0}, r"expected at least one controller"),
-        ({"controller": ["crazyflow"], "switch": 0}, r"other than 'crazyflow'"),
+        (
+            {"controller": ["crazyflow"], "switch": 0},
+            r"'crazyflow' follows, attitude or body_rate, got control='state'",
+        ),
         ({"controller": ["pid"], "switch": 1}, r"expected switch as a function or as integers from 0 to 0"),
         ({"controller": ["pid"], "switch": lambda state, setpoint, time: time}, r"expected one integer"),
         (

@@ -34,8 +34,8 @@ def per_drone(data):
     controls = data.controls
     changes = {
         level: record.replace(params=spread(record.params))
-        for level in (*LEVELS[:4], "controller")
-        if (record := getattr(controls, level)) is not None
+        for level in LEVELS[:4]
+        if (record := getattr(controls, level)) is not None and record.params is not None
     }
     return data.replace(params=spread(data.params), controls=controls.replace(**changes))
 
@@ -136,10 +136,10 @@ def test_docstrings_give_the_shapes(dynamics, control):
     assert n_documented(data, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(data))
 
 
-@pytest.mark.parametrize("controller", ["pid", "mellinger", ("pid", "mellinger")], ids=str)
+@pytest.mark.parametrize("controller", ["pid", "mellinger", "crazyflow", ("pid", "mellinger")], ids=str)
 def test_docstrings_of_controllers_give_the_shapes(controller):
     """Law 2, for those that are not the default, and for several of which each drone has one."""
     switch = {} if isinstance(controller, str) else {"switch": 0}
     sim = Sim(2, 3, control="state", controller=controller if isinstance(controller, str) else [*controller], **switch)
-    record = sim.data.controls.controller
+    record = sim.data.controls
     assert n_documented(record, n_worlds=2, n_drones=3, n_rotors=4) == len(jax.tree.leaves(record))

@@ -76,7 +76,7 @@ def test_a_rate_is_a_positive_whole_number(name, rate):
             {"control": "state", "dynamics": "so_rpy", "freq": 5},
             ("near 100 Hz", "freq of controller 'auto'", "freq=50"),
         ),
-        ({"controller": "crazyflow", "freq": 5}, ("near 500 Hz", "attitude_freq", "freq=100", "or set attitude_freq")),
+        ({"controller": "crazyflow", "freq": 5}, ("near 500 Hz", "freq of controller 'crazyflow'", "freq=100")),
         ({"control": "state", "controller": "pid", "freq": 499}, ("outer_freq of controller 'pid'", "freq=500")),
         ({"control": "state", "controller": "mellinger", "freq": 997}, ("freq of controller 'mellinger'", "freq=998")),
     ],

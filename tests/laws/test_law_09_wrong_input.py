@@ -270,7 +270,7 @@ def test_data_with_axes_of_its_own_is_refused_at_the_next_step(sim, edit, fragme
         (lambda sim: Sim(n_worlds=3, control="state").data, ("'attitude' commands", "'state' commands")),
         (lambda sim: Sim(n_worlds=3, freq=250).data, ("at 500 Hz", "at 250 Hz")),
         (lambda sim: Sim(n_worlds=3, dynamics="so_rpy").data, ("first-principles", "fitted")),
-        (lambda sim: Sim(n_worlds=3, controller="crazyflow").data, ("Crazyflow's cascade", "another controller")),
+        (lambda sim: Sim(n_worlds=3, controller="crazyflow").data, ("with memory AutoMemory", "memory AttitudeMemory")),
         (lambda sim: Sim(n_worlds=3, controller="pid").data, ("controller 'auto' with memory AutoMemory", "PIDMemory")),
         (lambda sim: Sim(n_worlds=3, attitude_freq=250).data, ("freq=500, got", "AutoParams and freq=250")),
         (lambda sim: Sim(n_worlds=3, controller=["auto"], switch=0).data, ("got memory SwitchMemory(AutoMemory)",)),

@@ -1,0 +1,129 @@
+"""Controller ``"crazyflow"``: the cascade of Crazyflow 0.4.0, which flies its flights."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from crazysim.control import attitude, state
+from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
+from crazysim.control.gains import require_gains
+from crazysim.control.levels import Control
+from crazysim.control.protocol import Controller, DroneData
+from crazysim.control.setpoint import Setpoint
+from crazysim.control.state import StateParams, state2attitude
+from crazysim.drones import Airframe
+from crazysim.pytree import PyTree, leaf
+
+
+class StateMemory(PyTree):
+    """Memory of the state controller."""
+
+    pos_err_i: Array = leaf("drone", 1)
+    """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
+
+
+class AttitudeMemory(PyTree):
+    """Memory of the attitude and body-rate controller."""
+
+    ang_vel_des: Array = leaf("drone", 1)
+    """Desired body rates at the last tick, rad/s. (n_worlds, n_drones, 3)"""
+    r_int_error: Array = leaf("drone", 1)
+    """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
+    prev_ang_vel: Array = leaf("drone", 1)
+    """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
+
+
+class CrazyflowState(Controller):
+    """State controller of Crazyflow (``state2attitude``), which ``Crazyflow`` places in front of itself."""
+
+    name: ClassVar[str] = "crazyflow"
+    levels: ClassVar[tuple[Control, ...]] = (Control.state,)
+    output: ClassVar[Control] = Control.attitude
+    follows_feedforward: ClassVar[bool] = False
+    freq: int = 100
+    """Rate, Hz."""
+    inner: Controller | None = None
+    """Controller that follows the attitudes; None with fitted dynamics, which do."""
+
+    def params(self, airframe: Airframe) -> StateParams:
+        """Return the gains of an airframe.
+
+        Raises:
+            ConfigError: If the airframe lacks gains, those of the attitude controller included.
+        """
+        keys = (*state.KEYS, *(() if self.inner is None else attitude.KEYS))
+        require_gains(airframe, keys, self.name)
+        return StateParams.create(airframe)
+
+    def memory(self, airframe: Airframe) -> StateMemory:
+        """Return the memory of one drone before the first tick."""
+        return StateMemory(_zeros())
+
+    def update(
+        self, data: DroneData, command: Setpoint | Array, memory: StateMemory, params: StateParams
+    ) -> tuple[Array, StateMemory]:
+        """Return roll, pitch, yaw, rad, and collective thrust, N (4,), and the memory."""
+        s, cmd = data.states, data.controls.state.cmd
+        commanded, pos_err_i = state2attitude(s.pos, s.quat, s.vel, cmd, memory.pos_err_i, self.freq, params=params)
+        return commanded, StateMemory(pos_err_i)
+
+
+class Crazyflow(Controller):
+    """Cascade of Crazyflow, with gains from the airframe's table ``[controller]``, at every command level.
+
+    It follows attitudes (``attitude2force_torque``) and body rates (``body_rate2force_torque``). At the level ``state``
+    and with fitted dynamics ``CrazyflowState`` precedes or replaces it, and lower levels need no controller.
+    """
+
+    name: ClassVar[str] = "crazyflow"
+    levels: ClassVar[tuple[Control, ...]] = (Control.attitude, Control.body_rate)
+    output: ClassVar[Control] = Control.force_torque
+    follows_rates: ClassVar[bool] = True
+    freq: int = 500
+    """Rate, Hz."""
+
+    def adapted(self, control: Control, fitted: str | None) -> Controller | None:
+        """Return the state controller for the level ``state``, this one where it is followed, and otherwise None."""
+        if control == Control.state:
+            return CrazyflowState(inner=None if fitted else self)
+        return self if fitted is None and control in self.levels else None
+
+    def params(self, airframe: Airframe) -> AttitudeParams:
+        """Return the gains of an airframe.
+
+        Raises:
+            ConfigError: If the airframe lacks gains.
+        """
+        return AttitudeParams.create(airframe)
+
+    def memory(self, airframe: Airframe) -> AttitudeMemory:
+        """Return the memory of one drone before the first tick."""
+        return AttitudeMemory(_zeros(), _zeros(), _zeros())
+
+    def update(
+        self, data: DroneData, command: Setpoint | Array, memory: AttitudeMemory, params: AttitudeParams
+    ) -> tuple[Array, AttitudeMemory]:
+        """Return collective thrust, N, and body torque, N m (4,), and the memory."""
+        s, m = data.states, memory
+        cmd: Array = command  # type: ignore[assignment]  # it follows no setpoints
+        if data.controls.mode == Control.body_rate:
+            rates = cmd[..., :3]
+            wrench, r_int_error = body_rate2force_torque(
+                s.quat, s.ang_vel, cmd, m.prev_ang_vel, m.ang_vel_des, m.r_int_error, self.freq, params=params
+            )
+        else:
+            rates = data.controls.attitude.staged_ang_vel_des
+            if rates is None:  # one of several controllers
+                rates = jnp.zeros_like(s.ang_vel)
+            wrench, r_int_error = attitude2force_torque(
+                s.quat, s.ang_vel, cmd, rates, m.prev_ang_vel, m.ang_vel_des, m.r_int_error, self.freq, params=params
+            )
+        return wrench, AttitudeMemory(rates, r_int_error, s.ang_vel)
+
+
+def _zeros() -> Array:
+    return np.zeros(3)  # type: ignore[return-value]  # the simulation moves it to its device
