@@ -183,7 +183,9 @@ class Controller:
         return self.outer_freq is not None
 
 
-def in_series(controller: Controller | None, control: Control) -> tuple[list[tuple[Control, Controller]], Control]:
+def controller_chain(
+    controller: Controller | None, control: Control
+) -> tuple[list[tuple[Control, Controller]], Control]:
     """Return the controllers from a command level down, each with the level that it follows, and the last output.
 
     Args:

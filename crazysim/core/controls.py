@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.control import AllocationParams, Control, Controller
-from crazysim.control.protocol import in_series
+from crazysim.control.protocol import controller_chain
 from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
@@ -61,7 +61,7 @@ class ControllerData(PyTree):
         return ControllerData(jax.tree.map(of_all, memory, one), params, controller.freq)
 
 
-class _Followed(PyTree):
+class _LevelData(PyTree):
     """Crazyflow's names for gains and memory of the controller of a level; None where it has none of that name."""
 
     controller: ControllerData | None
@@ -103,7 +103,7 @@ class _Followed(PyTree):
         return super().replace(**changes)
 
 
-class StateControlData(_Followed):
+class StateControlData(_LevelData):
     """State command, and the controller that follows it."""
 
     cmd: Array = leaf("drone", 1)
@@ -119,7 +119,7 @@ class StateControlData(_Followed):
     """The same of the staged setpoint; None likewise. (n_worlds, n_drones, 8)"""
 
 
-class AttitudeControlData(_Followed):
+class AttitudeControlData(_LevelData):
     """Attitude command, and the controller that follows it."""
 
     cmd: Array = leaf("drone", 1)
@@ -133,7 +133,7 @@ class AttitudeControlData(_Followed):
     controllers other than Crazyflow's. (n_worlds, n_drones, 3)"""
 
 
-class BodyRateControlData(_Followed):
+class BodyRateControlData(_LevelData):
     """Body-rate command, and the controller that follows it."""
 
     cmd: Array = leaf("drone", 1)
@@ -157,20 +157,36 @@ class ForceTorqueControlData(PyTree):
     """Limits and constants."""
 
 
-def controllers_of(controls: SimControls) -> list[ControllerData]:
+def require_same_controllers(controls: SimControls, like: SimControls, name: str | None) -> None:
+    """Check that two simulations' controllers have the same records, with memory of the same shapes.
+
+    Args:
+        controls: Commands and controllers to check.
+        like: Those of the simulation.
+        name: Name of the simulation's controller.
+
+    Raises:
+        ConfigError: If they differ.
+    """
+    given, needed = _controllers_of(controls), _controllers_of(like)
+    if given == needed:  # the same objects
+        return
+    if [_layout(controller) for controller in given] != [_layout(controller) for controller in needed]:
+        raise ConfigError(
+            f"expected data of controller {name!r} with {', then '.join(map(_described, needed)) or 'no records'}, got "
+            f"{', then '.join(map(_described, given)) or 'no records'}. Use data of this simulation, or of one with "
+            f"the same settings."
+        )
+
+
+def _controllers_of(controls: SimControls) -> list[ControllerData]:
     """Return the records of all controllers, from the command level down."""
     levels = (controls.state, controls.attitude, controls.body_rate)
     return [level.controller for level in levels if level is not None and level.controller is not None]
 
 
-def layout_of(controllers: list[ControllerData]) -> list[tuple[object, list[tuple[int, ...]]]]:
-    """Return what the data of two simulations with the same controllers have in common."""
-    return [(jax.tree.structure(each), [np.shape(x) for x in jax.tree.leaves(each.memory)]) for each in controllers]
-
-
-def described(controllers: list[ControllerData]) -> str:
-    """Return the records of controllers for a message."""
-    return ", then ".join(map(_described, controllers)) or "no records"
+def _layout(controller: ControllerData) -> tuple[object, list[tuple[int, ...]]]:
+    return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(controller.memory)]
 
 
 def _described(controller: ControllerData) -> str:
@@ -240,7 +256,7 @@ class SimControls(PyTree):
         shape = (n_worlds, n_drones)
         require_pair(dynamics, control)
         require_controller(dynamics, control, controller)
-        followers, last = in_series(controller, control)
+        followers, last = controller_chain(controller, control)
         by_level = dict(followers)
         data = {level: ControllerData.create(*shape, each, airframes) for level, each in followers}
 
@@ -297,7 +313,7 @@ def require_controller(dynamics: Dynamics, control: Control, controller: Control
     Raises:
         ConfigError: If they do not.
     """
-    followers, last = in_series(controller, control)
+    followers, last = controller_chain(controller, control)
     for level, each in followers:
         for member in each.members:
             if level not in member.levels:

@@ -20,7 +20,7 @@ from jax import Array
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from crazysim.control import Control, Controller
-from crazysim.control.protocol import in_series
+from crazysim.control.protocol import controller_chain
 from crazysim.control.switch import Switch
 from crazysim.errors import ConfigError, UnknownNameError, shown
 from crazysim.tables import ANY, Range, Shapes, bounds, numbers
@@ -364,7 +364,7 @@ def control_freqs(
     Raises:
         ConfigError: If a default is far below 500 Hz.
     """
-    followers, last = in_series(controller, control)
+    followers, last = controller_chain(controller, control)
     freqs = {}
     for level, each in followers:
         outer_freq = each.outer_freq if level == Control.state else None

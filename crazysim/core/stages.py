@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.control import Control, Controller, force_torque2rotor_vel
-from crazysim.control.protocol import in_series
+from crazysim.control.protocol import controller_chain
 from crazysim.core.controllers import controller_stages
 from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
@@ -41,7 +41,7 @@ def build_step_pipeline(
     """Return the stages of one physics step, in order; ``controller`` is None where commands need none."""
     fitted_model = dynamics != Dynamics.first_principles
     stages: Pipeline = {}
-    followers, last = in_series(controller, control)
+    followers, last = controller_chain(controller, control)
     for level, each in followers:
         stages |= controller_stages(each, level)
     if last == Control.attitude:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control, Controller
 from crazysim.control.controllers import find_controller
 from crazysim.core.airframes import AirframeSource, is_list, load_airframes
-from crazysim.core.controls import controllers_of, described, layout_of, require_controller, require_pair
+from crazysim.core.controls import require_controller, require_pair, require_same_controllers
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Plugin, plugin_list
@@ -94,13 +94,7 @@ class Configuration:
                 f"expected data of {_described(*needed)}, got data of {_described(*given)}. Use data of this "
                 f"simulation, or of one with the same settings."
             )
-        present, like_present = controllers_of(controls), controllers_of(like.controls)
-        if present != like_present and layout_of(present) != layout_of(like_present):  # records differ by identity
-            name = getattr(self.controller, "name", None)
-            raise ConfigError(
-                f"expected data of controller {name!r} with {described(like_present)}, got {described(present)}. Use "
-                f"data of this simulation, or of one with the same settings."
-            )
+        require_same_controllers(controls, like.controls, getattr(self.controller, "name", None))
 
     @staticmethod
     def create(
