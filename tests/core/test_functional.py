@@ -136,7 +136,7 @@ def test_commands_are_staged_in_one_function():
     sources = (Path(crazysim.__file__).parent).rglob("*.py")
     writes = re.compile(r"staged_(cmd|feedforward)\"?(=|: )(?!Array)")
     written = {".".join(source.parts[-2:]) for source in sources if writes.search(source.read_text())}
-    assert written == {"core.functional.py", "core.controls.py", "core.stages.py", "core.controllers.py"}
+    assert written == {"core.functional.py", "core.controls.py", "core.controllers.py"}
 
 
 def test_controllable_works_inside_jit():
