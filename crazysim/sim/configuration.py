@@ -151,7 +151,7 @@ def plugins_of(plugins: Sequence[Plugin], estimator: str | Estimator | None, aer
     found: list[Plugin] = []
     if estimator is not None:
         estimator = find_estimator(estimator)
-        found += [*estimator.sensors, estimator]
+        found.extend([*estimator.sensors, estimator])
     if aero is not None:
         if aero != "identified":
             raise ConfigError(

@@ -164,7 +164,8 @@ def test_drones_of_a_controller_fly_as_each_does_alone(name, rng):
 def test_the_cases_cover_dynamics_and_control():
     """No module of physics or control that computes arrays is missing.
 
-    ``parameters`` only loads them, and in ``firmware`` a library computes, which ``test_c_firmware`` compares.
+    ``parameters`` and ``parameter_tables`` only load them, and in ``firmware`` a library computes, which
+    ``test_c_firmware`` compares.
 
     Laws of controllers are covered by the controllers that use them.
     """
@@ -172,7 +173,8 @@ def test_the_cases_cover_dynamics_and_control():
     for place in CONTROLLERS.values():
         module = importlib.import_module(place.partition(":")[0])
         covered |= {module.__name__} | {getattr(x, "__module__", "") for x in vars(module).values()}
-    names = ("__init__", "levels", "models", "parameters", "protocol", "controllers", "setpoint", "switch", "firmware")
+    names = ("__init__", "levels", "models", "parameters", "parameter_tables")
+    names += ("protocol", "controllers", "setpoint", "switch", "firmware")
     for path in sources():
         name = "crazysim." + ".".join(path.relative_to(Path(crazysim.__file__).parent).with_suffix("").parts)
         assert name in covered or path.stem in names, name
