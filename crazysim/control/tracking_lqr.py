@@ -172,6 +172,7 @@ class TrackingLQR(Controller):
 
     The gains belong to times since the reset of a world, so the setpoints that arrive must be those of the trajectory,
     as from ``Follow`` with the same start.
+    It is the counterpart of AIMotionLab-Virtual's LTV-LQR, without that one's load.
     """
 
     name: ClassVar[str] = "tracking_lqr"
