@@ -23,7 +23,7 @@ from measure import digits, engine_of, medians, report
 
 import crazysim.envs as envs
 from crazysim import Randomize
-from crazysim.envs.state import bare, flatten
+from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.train import ppo
 from crazysim.train.config import TrainConfig
@@ -71,32 +71,44 @@ def rollouts(
     place = base.sim.device
     key = jax.device_put(jax.random.key(0), place)
     starts = {drones: jax.jit(env.reset)(key) for drones, env in places.items()}
-    look = base.sim.scene.depth_fn("fpv_cam", size[0], size[1]) if size else None
     n_obs = flatten(starts["as the airframe"].obs).shape[-1] + (size[0] * size[1] if size else 0)
     policy = Policy(RunningStats.create(n_obs), init_mlp(jax.random.key(1), (n_obs, 64, 64, base.actions.size), 0.01))
     policy = jax.device_put(policy, place)
 
-    def observed(state: Any) -> dict[str, jax.Array]:
-        if look is None:
-            return state.obs
-        depth = jnp.minimum(look(state.data).distance, MAX_DEPTH)
-        return {**state.obs, "depth": depth.reshape(*depth.shape[:2], -1)}
+    shape = starts["as the airframe"].action.shape
 
     def flying(policy: Policy) -> Any:
-        return lambda state, key: policy(observed(state)) + 0.1 * jax.random.normal(key, state.action.shape)
+        return lambda obs, memory, key: (policy(obs) + 0.1 * jax.random.normal(key, shape), memory, ())
+
+    def figures(step: Any) -> Any:
+        return step.reward.mean(), step.done.mean()
+
+    def looking(env: Any, state: Any, act: Any, key: Any) -> Any:
+        """Return what a rollout does for a policy that also gets images, which no observation of a task has."""
+        look = base.sim.scene.depth_fn("fpv_cam", *size)  # type: ignore[misc]
+
+        def step(state: Any, key: Any) -> Any:
+            depth = jnp.minimum(look(state.data).distance, MAX_DEPTH)
+            action, _, _ = act({**state.obs, "depth": depth.reshape(*depth.shape[:2], -1)}, (), key)
+            state = env.step(state, action)
+            return state, figures(state)
+
+        return jax.lax.scan(step, state, jax.random.split(key, n_steps))
 
     def jitted(env: Any, act: Any) -> Any:
         def run(carry: Any) -> Any:
             state, key = carry
             key, now = jax.random.split(key)
-            figures = lambda state: (state.reward.mean(), state.done.mean())  # noqa: E731
-            state, kept = envs.rollout(env, state, act, now, n_steps, figures)
+            if size:
+                state, kept = looking(env, state, act, now)
+            else:
+                state, _, kept = envs.rollout(env, state, act, now, n_steps, figures)
             return (state, key), kept
 
         return jax.jit(run)
 
     acts = {
-        "random": lambda state, key: jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3),
+        "random": lambda obs, memory, key: (jax.random.uniform(key, shape, minval=-0.3, maxval=0.3), memory, ()),
         "policy": flying(policy),
         "bfloat16": flying(policy.replace(layers=jax.tree.map(lambda x: x.astype("bfloat16"), policy.layers))),
     }
@@ -109,7 +121,7 @@ def rollouts(
                 carry = ppo.init(env, recipe, key)
                 lowered = ppo.iterate.lower(carry, env, recipe)
             else:
-                carry = (bare(starts[drones]), jax.device_put(jax.random.key(2), place))
+                carry = (starts[drones], jax.device_put(jax.random.key(2), place))
                 lowered = jitted(env, acts[name]).lower(carry)
             begin = time.perf_counter()
             run = lowered.compile()

@@ -26,10 +26,11 @@ T = TypeVar("T")
 
 def leaf(
     scope: Scope,
-    core_ndim: int = 0,
+    core_ndim: int | None = 0,
     core: tuple[int, ...] | None = None,
     *,
     sparse: bool = False,
+    scratch: bool = False,
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Declare an array field, or a dict of such arrays.
@@ -39,14 +40,16 @@ def leaf(
             (``Members``): (n_worlds, n_members, *core). ``world``: (n_worlds, 1, *core). ``batched``: (n_worlds, ...),
             with any further axes. ``shared``: core. ``parameter``: shared, or one per drone (or member), by its number
             of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
-        core_ndim: Number of dimensions of the core shape.
+        core_ndim: Number of dimensions of the core shape; None for any.
         core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
             each of three axes.
         sparse: True for a parameter whose zeros are terms that are absent, as an offset along one axis has. While it is
             shared, a step is compiled without them, and again after one of them changes.
+        scratch: True for an array that only carries numbers from one stage of a step to another: what a step writes
+            there is not kept.
         default: Value of the field where none is given.
     """
-    metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse}
+    metadata = {"scope": scope, CORE_NDIM_KEY: core_ndim, "core": core, "sparse": sparse, "scratch": scratch}
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -185,9 +188,9 @@ def numbered(tree: Any) -> Any:
     return treedef.unflatten(range(treedef.num_leaves))
 
 
-def sparse_leaves(tree: Any) -> Any:
-    """Return the same tree with True in the place of every leaf that is declared sparse, and False elsewhere."""
-    return _map_declared(lambda _, metadata, *__: bool(metadata.get("sparse")), tree, {}, "", None)
+def declared(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
+    """Return the same tree with True in the place of every leaf that is declared so, and False elsewhere."""
+    return _map_declared(lambda _, metadata, *__: bool(metadata.get(flag)), tree, {}, "", None)
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
@@ -219,16 +222,18 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
             metadata[CORE_NDIM_KEY],
             metadata["core"],
         )
-        has_axes = shape[: len(batch)] == batch and len(shape) == len(batch) + core_ndim
+        n_axes = len(shape) if core_ndim is None else len(batch) + core_ndim
+        has_axes = shape[: len(batch)] == batch and len(shape) == n_axes
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"
             batch = each if is_parameter else batch
             or_shared = f", or {core_ndim} if all {kinds} share it" if is_parameter else ""
             ending = "" if core is None else f" and end with {core}"
+            n_axes = len(batch) + (core_ndim or 0)
             raise ConfigError(
-                f"{name} has shape {shape}; needed are {len(batch) + core_ndim} dimensions that begin with {batch}"
-                f"{ending}, for {n_worlds} worlds of {n} {kinds}{or_shared}. For one value per world, repeat it "
-                f"for every {kind} with jnp.broadcast_to."
+                f"{name} has shape {shape}; needed are {n_axes} dimensions that begin with {batch}{ending}, for "
+                f"{n_worlds} worlds of {n} {kinds}{or_shared}. For one value per world, repeat it for every {kind} "
+                f"with jnp.broadcast_to."
             )
 
     _map_declared(check, tree, {}, "data", None)

@@ -8,42 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from cases import as_numbers
 
-from crazysim.envs import TASKS, make
-from crazysim.envs.wrappers import Wrapper
+from crazysim.envs import TASKS, AutoReset, make
 from crazysim.pytree import map_batched
 
 
-class Compiled(Wrapper):
-    """An environment whose functions are compiled once, for tests that call them from Python and compare bit for bit.
-
-    It is declared to need all worlds, so that nothing around it is fused.
-    """
-
-    batched = True
+class Compiled:
+    """An environment whose functions are compiled once, for tests that call them from Python and compare bits."""
 
     def __init__(self, env):
-        super().__init__(env)
+        self.env = env
         self.traces = collections.Counter()
         """Number of times that Python ran each of the functions."""
         for name in ("reset", "restart", "step"):
             setattr(self, name, jax.jit(self._counted(name, getattr(env, name))))
-        self.step = self._besides_final_obs(self.step)
 
-    def begin(self, state):
-        """Return the state with new episodes in all worlds, by the program of ``restart``."""
-        return self._besides_final_obs(self.restart)(state, np.ones(len(state.terminated), bool))
-
-    @staticmethod
-    def _besides_final_obs(fn):
-        """Return a function of a state that passes by what ``AutoReset`` adds to it: one program is for both."""
-
-        def call(state, *args):
-            added = {name: x for name, x in state.info.items() if name == "final_obs"}
-            own = {name: x for name, x in state.info.items() if name not in added}
-            new = fn(state.replace(info=own), *args)
-            return new.replace(info=new.info | added)
-
-        return call
+    def __getattr__(self, name):
+        return getattr(self.env, name)
 
     def _counted(self, name, fn):
         def counted(*args):
@@ -54,9 +34,10 @@ class Compiled(Wrapper):
 
 
 @functools.cache
-def compiled(name="hover", n_worlds=4):
-    """Return a compiled environment of a task with its usual settings."""
-    return Compiled(make(name, n_worlds))
+def compiled(name="hover", n_worlds=4, mode=None):
+    """Return a compiled environment of a task with its usual settings, with automatic resets if there is a mode."""
+    env = make(name, n_worlds)
+    return Compiled(env if mode is None else AutoReset(env, mode))
 
 
 def random_action(state, seed=0):
@@ -80,7 +61,8 @@ def kind(tree):
 def of_worlds(state, mask, but=()):
     """Return the part of a state that belongs to some worlds, without some of its fields."""
     data = map_batched(lambda x: as_numbers(x)[mask], state.data)
-    rest = {name: x for name, x in vars(state).items() if name not in ("data", *but)}
+    names = {"obs", "reward", "terminated", "truncated", "action", "info", "memory"} - set(but)
+    rest = {name: getattr(state, name) for name in sorted(names)}
     return data, jax.tree.map(lambda x: as_numbers(x)[mask], rest)
 
 

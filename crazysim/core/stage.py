@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,11 @@ T = TypeVar("T")
 
 StageScope = str
 """``"drone"``, ``"world"``, ``"batch"`` for all worlds, or the name of a population."""
+
+Phase = Literal["before", "each", "after"]
+"""When in a call a stage runs: once before the first step, at each step, or once after the last."""
+
+PHASES: tuple[Phase, ...] = ("before", "each", "after")
 
 RESERVED = ("batch", "batched", "shared", "opaque", "parameter", "member")
 """Names of other scopes, which neither a stage is declared for nor a population is named."""
@@ -38,6 +43,7 @@ class Stage:
         name: str | None = None,
         fixed: bool = False,
         why: str = "it is not declared for one drone or one world",
+        phase: Phase = "each",
     ):
         """Declare a stage; see ``stage``.
 
@@ -47,6 +53,7 @@ class Stage:
         """
         self.fn, self.when, self.batched, self.fixed, self.why = fn, when, batched, fixed, why
         self.scope: StageScope = scope
+        self.phase: Phase = phase
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
         self.__doc__ = fn.__doc__
 
@@ -81,7 +88,9 @@ class Stage:
         return f"<stage {self.__name__} of one {self.scope}>"
 
 
-def stage(scope: StageScope, when: Callable[..., Array | None] | None = None) -> Callable[[Callable[..., Any]], Stage]:
+def stage(
+    scope: StageScope, when: Callable[..., Array | None] | None = None, phase: Phase = "each"
+) -> Callable[[Callable[..., Any]], Stage]:
     """Declare the scope of a stage, so that an engine can fuse it with its neighbours.
 
     A stage without a declared scope receives the full batch.
@@ -100,16 +109,20 @@ def stage(scope: StageScope, when: Callable[..., Array | None] | None = None) ->
         scope: ``"drone"``, ``"world"`` or the name of a population.
         when: ``when(data)``: true if the stage acts at this step, (); None for always. An engine skips a stage at
             steps where it acts nowhere.
+        phase: When in a call of the step it runs: ``"before"`` the first of its physics steps, at ``"each"`` of them,
+            or ``"after"`` the last.
 
     Raises:
-        ConfigError: If the scope is none of these. A population is looked up when the stage is applied.
+        ConfigError: If the scope or the phase is none of these. A population is looked up when the stage is applied.
     """
     if not isinstance(scope, str) or not scope or scope in RESERVED:
         raise ConfigError(
             f"expected scope 'drone', 'world' or the name of a population, got {scope!r}. A stage of the full batch is "
             f"left undeclared."
         )
-    return lambda fn: Stage(fn, scope, when)
+    if phase not in PHASES:
+        raise ConfigError(f"expected a phase of {', '.join(map(repr, PHASES))}, got {phase!r}.")
+    return lambda fn: Stage(fn, scope, when, phase=phase)
 
 
 def tick(data: SimData, freq: int) -> Array | None:
@@ -129,7 +142,7 @@ def at_the_start(data: SimData) -> Array:
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
     return [
-        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed, fn.why)
+        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed, fn.why, fn.phase)
         if isinstance(fn, Stage)
         else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()

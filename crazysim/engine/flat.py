@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.engine.ir.program import Zeros
-from crazysim.pytree import numbered, scopes, sparse_leaves
+from crazysim.pytree import declared, numbered, scopes
 
 
 class PackCache:
@@ -89,7 +89,7 @@ class ZerosCache:
         if key not in self._shared:
             numbers = numbered(data)
             parameters = set(jax.tree.leaves((numbers.params, numbers.controls)))
-            rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(sparse_leaves(data)), leaves, strict=True)
+            rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(declared(data, "sparse")), leaves, strict=True)
             self._shared[key] = [
                 i
                 for i, (scope, is_sparse, x) in enumerate(rows)

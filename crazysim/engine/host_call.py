@@ -186,15 +186,14 @@ class HostCall:
         self._written, self._positions = [i for i, _ in written], [k for _, k in written]
         self._read = sorted({i for launch in self._launches for i in launch.inputs})
 
-    def hold(self, leaves: Sequence[Any], packed: Any, sharding: Any) -> HostLeaves:
+    def hold(self, leaves: Sequence[Any], sharding: Any) -> HostLeaves:
         """Return leaves that can be stepped.
 
         Args:
-            leaves: Leaves of the data on the device.
-            packed: The packed leaf; None if there is none.
+            leaves: Leaves of the data on the device, and behind them those that passes add.
             sharding: The device.
         """
-        items = [*leaves, packed]
+        items = list(leaves)
         views = {i: self._view(i, items[i]) for i in self._read}
         addresses = [0] * len(items)
         for i, view in views.items():

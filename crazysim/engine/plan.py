@@ -13,9 +13,10 @@ Everything that an engine can refuse it refuses here, before the first step. The
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -35,6 +36,7 @@ from crazysim.engine.lowering.relative import on_data
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
+from crazysim.engine.passes.layout import Rows, rows_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_batch_axes, numbered, scopes
 
@@ -45,7 +47,12 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 """Backends of the engines that run programs."""
 
 
-class Plan(NamedTuple):
+Apart = frozenset[int] | None
+"""Leaves that stay arrays of their own where others become rows; None for no rows."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plan:
     """Engine and compiled step for data of one structure."""
 
     engine: str
@@ -57,10 +64,12 @@ class Plan(NamedTuple):
     none for ``plain``."""
     location: Location
     """Devices that it runs on."""
-    read: tuple[int, ...]
-    """Leaves that are passed to the compiled step."""
+    inputs: tuple[int, ...]
+    """Leaves that are passed to the compiled step: those of the data, and behind them those that passes add."""
     packed: tuple[int, ...]
-    """Leaves that are passed as one array behind them."""
+    """Shared leaves that are passed as one, which is the first behind those of the data."""
+    rows: tuple[Rows, ...]
+    """Leaves of rows, behind that; empty where the data is stepped as it is."""
     written: tuple[int, ...]
     """Leaves that are returned."""
     numbers: SimData
@@ -99,13 +108,15 @@ class Planner(NamedTuple):
     reported: set[str]
     """Warnings that were given before, for data of another structure."""
 
-    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None]) -> Plan:
+    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], apart: Apart = None) -> Plan:
         """Return the plan of some data.
 
         Args:
             data: The data, or its shapes and types.
             zeros: Elements of shared parameters that are zero.
             trace: Traces the compiled step of a plan, as its first call would, to find what fails there.
+            apart: Leaves that stay arrays of their own where the others that a call writes become rows, if one kernel
+                runs all of the step; None for no rows.
 
         Raises:
             ConfigError: If a stage is wrong, if an engine chosen by name cannot run it, or, with ``strict``, if a
@@ -114,7 +125,7 @@ class Planner(NamedTuple):
         if self.engine == "plain":
             return self._plain(data, "it was chosen")
         try:
-            plan, problems = self._fast(data, zeros)
+            plan, problems = self._fast(data, zeros, apart)
             if plan.direct is None:
                 trace(plan)
         except (ConfigError, MemoryError):
@@ -136,7 +147,7 @@ class Planner(NamedTuple):
         )
         return plan
 
-    def _fast(self, data: SimData, zeros: Zeros) -> tuple[Plan, list[str]]:
+    def _fast(self, data: SimData, zeros: Zeros, apart: Apart) -> tuple[Plan, list[str]]:
         """Return a plan that runs a program, and what it does not support; that of ``plain`` on several devices."""
         limit = self._spread_limit(data)
         if limit:
@@ -149,7 +160,12 @@ class Planner(NamedTuple):
         lowered = [
             lower_stages(g.stages, data, known, _watched, population=g.population, tracer=tracer) for g in groups
         ]
-        programs = tuple([optimise(program, pack=k == 0) for k, program in enumerate(lowered)])
+        one_kernel = self._has_kernels and not self.location.spread and [x.fused for x in lowered] == [True]
+        select = None
+        if apart is not None and one_kernel:
+            kept = {*apart, numbered(data).core.mjx_synced}
+            select = lambda written: [i for i in written if i not in kept]  # noqa: E731
+        programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
         split = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
         if self.location.spread and split:
@@ -159,27 +175,25 @@ class Planner(NamedTuple):
             engine, why = "lanes", fused.missing(self.location.platform) or ""
             if not why:
                 try:
-                    runs, engine = self._built("fused", programs), "fused"
+                    in_leaves = None if select is None else optimise(lowered[0])
+                    runs, engine = [fused.build(x, self.location, in_leaves) for x in programs], "fused"
                 except UnsupportedError as error:
                     error = self._of_one_stage(error, data)
                     why = str(error)
                     problems.append(self._without_kernel(error))
             if why and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
-        runs = runs or self._built(engine, programs)
-        read = tuple(i for program in programs for i in (*program.read, *_needed(program)))
+        runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
+        inputs = {i for program in programs for i in _inputs(program)}
         run, written = _together(groups, programs, runs)
-        plan = self._wrap(engine, why, data, programs, read, written, run, len(programs[0].leaves))
+        plan = self._wrap(engine, why, data, programs, inputs, written, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
         if on_host and is_possible(kernels):
             owned = [group.owned for group in groups]
             call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.numbers.core.nonfinite))
-            plan = plan._replace(host_call=call)
+            plan = dataclasses.replace(plan, host_call=call)
         return plan, problems
-
-    def _built(self, engine: str, programs: Sequence[Program]) -> list[Run]:
-        return [BACKENDS[engine](program, self.location) for program in programs]
 
     def _spread_limit(self, data: SimData) -> str:
         """Return why data on several devices is stepped by ``plain``, or nothing."""
@@ -196,33 +210,40 @@ class Planner(NamedTuple):
         # XLA spreads the arrays of ``plain`` over devices by itself.
         return self._wrap("plain", why, data, (), everything, tuple(written), run, len(everything))
 
+    @property
+    def _has_kernels(self) -> bool:
+        return self.engine in ("auto", "fused") and fused.missing(self.location.platform) is None
+
     def _wrap(
         self,
         engine: str,
         why: str,
         data: SimData,
         programs: tuple[Program, ...],
-        read: tuple[int, ...],
+        needed: Collection[int],
         written: tuple[int, ...],
         run: Run,
         n_leaves: int,
     ) -> Plan:
-        numbers = numbered(data)
-        everything = tuple(sorted({*read, *written}))
-        written = (*written, numbers.core.nonfinite)
-        packed = programs[0].packed if programs else ()
-        read = everything[:-1] if packed else everything  # the packed array is the last
+        numbers, inputs = numbered(data), tuple(sorted(needed))
+        # Where a stage writes the flags itself, there is no check.
+        checks = any(p.check is not None for p in programs) if programs else numbers.core.nonfinite not in written
+        flags = (numbers.core.nonfinite,) if checks else ()
+        written = (*written, *flags)
+        main = programs[0] if programs else None
+        packed = main.packed if main is not None else ()
+        rows = tuple(rows_of(main)) if main is not None else ()
 
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
-            leaves = with_leaves([None] * n_leaves, everything, values)
+            leaves = with_leaves([None] * n_leaves, inputs, values)
             out, flagged = run(leaves, n_steps)
-            return [*out, flagged]
+            return [*out, flagged] if flags else list(out)
 
         if programs and self.location.mesh is not None:
-            advance = self._over_mesh(advance, data, everything, written)
-        plan = Plan(engine, why, programs, self.location, read, packed, written, numbers, *_jitted(advance))
+            advance = self._over_mesh(advance, data, inputs, written)
+        plan = Plan(engine, why, programs, self.location, inputs, packed, rows, written, numbers, *_jitted(advance))
         direct = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
-        return plan._replace(direct=_results_on_device(advance)) if direct else plan
+        return dataclasses.replace(plan, direct=_results_on_device(advance)) if direct else plan
 
     def _over_mesh(
         self, advance: Callable[..., Any], data: SimData, inputs: Sequence[int], outputs: Sequence[int]
@@ -315,8 +336,15 @@ def _watched(data: SimData) -> list[Any]:
     return jax.tree.leaves(watched(data))
 
 
-def _needed(program: Program) -> list[int]:
-    """Return the leaves that are watched, and one whose shape gives the number of worlds."""
-    check = program.check
-    checked = [leaf for leaf, _ in check.reads] if check is not None else []
-    return [*checked, next(i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone")]
+def _inputs(program: Program) -> list[int]:
+    """Return the leaves that a program reads, and one whose shape gives the number of worlds.
+
+    A leaf that is written before it is read is not one of them, unless unfused stages split the step.
+    """
+    moved = {i for leaf in program.leaves for i in leaf.rows_of}
+    of_drones = [i for i, x in enumerate(program.leaves) if x.scope == "drone" and not x.rows_of and i not in moved]
+    if program.fused:
+        needed = kernel.needed(program)
+        return [*needed, next((i for i in of_drones if i in needed), of_drones[0])]
+    checked = [leaf for leaf, _ in program.check.reads] if program.check is not None else []
+    return [*program.read, *program.written, *checked, of_drones[0]]

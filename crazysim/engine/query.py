@@ -10,8 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import Axes, Stage
-from crazysim.engine.fused_call import FusedCall
+from crazysim.core.sharding import Location
+from crazysim.core.stage import Axes, Stage, with_leaves
+from crazysim.engine.backends import fused
+from crazysim.engine.lowering.relative import on_data
+from crazysim.engine.lowering.stages import lower_stages
+from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf
 
 NAME = "results"
@@ -53,10 +57,15 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
             rows[name] = jnp.zeros((n_worlds, n_drones, *shape), x.dtype).reshape(n_worlds, n_drones, -1)
         shapes.append(dict(zip(names, per_drone, strict=True)))
         trees.append(treedef)
-        stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}"))
+        stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}", phase="after"))
     prepared = data.replace(plugins={NAME: Results(rows)})
-    rollout = FusedCall((), (), stages, prepared, 0, platform)
-    found = jax.tree.unflatten(jax.tree.structure(prepared), rollout(jax.tree.leaves(prepared))).plugins[NAME].rows
+    given, treedef = jax.tree.flatten(prepared)
+    program = optimise(lower_stages(stages, prepared))
+    if program.unfused_stages:
+        raise program.unfused_stages[0].error
+    packed = [jnp.concatenate([given[i].ravel() for i in program.packed])] if program.packed else []
+    written, _ = on_data(program, fused.build(program, Location(platform)))([*given, *packed], 0)
+    found = treedef.unflatten(with_leaves(given, program.written, written)).plugins[NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])
         for tree, some in zip(trees, shapes, strict=True)

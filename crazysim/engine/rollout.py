@@ -9,11 +9,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from crazysim.control import Control
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.core.settings import positive
-from crazysim.core.stage import with_leaves
 from crazysim.engine.ir.program import Zeros
 from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
@@ -23,14 +21,6 @@ Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
 Keep = Callable[[SimData], Any]
 """Data to the part of it to record: any tree of arrays."""
-
-COMMANDS: dict[Control, Callable[[SimData, Any], SimData]] = {
-    Control.state: F.state_control,
-    Control.attitude: F.attitude_control,
-    Control.body_rate: F.body_rate_control,
-    Control.force_torque: F.force_torque_control,
-    Control.rotor_vel: F.rotor_vel_control,
-}
 
 
 def states_of(data: SimData) -> Any:
@@ -77,25 +67,21 @@ def rollout(
     if n_control_steps % every:
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
-    command = COMMANDS[data.controls.mode]
-    leaves, treedef = jax.tree.flatten(data)
-    plan = step.plan(data, zeros)
-    changed = sorted({*plan.written, plan.synced, *F.staged_leaves(plan.numbers)})
+    start = step.flatten(data, zeros, n_substeps, frozenset() if step.platform == "gpu" else None)
+    changed = sorted({*start.plan.written, start.plan.synced, *F.staged_leaves(start.plan.numbers)})
 
     def control_step(carry: list[Any]) -> list[Any]:
-        data = unpack(carry)
-        after = jax.tree.leaves(step(command(data, policy(params, data)), n_substeps, zeros))
-        return [after[i] for i in changed]
-
-    def unpack(carry: list[Any]) -> SimData:
-        return treedef.unflatten(with_leaves(leaves, changed, carry))
+        now = start.replaced(changed, carry)
+        command = F.check_command(data, data.controls.mode, policy(params, now.data()))
+        after = step.advance(now.staged(data, command), n_substeps)
+        return [after.leaves[i] for i in changed]
 
     def until_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
-        return carry, keep(unpack(carry))
+        return carry, keep(start.replaced(changed, carry).data())
 
-    carry, kept = jax.lax.scan(until_record, [leaves[i] for i in changed], length=n_control_steps // every)
-    return unpack(carry), kept
+    carry, kept = jax.lax.scan(until_record, [start.leaves[i] for i in changed], length=n_control_steps // every)
+    return start.replaced(changed, carry).data(), kept
 
 
 SETTINGS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")

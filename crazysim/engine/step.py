@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import functools
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import jax
@@ -17,12 +18,13 @@ from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import placed, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, locate
-from crazysim.core.stage import Axes, as_stages, with_leaves
+from crazysim.core.stage import Axes, Stage, as_stages, with_leaves
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.ir.program import Program, Zeros
-from crazysim.engine.plan import ENGINES, Plan, Planner
+from crazysim.engine.lowering.relative import viewed
+from crazysim.engine.plan import ENGINES, Apart, Plan, Planner
 from crazysim.errors import ConfigError, shown
 from crazysim.pytree import check_axes, lazy
 
@@ -30,11 +32,12 @@ from crazysim.pytree import check_axes, lazy
 class FlatData:
     """``SimData`` as a list of arrays with the plan that steps it; steps in a row need no record between them."""
 
-    __slots__ = ("_record", "leaves", "packed", "plan", "treedef")
+    __slots__ = ("_record", "leaves", "plan")
 
-    def __init__(self, leaves: list[Any] | HostLeaves, treedef: Any, plan: Plan, packed: Array | None):
-        """Hold the leaves, and the array of those that are packed."""
-        self.leaves, self.treedef, self.plan, self.packed = leaves, treedef, plan, packed
+    def __init__(self, leaves: list[Any] | HostLeaves, plan: Plan):
+        """Hold the leaves: those of the data, None for one that is in rows, and behind them those that passes add."""
+        self.leaves: Any = leaves
+        self.plan = plan
         self._record: SimData | None = None
 
     def is_record(self, data: SimData) -> bool:
@@ -45,8 +48,15 @@ class FlatData:
         """Return the data as a record, which is made once, and whose fields are made when they are read."""
         record = self._record
         if record is None:
-            record = self._record = lazy(self.plan.numbers, self.leaves.__getitem__)
+            # Without a reference to this object, so that no cycle keeps arrays in memory.
+            record = self._record = lazy(self.plan.numbers, functools.partial(_leaf, self.leaves, self.plan))
         return record
+
+    def replaced(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:
+        """Return the data with other values of some leaves, none of which is in rows."""
+        if isinstance(self.leaves, HostLeaves):
+            return FlatData(self.leaves.replaced(numbers, values), self.plan)
+        return FlatData(with_leaves(self.leaves, numbers, values), self.plan)
 
     def staged(self, like: SimData, command: Any, feedforward: Any = None) -> FlatData:
         """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does.
@@ -57,18 +67,27 @@ class FlatData:
             feedforward: Feedforward of a setpoint; None for that of ``stage_command``.
         """
         numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
-        if isinstance(self.leaves, HostLeaves):
-            leaves: Any = self.leaves.replaced(numbers, values.values())
-        else:
-            leaves = with_leaves(self.leaves, numbers, [placed(like, x) for x in values.values()])
-        return FlatData(leaves, self.treedef, self.plan, self.packed)
+        on_host = isinstance(self.leaves, HostLeaves)
+        return self.replaced(numbers, [x if on_host else placed(like, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step besides the number of steps."""
-        values = [self.leaves[i] for i in self.plan.read]
-        if self.packed is not None:
-            values.append(self.packed)
-        return values
+        return [self.leaves[i] for i in self.plan.inputs]
+
+
+def _leaf(leaves: Any, plan: Plan, i: int) -> Any:
+    """Return one of the leaves of the data, from the rows if it is in rows."""
+    x = leaves[i]
+    if x is not None or not plan.rows:
+        return x
+    rows = next(rows for rows in plan.rows if i in rows.members)
+    x = rows.unpack(leaves[rows.leaf], i)
+    return x.reshape(x.shape[0], *x.shape[2:]) if i in rows.program.views else x
+
+
+jax.tree_util.register_pytree_node(
+    FlatData, lambda flat: (tuple(flat.leaves), flat.plan), lambda plan, leaves: FlatData(list(leaves), plan)
+)
 
 
 class Step:
@@ -122,10 +141,14 @@ class Step:
 
     def without(self, names: Collection[str]) -> Step:
         """Return the step without some stages."""
+        return self.of([stage for stage in self.stages if stage.__name__ not in names])
+
+    def of(self, stages: Sequence[Stage]) -> Step:
+        """Return the step of other stages, with the same engine and devices."""
         devices = self.location.devices
         device = devices[0] if self.mesh is None and devices is not None else None
-        stages: Pipeline = {stage.__name__: stage for stage in self.stages if stage.__name__ not in names}
-        return Step(stages, self.engine, self.platform, self.mesh, device=device, strict=self.strict)
+        pipeline: Pipeline = {stage.__name__: stage for stage in stages}
+        return Step(pipeline, self.engine, self.platform, self.mesh, device=device, strict=self.strict)
 
     def __call__(self, data: SimData, n_steps: int | Array = 1, zeros: Zeros | None = None) -> SimData:
         """Return the data some steps later.
@@ -141,20 +164,35 @@ class Step:
                 one only the type and shape are known.
         """
         _check_steps(n_steps)
-        after = self.advance(self.flatten(data, zeros, n_steps), n_steps)
-        return after.treedef.unflatten(after.leaves)
+        leaves, treedef = jax.tree.flatten(data)
+        after = self.advance(self._flat(data, leaves, treedef, zeros, n_steps), n_steps)
+        return treedef.unflatten(after.leaves[: len(leaves)])
 
-    def flatten(self, data: SimData, zeros: Zeros | None = None, n_steps: int | Array | None = None) -> FlatData:
+    def flatten(
+        self, data: SimData, zeros: Zeros | None = None, n_steps: int | Array | None = None, apart: Apart = None
+    ) -> FlatData:
         """Return the data flattened for ``advance``.
 
         Args:
             data: The simulation.
             zeros: As in ``__call__``.
             n_steps: A number of steps of the kind that will be taken; None for an array.
+            apart: Leaves that stay arrays of their own where others that a call writes become rows, which is faster in
+                loops over calls; None for no rows.
         """
-        leaves, treedef = jax.tree.flatten(data)
-        plan = self._plan(data, leaves, treedef, zeros, n_steps)
-        return FlatData(leaves, treedef, plan, self._packed(plan, leaves))
+        return self._flat(data, *jax.tree.flatten(data), zeros, n_steps, apart)
+
+    def _flat(
+        self,
+        data: SimData,
+        leaves: list[Any],
+        treedef: Any,
+        zeros: Zeros | None,
+        n_steps: int | Array | None,
+        apart: Apart = None,
+    ) -> FlatData:
+        plan = self._plan(data, leaves, treedef, zeros, n_steps, apart)
+        return FlatData(self._all_leaves(plan, leaves), plan)
 
     def advance(self, flat: FlatData, n_steps: int | Array) -> FlatData:
         """Return the data some steps later, still flattened."""
@@ -168,17 +206,17 @@ class Step:
         self._called.add(program)
         leaves = with_leaves(flat.leaves, plan.written, out)  # type: ignore[arg-type]  # a list, but for a host call
         leaves[plan.synced] = self._false(leaves[plan.synced])
-        return FlatData(leaves, flat.treedef, plan, flat.packed)
+        return FlatData(leaves, plan)
 
     def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
         """Return the same without XLA, for data whose plan has a ``host_call``; it waits until the steps are taken."""
         plan, leaves = flat.plan, flat.leaves
         call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
-            leaves = call.hold(leaves, flat.packed, leaves[plan.synced].sharding)
+            leaves = call.hold(leaves, leaves[plan.synced].sharding)
         after = call(leaves, n_steps)
         after.items[plan.synced] = self._false(after.items[plan.synced])
-        return FlatData(after, flat.treedef, plan, flat.packed)
+        return FlatData(after, plan)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
         """Return how this data is stepped."""
@@ -212,8 +250,12 @@ class Step:
         called = [plan.host_call is not None and plan.host_call.used for plan in self._plans.values()]
         return sum(called) + sum(count(plan.dynamic) + count(plan.static) for plan in self._plans.values())
 
-    def _packed(self, plan: Plan, leaves: list[Any]) -> Array | None:
-        return self._pack([leaves[i] for i in plan.packed]) if plan.packed else None
+    def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
+        """Return the leaves of the data, and behind them those that the plan adds."""
+        packed = [self._pack([leaves[i] for i in plan.packed])] if plan.packed else []
+        rows = [rows.pack(viewed(rows.program.views, leaves)) for rows in plan.rows]
+        in_rows = [i for rows in plan.rows for i in rows.members]
+        return [*with_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
     def _false(self, before: Any) -> Any:
         """Return a flag that is false, on the devices of the flag before; the same array again costs no call."""
@@ -226,11 +268,17 @@ class Step:
         return flag
 
     def _plan(
-        self, data: SimData, leaves: list[Any], treedef: Any, zeros: Zeros | None, n_steps: int | Array | None = None
+        self,
+        data: SimData,
+        leaves: list[Any],
+        treedef: Any,
+        zeros: Zeros | None,
+        n_steps: int | Array | None = None,
+        apart: Apart = None,
     ) -> Plan:
         zeros = self._zeros(data, leaves, treedef) if zeros is None else zeros
         elsewhere = self._elsewhere(data.states.pos)
-        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, elsewhere)
+        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, elsewhere, apart)
         plan = self._plans.get(key)
         if plan is None:
             check_axes(data, data.core.n_worlds, data.core.n_drones)
@@ -240,12 +288,12 @@ class Step:
             planner = Planner(self.stages, self.engine, self.strict, location, self._reported)
 
             def trace(plan: Plan) -> None:
-                flat = FlatData(leaves, treedef, plan, self._packed(plan, leaves))
+                flat = FlatData(jax.eval_shape(lambda leaves: self._all_leaves(plan, leaves), leaves), plan)
                 known = isinstance(n_steps, int)
                 step = plan.static if known else plan.dynamic
                 step.trace(flat.inputs(), n_steps if known else jnp.int32(1))
 
-            plan = self._plans[key] = planner.plan(data, zeros, trace)
+            plan = self._plans[key] = planner.plan(data, zeros, trace, apart)
         return plan
 
     def _elsewhere(self, x: Any) -> Location | None:

@@ -4,40 +4,40 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from operator import is_
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive
 from crazysim.core.sharding import beside, commit, put, shard
-from crazysim.core.stage import Axes, Stage, of_world, over_worlds
-from crazysim.core.stages import reset
+from crazysim.core.stage import over_worlds
 from crazysim.eager import is_traced
-from crazysim.engine.backends import fused
+from crazysim.engine.step import FlatData, Step
+from crazysim.engine.tools.explain import explain
 from crazysim.envs.actions import Actions, actions_of
-from crazysim.envs.default_data import compact, reset_world, spread, with_own
 from crazysim.envs.hooks import Hooks
-from crazysim.envs.phases import Phases, all_worlds
-from crazysim.envs.state import EnvState, state_of_data, validate_action
+from crazysim.envs.phases import Phases, all_worlds, select_states
+from crazysim.envs.reset_policy import ResetPolicy
+from crazysim.envs.resets import Resets
+from crazysim.envs.state import NAME, OUTPUTS, EnvState, state_of_data, validate_action
 from crazysim.envs.task import Task
-from crazysim.envs.task_check import check_task, require_finite_start, require_installed
+from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_batch_axes, n_world_axes, numbered, scopes, select_worlds
+from crazysim.pytree import numbered
 from crazysim.sim.sim import Sim
 
 
 class Env(ABC):
     """An environment of all worlds, wrapped or not. Its functions are pure, for jit, scan, vmap and grad.
 
-    A step has four phases: ``act`` stages the command of an action, ``physics`` advances the simulation, ``observe``
-    evaluates the task, and ``restart`` begins new episodes where one is over.
+    A step has four phases: ``act`` stages the command of an action, the physics advances the simulation, ``observe``
+    evaluates the task, and ``begin`` starts new episodes where one is over, if ``AutoReset`` is around it.
     """
 
     auto_resets: ClassVar[bool] = False
@@ -78,14 +78,36 @@ class Env(ABC):
         """Environment steps in one episode."""
         return self.base.max_steps
 
+    @property
+    def policy(self) -> ResetPolicy | None:
+        """Rule by which new episodes begin within a step; None if none do."""
+        return None
+
     @functools.cached_property
     def phases(self) -> Phases:
         """The phases of its step."""
         base, last_step = self.base, self.max_steps * self.n_substeps
-        reset_data, batched = base.reset_data, base.batched_reset
         return Phases(
-            self.task, self.actions, self.wrappers, base.sim.n_drones, last_step, reset_data, batched, base.measured
+            self.task,
+            self.actions,
+            self.wrappers,
+            base.sim.n_drones,
+            last_step,
+            base.resets,
+            self.policy,
+            base.measured,
         )
+
+    @functools.cached_property
+    def step_fn(self) -> Step:
+        """The step of the engine that ``step`` calls: the physics between the phases."""
+        batched = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
+        batched += [f"task {self.task.name!r}"] if self.task.batched else []
+        why = f"{', '.join(batched)} is declared to need all worlds at once" if batched else None
+        if self.base.resets.foreign:
+            why = "a record in data.plugins is of another library, and is not divided among worlds"
+        physics = self.base.physics
+        return physics.of(self.phases.stages(physics.stages, why))
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the start of an episode; the same key gives the same episodes.
@@ -103,8 +125,9 @@ class Env(ABC):
             data = self.base.initial_data(key)
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
-            state = self.begin(state_of_data(data))
-        if not is_traced([state.data.states.pos]):
+            state = self._complete(self.begin(state_of_data(data)))
+        if not is_traced([state.whole.states.pos]):
+            state = EnvState(put(state.whole, self.sim.device)) if self.sim.mesh is None else state
             require_finite_start(self.task, state)
         return state
 
@@ -118,12 +141,13 @@ class Env(ABC):
         Raises:
             ConfigError: If the mask has another shape or type.
         """
-        with beside(state.data.core.steps):
-            mask = as_mask(mask, state.data.core.steps.shape[:1])
+        steps = state.whole.core.steps
+        with beside(steps):
+            mask = as_mask(mask, steps.shape[:1])
             return select_states(mask, self.begin(state), state)
 
     def step(self, state: EnvState, action: Array) -> EnvState:
-        """Return the state one environment step later.
+        """Return the state one environment step later; with ``AutoReset``, with new episodes where one is over.
 
         A world that becomes non-finite terminates, sets ``info["nonfinite"]``, and is observed as zeros.
 
@@ -134,25 +158,67 @@ class Env(ABC):
         Raises:
             ValueError: If the action has another shape.
         """
-        with beside(state.data.core.steps):
+        self._require_own(state)
+        with beside(state.whole.core.steps):
             action = validate_action(action, state, self.actions)
-            state, action = self.phases.act(state, action, all_worlds)
-            state = state.replace(data=self.base.physics(state.data))
-            return self.phases.observe(state, action, all_worlds)
+            after = self.step_fn(state.replace(next_action=action).whole, self.n_substeps, ())
+            return EnvState(after).replace(next_action=state.record.next_action)
+
+    def flatten(self, state: EnvState) -> FlatData:
+        """Return the state as flat data for ``advance``, which steps it faster in a loop than ``step`` a state."""
+        self._require_own(state)
+        record = numbered(state.whole).plugins[NAME]
+        outputs = jax.tree.leaves([getattr(record, name) for name in OUTPUTS])
+        return self.step_fn.flatten(state.whole, (), self.n_substeps, frozenset(outputs))
+
+    def advance(self, flat: FlatData, action: Array) -> FlatData:
+        """Return flat data one environment step later; ``EnvState(flat.data())`` is its state. See ``step``."""
+        flat = flat.replaced([flat.plan.numbers.plugins[NAME].next_action], [action])
+        return self.step_fn.advance(flat, self.n_substeps)
+
+    def _require_own(self, state: EnvState) -> None:
+        """Check that a state has the structure that steps of this environment return.
+
+        Raises:
+            ConfigError: If it is of an environment with another mode of automatic resets.
+        """
+        expected = self.policy is not None and self.policy.keeps_final_obs
+        if expected != ("final_obs" in state.record.drone_info):
+            raise ConfigError(
+                f"expected a state of this environment, {'with' if expected else 'without'} info['final_obs'], got one "
+                f"of another mode of automatic resets. Use its own reset."
+            )
 
     def begin(self, state: EnvState) -> EnvState:
         """Return the state with new episodes in all worlds."""
-        state = self.phases.begin(state, self.base.default_of(state.data), all_worlds)
-        data = state.data.replace(core=state.data.core.replace(mjx_synced=jnp.asarray(False)))
-        return state.replace(data=data if self.sim.mesh is None else shard(data, self.sim.mesh))
+        state = self.phases.begin(state, self.base.resets.default_of(state.data), all_worlds)
+        core = state.whole.core.replace(mjx_synced=jnp.asarray(False))
+        whole = state.whole.replace(core=core)
+        return EnvState(whole if self.sim.mesh is None else shard(whole, self.sim.mesh))
+
+    def _complete(self, state: EnvState) -> EnvState:
+        """Return the state at the start of the first episode with everything that a step adds, as zeros."""
+        state = state if self.policy is None else self.policy.end(state)
+        state = state.replace(next_action=jnp.zeros_like(state.action), over=jnp.zeros_like(state.terminated))
+        leaves, treedef = jax.tree.flatten(state)
+        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]))
+        if key not in self._after:
+            self._after[key] = jax.eval_shape(self.phases.outline, state)
+        after = self._after[key]
+        missing = {k: x for k, x in after.info.items() if k not in state.info}
+        state = state.replace(info=state.info | jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), missing))
+        check_record(state, after)
+        return state
+
+    @functools.cached_property
+    def _after(self) -> dict[Any, EnvState]:
+        """Shapes and types of the state after a step, by those at the start of an episode."""
+        return {}
 
     def explain(self) -> str:
-        """Return how a step is executed: whether it is one kernel, and if not, why; then the physics in it."""
-        return f"a step is {self._kind_of_step()}\nits physics, as in sim.explain():\n{self.sim.explain()}"
-
-    def _kind_of_step(self) -> str:
-        """Return the part of ``explain`` about the step: that it is one kernel, or that it is not, with the reason."""
-        return "not one kernel: it begins no new episodes. AutoReset(env), which training and Gymnasium use, does"
+        """Return how a step is executed, as ``Sim.explain`` does for a step of the physics."""
+        state = jax.eval_shape(self.reset, jax.random.key(0))
+        return explain(self.step_fn, state.whole, zeros=())
 
     def target(self, state: EnvState) -> Array | None:
         """Return the place where each drone should be, or several marks, for images, m; None if the task has none.
@@ -235,35 +301,13 @@ class DroneEnv(Env):
                 f"seconds={1 / freq:g} or more."
             )
         sim.plugins.check()
-        self._step = sim.build_step_fn().without(sim.plugins.reset_stages)  # every episode begins by a reset
-        self._foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))
-        first, *others = sim.reset_pipeline.values()
-        self.batched_reset = self._foreign or first is not reset or not all(isinstance(fn, Stage) for fn in others)
-        """True if the reset pipeline has functions of all worlds, or a record of another library is reset."""
-        self.reset_data = self._reset_all() if self.batched_reset else self._reset_world(others)
-        """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
+        if NAME in sim.plugins:
+            raise ConfigError(f"expected no plugin of the name {NAME!r}, which is that of the environment's record")
+        self.physics = sim.build_step_fn().without(sim.plugins.reset_stages)  # every episode begins by a reset
+        """The step of the physics."""
+        self.resets = Resets(sim)
+        """Resets of data at the start of an episode."""
         self._plugins, self._beginning = tuple(sim.plugins.values()), _beginning(sim)
-        self._default = default = compact(sim.default_data)
-        rows = zip(*map(jax.tree.leaves, (scopes(default), default, numbered(default))), strict=True)
-        world_id = numbered(default).core.world_id
-        self.default_varies = any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows)
-        """True if episodes begin from different data in different worlds."""
-
-    def _reset_all(self) -> Callable[[SimData, SimData], SimData]:
-        reset_all, worlds = self.sim.build_reset_fn().plain, np.ones(self.sim.n_worlds, bool)
-        return lambda data, default: reset_all(data, default, worlds)
-
-    def _reset_world(self, stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]:
-        """Return a function that resets one world and applies stages of the reset pipeline to it."""
-        axes = Axes(self.sim.data)
-
-        def reset_one(data: SimData, default: SimData) -> SimData:
-            data = reset_world(data, default)
-            for stage in stages:
-                data = of_world(stage, axes)(data)
-            return data
-
-        return reset_one
 
     @property
     def base(self) -> DroneEnv:
@@ -300,41 +344,6 @@ class DroneEnv(Env):
         """Environment steps in one episode."""
         return self._max_steps
 
-    def physics(self, data: SimData) -> SimData:
-        """Return the data of all worlds after the physics of an environment step."""
-        return self._step(data, self.n_substeps)
-
-    @property
-    def stages(self) -> list[Stage]:
-        """Stages of a physics step."""
-        return self._step.stages
-
-    @property
-    def strict(self) -> bool:
-        """True to raise an error where a step runs unfused for another reason than a documented limit."""
-        return self._step.strict
-
-    @property
-    def unfused(self) -> str | None:
-        """Reason why its steps cannot be one kernel, as far as it is known without tracing; None if there is none."""
-        if self._step.engine not in ("auto", "fused"):
-            return f"the engine is {self._step.engine!r}"
-        if (missing := fused.missing(self._step.platform)) is not None:
-            return missing
-        if self.sim.mesh is not None:
-            return "the worlds are sharded over several devices"
-        if self.task.batched:
-            return f"task {self.task.name!r} is declared to need all worlds at once"
-        if self._foreign:
-            return "a record in data.plugins is of another library, and is not divided among worlds"
-        if self.batched_reset:
-            others = [
-                name for name, fn in self.sim.reset_pipeline.items() if not (fn is reset or isinstance(fn, Stage))
-            ]
-            own = ", ".join(map(repr, others))
-            return f"{own} of the reset pipeline takes all worlds at once"
-        return "episodes begin from different data in different worlds" if self.default_varies else None
-
     def initial_data(self, key: Array) -> SimData:
         """Return the data of all worlds before their first episode. The key is that of ``reset``. ()
 
@@ -355,42 +364,14 @@ class DroneEnv(Env):
                 "expected the default data with which the environment was made, got others: an environment does not "
                 "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
             )
-        data, mesh = spread(self._default, self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
+        data, mesh = self.resets.spread(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=data.core.replace(rng_key=key))
         if mesh is not None:
             return shard(data, mesh)
         return data if is_traced([key]) else put(data, self.sim.device)
-
-    def default_of(self, data: SimData) -> SimData:
-        """Return the data of all worlds that an episode begins from; seed and numbers are those of the data given."""
-        n_worlds, n_drones = data.states.pos.shape[:2]
-        return with_own(spread(self._default, n_worlds, n_drones), data)
-
-    def default_of_world(self, data: SimData) -> SimData:
-        """Return the data of one world that an episode begins from, where worlds do not differ in that."""
-
-        def one(scope: str, x: Array) -> Array:
-            return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
-
-        return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
 
 
 def _beginning(sim: Sim) -> list[Any]:
     """Return the arrays that episodes begin from, besides those of the scene, which change when it is compiled."""
     data = sim.default_data
     return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))
-
-
-def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
-    """Return one state in the worlds of a mask, and another elsewhere; leaves that worlds share are the new ones.
-
-    Args:
-        mask: True where the new state is taken; None for all. (n_worlds,)
-        new: State of the worlds in the mask. Its reward and info may hold more than the old state's.
-        old: State of the others.
-    """
-    old = old.replace(reward=new.reward if old.reward is None else old.reward, info=new.info | old.info)
-    kinds = jax.tree.leaves(scopes(new))
-    pairs = zip(kinds, jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
-    leaves = [select_worlds(mask, x, y) if n_batch_axes(kind) else x for kind, x, y in pairs]
-    return jax.tree.structure(new).unflatten(leaves)

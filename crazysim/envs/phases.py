@@ -1,12 +1,14 @@
 """Phases of an environment step: act, (physics), observe, and begin, which starts an episode.
 
-Each is written for one world. ``Env`` runs them for all worlds with ``apply=all_worlds``; ``FusedEnvStep`` runs the
-same functions as stages of the engine. Tasks and hooks of wrappers are called here and nowhere else.
+Each is written for one world, and becomes a stage of the step: ``act`` before the physics, ``observe`` after it, and
+``begin`` where an episode is over. Resets by the user call ``begin`` for all worlds. Tasks and hooks of wrappers are
+called here and nowhere else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,13 +19,17 @@ from jax.tree_util import keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import Phase, Stage, over_worlds
+from crazysim.core.stages import nonfinite
 from crazysim.envs.actions import Actions
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
-from crazysim.envs.state import EnvState, Obs
+from crazysim.envs.reset_policy import ResetPolicy
+from crazysim.envs.resets import Resets
+from crazysim.envs.state import NAME, EnvState, Obs
 from crazysim.envs.task import Task, total
 from crazysim.errors import ConfigError
+from crazysim.pytree import n_batch_axes, scopes, select_worlds
 
 Apply = Callable[[Callable[..., Any], bool], Callable[..., Any]]
 """``apply(fn, batched)``: the function as a phase calls it; ``batched`` for functions that take all worlds anyway."""
@@ -54,13 +60,69 @@ class Phases:
     """Drones in a world."""
     last_step: int
     """Physics steps of an episode."""
-    reset_data: Callable[[SimData, SimData], SimData]
-    """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``batched_reset``."""
-    batched_reset: bool
-    """True if ``reset_data`` takes all worlds at once."""
+    resets: Resets
+    """Resets of data at the start of an episode."""
+    policy: ResetPolicy | None = None
+    """Rule by which new episodes begin within a step; None if none do."""
     measured: Callable[[SimData], SimData] | None = None
     """``measured(data)``: the data that the task observes, of one world, or of all if it is batched; None for the true
     ones."""
+
+    def stages(self, physics: Sequence[Stage], batched: str | None) -> list[Stage]:
+        """Return the stages of an environment step.
+
+        Args:
+            physics: Stages of a physics step.
+            batched: Reason why all phases need all worlds at once; None if each is of one world.
+        """
+
+        def stage(name: str, fn: Callable[..., SimData], phase: Phase, why: str | None, when: Any = None) -> Stage:
+            if why is None:
+                return Stage(functools.partial(fn, apply=one_world), "world", when, name=name, phase=phase)
+            return Stage(functools.partial(fn, apply=all_worlds), "batch", name=name, phase=phase, why=why)
+
+        def over(data: SimData) -> Array:
+            return data.plugins[NAME].over
+
+        # Flagged first, so that the task can read it, and a new episode clears it.
+        stages = [
+            stage("act", self._act, "before", batched),
+            *physics,
+            stage("flag nonfinite", _flag_nonfinite, "after", batched),
+            stage("observe", self._observe, "after", batched),
+        ]
+        if self.policy is not None:
+            stages.append(stage("begin", self._begin, "after", batched or self.resets.batched, over))
+        return stages
+
+    def _act(self, data: SimData, apply: Apply) -> SimData:
+        state = EnvState(data)
+        state, action = self.act(state, state.record.next_action, apply)
+        return _as_before(data, state.replace(next_action=action))
+
+    def _observe(self, data: SimData, apply: Apply) -> SimData:
+        before = EnvState(data)
+        return _as_before(data, self.after_physics(before, before.record.next_action, apply))
+
+    def _begin(self, data: SimData, apply: Apply) -> SimData:
+        ended, batched = EnvState(data), apply is all_worlds
+        default = self.resets.default_of(ended.data) if batched else self.resets.default_of_world(ended.data)
+        new = self.begin(ended, default, apply)
+        new = new if self.policy is None else self.policy.begin(ended, new)
+        return _as_before(data, select_states(data.plugins[NAME].over[:, 0], new, ended) if batched else new)
+
+    def outline(self, state: EnvState) -> EnvState:
+        """Return a state of all worlds with the structure, shapes and types that a step returns."""
+        state, action = self.act(state, state.record.next_action, all_worlds)
+        return self.after_physics(state, action, all_worlds)
+
+    def after_physics(self, state: EnvState, action: Array, apply: Apply) -> EnvState:
+        """Return the result of ``observe``, noting where a new episode begins."""
+        was_done = state.done
+        state = self.observe(state, action, apply)
+        if self.policy is None:
+            return state
+        return self.policy.end(state).replace(over=self.policy.is_over(was_done, state))
 
     def act(self, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
         """Return the state with the action's command staged, and the action as the wrappers pass it on.
@@ -116,7 +178,7 @@ class Phases:
             apply: Caller of functions of one world.
         """
         task, shape = self.task, (self.n_drones, self.actions.size)
-        before = apply(self.reset_data, self.batched_reset)(state.data, default)
+        before = apply(self.resets.data, self.resets.batched_pipeline)(state.data, default)
         key = apply(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
         data = apply(task.spawn, task.batched)(before, key)
         for wrapper in self.wrappers:
@@ -144,6 +206,37 @@ class Phases:
     def _observed(self, data: SimData) -> Obs:
         """Return the observations of the task, of measured states if it is to get these."""
         return self.task.observe(data if self.measured is None else self.measured(data))
+
+
+def _flag_nonfinite(data: SimData, apply: Apply) -> SimData:
+    """Return the data with worlds flagged that are not finite, which holds for one world and for all."""
+    del apply
+    return data.replace(core=data.core.replace(nonfinite=nonfinite(data)))
+
+
+def _as_before(data: SimData, state: EnvState) -> SimData:
+    """Return the data of a state with the types of the data before."""
+    if jax.tree.structure(state.whole) != jax.tree.structure(data):
+        return state.whole  # the engine refuses it, and says what has changed
+
+    def cast(new: Any, old: Array) -> Array:
+        return new if getattr(new, "dtype", None) == old.dtype else jnp.asarray(new, old.dtype)
+
+    return jax.tree.map(cast, state.whole, data)
+
+
+def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
+    """Return one state in the worlds of a mask, and another elsewhere; leaves that worlds share are the new ones.
+
+    Args:
+        mask: True where the new state is taken; None for all. (n_worlds,)
+        new: State of the worlds in the mask.
+        old: State of the others.
+    """
+    kinds = jax.tree.leaves(scopes(new))
+    pairs = zip(kinds, jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
+    leaves = [select_worlds(mask, x, y) if n_batch_axes(kind) else x for kind, x, y in pairs]
+    return jax.tree.structure(new).unflatten(leaves)
 
 
 def _step_info(task: Task, data: SimData) -> dict[str, Array]:

@@ -31,6 +31,8 @@ class ResetPolicy:
     """``is_over(was_done, ended)``: true where a new episode begins; ``was_done`` is ``done`` before the step. ()"""
     end: Callable[[EnvState], EnvState]
     """``end(state)``: the state after a step, whether a new episode begins or not."""
+    keeps_final_obs: bool
+    """True if ``end`` adds ``info["final_obs"]``."""
     begin: Callable[[EnvState, EnvState], EnvState]
     """``begin(ended, new)``: the state where a new episode begins, from those before and after its reset."""
 
@@ -45,7 +47,7 @@ def _with_results(ended: EnvState, new: EnvState) -> EnvState:
 
 POLICIES: dict[AutoresetMode, ResetPolicy | None] = {
     AutoresetMode.disabled: None,
-    AutoresetMode.next_step: ResetPolicy(lambda was_done, _: was_done, lambda state: state, lambda _, new: new),
-    AutoresetMode.same_step: ResetPolicy(lambda _, ended: ended.done, _with_final_obs, _with_results),
+    AutoresetMode.next_step: ResetPolicy(lambda was_done, _: was_done, lambda state: state, False, lambda _, new: new),
+    AutoresetMode.same_step: ResetPolicy(lambda _, ended: ended.done, _with_final_obs, True, _with_results),
 }
 """Reset policy of each mode; None for no automatic resets."""

@@ -1,4 +1,4 @@
-"""Many steps of an environment in one compiled call, which carries from step to step only what the next one reads."""
+"""Many steps of an environment in one compiled call."""
 
 from __future__ import annotations
 
@@ -10,69 +10,102 @@ from jax import Array
 
 from crazysim.core.settings import positive
 from crazysim.envs.env import Env
-from crazysim.envs.fused_step import FusedEnvStep
-from crazysim.envs.state import EnvState, bare
-from crazysim.envs.wrappers import AutoReset
+from crazysim.envs.state import EnvState, Obs, validate_action
+from crazysim.pytree import PyTree, select_worlds
 
-Act = Callable[[EnvState, Array], Array]
-"""State and random key to the actions of all drones. (n_worlds, n_drones, k)"""
-Keep = Callable[[EnvState], Any]
-"""State after a step to the part of it that is kept: any tree of arrays."""
+Policy = Callable[[Obs, Any, Array], tuple[Array, Any, Any]]
+"""``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once: observations, what the policy
+remembers and a random key, to the actions of all drones, (n_worlds, n_drones, k), what it remembers next, and any tree
+of arrays for ``Transition.extras``. Memory has worlds in front, (n_worlds, ...); ``()`` for none."""
+
+
+class Transition(PyTree):
+    """One step of all worlds; of the arrays of a transition only those that ``keep`` returns are computed."""
+
+    obs: Obs
+    """Observations that the policy got. (n_worlds, n_drones, k) each"""
+    action: Array
+    """Actions. (n_worlds, n_drones, k)"""
+    extras: Any
+    """Third result of the policy."""
+    state: EnvState
+    """State after the step, in which a new episode may have begun."""
+
+    @property
+    def reward(self) -> Array:
+        """Rewards. (n_worlds, n_drones)"""
+        return self.state.reward
+
+    @property
+    def terminated(self) -> Array:
+        """True where the episode ended by success or failure. (n_worlds,)"""
+        return self.state.terminated
+
+    @property
+    def truncated(self) -> Array:
+        """True where the episode reached its time limit. (n_worlds,)"""
+        return self.state.truncated
+
+    @property
+    def done(self) -> Array:
+        """True where the episode is over. (n_worlds,)"""
+        return self.state.done
+
+    @property
+    def final_obs(self) -> Obs:
+        """Observations at the end of the step, before a new episode begins. (n_worlds, n_drones, k) each"""
+        return self.state.final_obs
+
+
+Keep = Callable[[Transition], Any]
+"""Transition to the part of it that is kept: any tree of arrays."""
 
 
 def rollout(
     env: Env,
     state: EnvState,
-    act: Act,
+    policy: Policy,
     key: Array,
     n_steps: int,
-    keep: Keep = lambda state: (state.reward, state.done),
-) -> tuple[EnvState, Any]:
-    """Return the state some steps later, and what was kept on the way; pure, for jit and grad.
+    keep: Keep = lambda transition: (transition.reward, transition.done),
+    memory: Any = (),
+    fresh: Any = None,
+) -> tuple[EnvState, Any, Any]:
+    """Return the state some steps later, the policy's memory, and what was kept on the way; pure, for jit and grad.
 
     Args:
         env: The environment, usually inside ``AutoReset``.
         state: The state at the start.
-        act: ``act(state, key)``: actions of all drones, (n_worlds, n_drones, k). The state has data, observations and
-            memory, but no reward and info.
+        policy: The policy, for all worlds at once.
         key: Random key; each step receives one of its own.
         n_steps: Number of steps, a positive integer.
-        keep: ``keep(state)``: the part of the state after each step to return; rewards and ends by default.
+        keep: ``keep(transition)``: the part of each transition to return; rewards and ends by default.
+        memory: Memory of the policy before the first step; ``()`` for none. (n_worlds, ...) each
+        fresh: Memory with which a new episode begins; None for ``memory``.
 
     Returns:
-        The state, without reward and info, and what was kept, with time in front. (n_steps, ...)
+        The state, the memory, and what was kept, with time in front, (n_steps, ...).
 
     Raises:
         ConfigError: If the number of steps is not a positive integer.
+        ValueError: If the policy returns actions of another shape.
     """
-    n_steps = positive("n_steps", n_steps)
-    start = bare(state)
-    keys = jax.random.split(key, n_steps)
-    fused = env.fused_step(start, start.action, packed=True) if isinstance(env, AutoReset) else None
-    if fused is not None:
-        return _packed(fused, start, act, keys, keep)
+    n_steps, fresh = positive("n_steps", n_steps), memory if fresh is None else fresh
+    start = env.flatten(state)
+    carried = sorted({*start.plan.written, start.plan.synced})
 
-    def step(carry: EnvState, key: Array) -> tuple[EnvState, Any]:
-        after = env.step(carry, act(carry, key))
-        return bare(after), keep(after)
+    def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
+        before, memory = start.replaced(carried, carry[0]), carry[1]
+        seen = EnvState(before.data())
+        action, memory, extras = policy(seen.obs, memory, key)
+        after = env.advance(before, validate_action(action, seen, env.actions))
+        new = EnvState(after.data())
+        if env.policy is not None:
+            over = env.policy.is_over(seen.done, new)
+            memory = jax.tree.map(lambda first, x: select_worlds(over, first, x), fresh, memory)
+        kept = keep(Transition(seen.obs, action, extras, new))
+        return ([after.leaves[i] for i in carried], memory), kept
 
-    return jax.lax.scan(step, start, keys)
-
-
-def _packed(fused: FusedEnvStep, start: EnvState, act: Act, keys: Array, keep: Keep) -> tuple[EnvState, Any]:
-    """Return the same with states that stay packed between steps."""
-    first = fused.pack(start)
-
-    def step(carry: tuple[list[Array], dict[str, Any]], key: Array) -> tuple[Any, Any]:
-        packed, before = first._replace(rows=carry[0]), seen(carry)
-        packed, outputs = fused.step_packed(packed, (before.terminated, before.truncated), act(before, key))
-        after = fused.unpack(packed, start)
-        after = outputs.replace(data=after.data, action=after.action, memory=after.memory)
-        return (packed.rows, {name: getattr(after, name) for name in ("obs", "terminated", "truncated")}), keep(after)
-
-    def seen(carry: tuple[list[Array], dict[str, Any]]) -> EnvState:
-        return fused.unpack(first._replace(rows=carry[0]), start).replace(**carry[1])
-
-    outputs = {"obs": start.obs, "terminated": start.terminated, "truncated": start.truncated}
-    carry, kept = jax.lax.scan(step, (first.rows, outputs), keys)
-    return seen(carry), kept
+    carry = [start.leaves[i] for i in carried], memory
+    (leaves, memory), kept = jax.lax.scan(step, carry, jax.random.split(key, n_steps))
+    return EnvState(start.replaced(carried, leaves).data()), memory, kept

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -14,47 +15,178 @@ from crazysim.envs.actions import Actions
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 
+NAME = "environment"
+"""Key of the environment's record in the plugins of its data."""
+
 Obs = dict[str, Array]
 """Named observations. (n_worlds, n_drones, k) each, or (n_drones, k) in one world"""
+
+
+class EnvRecord(PyTree):
+    """Record that an environment adds to the data of its simulation; ``EnvState`` shows it to users."""
+
+    obs: Obs = leaf("drone", 1)
+    """Observations. (n_worlds, n_drones, k) each"""
+    reward: Array = leaf("drone")
+    """Reward of the last step. (n_worlds, n_drones)"""
+    terminated: Array = leaf("world")
+    """True where the episode ended by success or failure. (n_worlds, 1)"""
+    truncated: Array = leaf("world")
+    """True where the episode reached its time limit. (n_worlds, 1)"""
+    action: Array = leaf("drone", 1)
+    """Action of the last step. (n_worlds, n_drones, k)"""
+    drone_info: dict[str, Any] = leaf("drone", None)
+    """Entries of ``info`` with a row for each drone. (n_worlds, n_drones, ...) each"""
+    world_info: dict[str, Array] = leaf("world")
+    """Entries of ``info`` with a number for each world. (n_worlds, 1) each"""
+    memory: dict[str, Any] = leaf("world", None)
+    """Memory of the wrappers, by name of the wrapper. (n_worlds, 1, ...) each; records within declare their own axes"""
+    next_action: Array = leaf("drone", 1, scratch=True)
+    """Action that a step is given, and as the wrappers pass it on. (n_worlds, n_drones, k)"""
+    over: Array = leaf("world", scratch=True)
+    """True where a new episode begins within the step. (n_worlds, 1)"""
+
+
+OUTPUTS = ("obs", "reward", "terminated", "truncated", "drone_info", "world_info")
+"""Fields of the record that are results of a step."""
 
 
 class EnvState(PyTree):
     """An environment at one moment: argument and result of ``step``.
 
-    Functions of one world, those of tasks and wrappers, receive it without the axis of worlds.
+    A view of the simulation's data and of the environment's record among its plugins. Functions of one world, those of
+    tasks and wrappers, receive it without the axis of worlds. ``replace`` takes the names of the properties.
     """
 
-    data: SimData
-    """The simulation."""
-    obs: Obs = leaf("drone", 1)
-    """Observations passed to the policy. (n_worlds, n_drones, k) each"""
-    reward: Array = leaf("drone")
-    """Reward of the step that led here. (n_worlds, n_drones)"""
-    terminated: Array = leaf("batched")
-    """True where the episode ended by success or failure. (n_worlds,)"""
-    truncated: Array = leaf("batched")
-    """True where the episode reached its time limit. (n_worlds,)"""
-    action: Array = leaf("drone", 1)
-    """Action of the step that led here; zero at the start of an episode. (n_worlds, n_drones, k)"""
-    info: dict[str, Any] = leaf("batched")
-    """Further quantities by name. (n_worlds,) or (n_worlds, n_drones, ...) each"""
-    memory: dict[str, Any] = leaf("batched")
-    """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; those of records have their declared axes"""
+    whole: SimData
+    """Data of the simulation, with the environment's record in its plugins."""
+
+    @property
+    def record(self) -> EnvRecord:
+        """The environment's record."""
+        return self.whole.plugins[NAME]
+
+    @property
+    def data(self) -> SimData:
+        """The simulation, without the environment's record."""
+        return self.whole.replace(plugins={k: x for k, x in self.whole.plugins.items() if k != NAME})
+
+    @property
+    def obs(self) -> Obs:
+        """Observations passed to the policy. (n_worlds, n_drones, k) each"""
+        return self.record.obs
+
+    @property
+    def reward(self) -> Array:
+        """Reward of the step that led here. (n_worlds, n_drones)"""
+        return self.record.reward
+
+    @property
+    def terminated(self) -> Array:
+        """True where the episode ended by success or failure. (n_worlds,)"""
+        return self._without_axis(self.record.terminated)
+
+    @property
+    def truncated(self) -> Array:
+        """True where the episode reached its time limit. (n_worlds,)"""
+        return self._without_axis(self.record.truncated)
 
     @property
     def done(self) -> Array:
         """True where the episode is over. (n_worlds,)"""
         return self.terminated | self.truncated
 
+    @property
+    def action(self) -> Array:
+        """Action of the step that led here; zero at the start of an episode. (n_worlds, n_drones, k)"""
+        return self.record.action
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Further quantities by name. (n_worlds,) or (n_worlds, n_drones, ...) each"""
+        record = self.record
+        return {k: self._without_axis(x) for k, x in record.world_info.items()} | record.drone_info
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; those of records as they declare it"""
+        return _undeclared(self._without_axis, self.record.memory)
+
+    @property
+    def final_obs(self) -> Obs:
+        """Observations at the end of the step: ``obs``, or those before a new episode began within the step.
+
+        Returns:
+            (n_worlds, n_drones, k) each
+        """
+        return self.record.drone_info.get("final_obs", self.obs)
+
+    def replace(self, **changes: Any) -> EnvState:
+        """Return the state with other values of some properties.
+
+        Raises:
+            ConfigError: If an entry of ``info`` is neither a number of a world nor has a row for each drone.
+        """
+        whole = changes.pop("whole", self.whole)
+        record = whole.plugins[NAME]
+        if "data" in changes:
+            whole = changes.pop("data")
+        if "info" in changes:
+            changes |= self._divided(changes.pop("info"))
+        if "memory" in changes:
+            changes["memory"] = _undeclared(self._with_axis, changes["memory"])
+        for name in {"terminated", "truncated", "over"} & changes.keys():
+            changes[name] = self._with_axis(changes[name])
+        record = record.replace(**changes) if changes else record
+        return EnvState(whole.replace(plugins=whole.plugins | {NAME: record}))
+
+    def _divided(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        """Return entries of ``info`` as those of drones and those of worlds."""
+        n, n_drones = max(self.whole.core.steps.ndim - 1, 0), self.whole.core.n_drones
+        of_drones, of_worlds = {}, {}
+        for name, entry in info.items():
+            shapes = [jnp.shape(x) for x in jax.tree.leaves(entry)]
+            if all(shape[n : n + 1] == (n_drones,) for shape in shapes):
+                of_drones[name] = entry
+            elif all(len(shape) == n for shape in shapes):
+                of_worlds[name] = self._with_axis(entry)
+            else:
+                raise ConfigError(
+                    f"expected info[{name!r}] as one number of a world, (), or with a row for each of {n_drones} "
+                    f"drones in front, ({n_drones}, ...), got {', '.join(str(shape[n:]) for shape in shapes)}. "
+                    f"Return one row for every drone."
+                )
+        return {"drone_info": of_drones, "world_info": of_worlds}
+
+    def _without_axis(self, x: Any) -> Any:
+        """Return an array of worlds without the axis of length 1; in one world it has none."""
+        axis = self.whole.core.steps.ndim - 1
+        return x if axis < 0 else _reshaped(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
+
+    def _with_axis(self, x: Any) -> Any:
+        """Return an array of worlds with the axis of length 1; in one world it has none."""
+        axis = self.whole.core.steps.ndim - 1
+        return x if axis < 0 else _reshaped(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
+
+
+def _reshaped(x: Any, shape: tuple[int, ...]) -> Any:
+    return jax.ShapeDtypeStruct(shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.reshape(x, shape)
+
+
+def _undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
+    """Return the memory with a function applied to its arrays outside of records."""
+
+    def is_record(x: object) -> bool:
+        return isinstance(x, PyTree)
+
+    return jax.tree.map(lambda x: x if is_record(x) else fn(x), memory, is_leaf=is_record)
+
 
 def state_of_data(data: SimData) -> EnvState:
     """Return a state that has data only, from which an episode begins."""
-    return EnvState(data, {}, None, None, None, None, {}, {})  # type: ignore[arg-type]
-
-
-def bare(state: EnvState) -> EnvState:
-    """Return a state without reward and info, which no step reads."""
-    return state.replace(reward=None, info={})
+    nothing: Any = None
+    record = EnvRecord({}, nothing, nothing, nothing, nothing, {}, {}, {}, nothing, nothing)
+    return EnvState(data.replace(plugins=data.plugins | {NAME: record}))
 
 
 def flatten(obs: Obs) -> Array:

@@ -14,51 +14,48 @@ from numpy.typing import ArrayLike
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
 from crazysim.core.stage import with_leaves
-from crazysim.envs.fused_step import FusedEnvStep, PackedState
-from crazysim.envs.state import EnvState, bare
+from crazysim.engine.step import FlatData
+from crazysim.envs.env import Env
+from crazysim.envs.state import NAME, OUTPUTS, EnvState
 from crazysim.envs.task_check import require_finite_start
-from crazysim.envs.wrappers.autoreset import AutoReset
 from crazysim.errors import ConfigError
 
 Output = Callable[[EnvState], Any]
-"""State after a step, without data and memory, to the tree of arrays that a call returns."""
+"""State after a step to the tree of arrays that a call returns."""
 
 
 class EnvStepper:
-    """A state and its compiled step: packed in one kernel where that is possible, else leaf by leaf."""
+    """A state that advances, held flattened; its compiled step returns what a user reads after each call."""
 
-    def __init__(self, env: AutoReset, output: Output):
+    def __init__(self, env: Env, output: Output):
         """Take the environment, and the function that selects what a step returns."""
         self._env, self._output = env, output
-        self._structure: object = None
-        self._steps: _PackedSteps | _LeafSteps | None = None
+        self._flatten = jax.jit(env.flatten)
+        self._unflatten = jax.jit(lambda flat, terminated, truncated: EnvState(flat.data()).replace(
+            terminated=terminated, truncated=truncated
+        ))  # fmt: skip
+        self._flat: FlatData | None = None
+        self._ends: tuple[Array, Array]
+        self._carried: list[int] = []
+        self._fixed: list[int] = []
+        self.compiled: Any = None
+        """The compiled step; None before there is one."""
 
     @property
     def state(self) -> EnvState | None:
-        """The state without observations, reward and info; None before there is one."""
-        return None if self._steps is None else self._steps.state()
+        """The state, with observations, reward and info as they were assigned; None before there is one."""
+        return None if self._flat is None else self._unflatten(self._flat, *self._ends)
 
     @state.setter
     def state(self, state: EnvState) -> None:
-        with keep_programs():
-            self._hold(bare(state).replace(obs={}))
-
-    def _hold(self, state: EnvState) -> None:
-        leaves, treedef = jax.tree.flatten(state)
-        structure = (treedef, [(x.shape, x.dtype) for x in leaves])
-        if self._steps is None:
+        before = self._flat
+        if before is None:
             require_finite_start(self._env.task, state)
-        if self._steps is None or structure != self._structure:
-            fused = self._env.fused_step(state, state.action, packed=True)
-            packed = fused is not None
-            self._steps = _PackedSteps(fused, self._output) if packed else _LeafSteps(self._env, self._output)
-            self._structure = structure
-        self._steps.hold(state)
-
-    @property
-    def compiled(self) -> Any:
-        """The compiled step; None before there is one."""
-        return None if self._steps is None else self._steps.compiled
+        with keep_programs():
+            flat = self._flat = self._flatten(state)
+        self._ends = state.terminated, state.truncated
+        if before is None or before.plan is not flat.plan:
+            self._compile(flat)
 
     def __call__(self, actions: Array | np.ndarray) -> tuple[Any, Array, Array]:
         """Advance the state by one step, and return the output, ``terminated`` and ``truncated``. (n_worlds,) each
@@ -69,83 +66,30 @@ class EnvStepper:
         Raises:
             ConfigError: If there is no state.
         """
-        if self._steps is None:
+        flat = self._flat
+        if flat is None:
             raise ConfigError("expected a state before the first step, got none. Assign stepper.state.")
-        compiled = self._steps.compiled
-        with keep_programs(when=compiled is None or not jaxcompat.n_compilations(compiled)):
-            return self._steps.step(actions)
+        carry, fixed = ([flat.leaves[i] for i in some] for some in (self._carried, self._fixed))
+        with keep_programs(when=not jaxcompat.n_compilations(self.compiled)):
+            carry, output, self._ends = self.compiled(carry, fixed, self._ends, actions)
+        self._flat = flat.replaced(self._carried, carry)
+        return output, *self._ends
 
+    def _compile(self, flat: FlatData) -> None:
+        """Make the compiled step, which takes and returns what calls carry: results that none reads are left out."""
+        plan, env = flat.plan, self._env
+        record, n = plan.numbers.plugins[NAME], len(flat.leaves)
+        flags = [record.terminated, record.truncated]
+        results = set(jax.tree.leaves([getattr(record, name) for name in OUTPUTS])) - set(plan.inputs)
+        self._carried = carried = [i for i in plan.written if i not in results and i not in flags]
+        self._fixed = fixed = [i for i in plan.inputs if i not in (*carried, *flags, record.next_action)]
+        shape = flat.leaves[record.next_action].shape
 
-class _PackedSteps:
-    """Steps of one kernel on a packed state."""
+        def step(carry: list[Array], rest: list[Array], ends: tuple[Array, Array], actions: ArrayLike) -> Any:
+            leaves = with_leaves(with_leaves([None] * n, fixed, rest), carried, carry)
+            leaves = with_leaves(leaves, flags, [x[:, None] for x in ends])
+            after = env.advance(FlatData(leaves, plan), jnp.asarray(actions).reshape(shape))
+            state = EnvState(after.data())
+            return [after.leaves[i] for i in carried], self._output(state), (state.terminated, state.truncated)
 
-    def __init__(self, fused: FusedEnvStep, output: Output):
-        self._rows: list[Array]
-        self._rest: PackedState
-        self._start: EnvState
-        self._ends: tuple[Array, Array]
-
-        def step(rows: list[Array], rest: PackedState, ends: tuple[Array, Array], actions: ArrayLike) -> Any:
-            packed, state = fused.step_packed(rest._replace(rows=rows), ends, jnp.asarray(actions))
-            return packed.rows, output(state), (state.terminated, state.truncated)
-
-        self.compiled = jax.jit(step, donate_argnums=0)  # no caller has the rows
-        self._pack, self._unpack = jax.jit(fused.pack), jax.jit(fused.unpack)
-
-    def hold(self, state: EnvState) -> None:
-        packed = self._pack(state)
-        self._rows, self._rest = packed.rows, packed._replace(rows=[])
-        self._start, self._ends = state, (state.terminated, state.truncated)
-
-    def step(self, actions: ArrayLike) -> tuple[Any, Array, Array]:
-        self._rows, output, self._ends = self.compiled(self._rows, self._rest, self._ends, actions)
-        terminated, truncated = self._ends
-        return output, terminated, truncated
-
-    def state(self) -> EnvState:
-        terminated, truncated = self._ends
-        state = self._unpack(self._rest._replace(rows=self._rows), self._start)
-        return state.replace(terminated=terminated, truncated=truncated)
-
-
-class _LeafSteps:
-    """Steps of a function that returns the leaves it writes: a compiled call copies what it returns unchanged."""
-
-    def __init__(self, env: AutoReset, output: Output):
-        self._env, self._output = env, output
-        self._leaves: list[Array] = []
-        self.compiled: Any = None
-
-    def hold(self, state: EnvState) -> None:
-        self._leaves, self._treedef = jax.tree.flatten(state)
-
-    def step(self, actions: ArrayLike) -> tuple[Any, Array, Array]:
-        if self.compiled is None:
-            self.compiled = self._prepare(actions)
-        values = self.compiled(self._leaves, actions)
-        n = len(self._written)
-        self._leaves = with_leaves(self._leaves, self._written, values[:n])
-        state = self.state()
-        return self._output_tree.unflatten(values[n:]), state.terminated, state.truncated
-
-    def state(self) -> EnvState:
-        return self._treedef.unflatten(self._leaves)
-
-    def _prepare(self, actions: ArrayLike) -> Any:
-        """Return the function to compile, after finding out which leaves it writes."""
-        treedef = self._treedef
-
-        def flat(leaves: list[Array], actions: ArrayLike) -> list[Array]:
-            before = treedef.unflatten(leaves)
-            state = self._env.step(before, jnp.asarray(actions).reshape(before.action.shape))
-            after, same = jax.tree.flatten(bare(state).replace(obs={}))
-            if same != treedef:
-                raise ConfigError(f"expected a step to keep the structure of the state, {treedef}, got {same}")
-            values, self._output_tree = jax.tree.flatten(self._output(state))
-            return [*after, *values]
-
-        jaxpr = jax.make_jaxpr(flat)(self._leaves, actions).jaxpr
-        n = len(self._leaves)
-        self._written = [i for i in range(n) if jaxpr.outvars[i] is not jaxpr.invars[i]]
-        kept = [*self._written, *range(n, len(jaxpr.outvars))]
-        return jax.jit(lambda leaves, actions: [flat(leaves, actions)[i] for i in kept])
+        self.compiled = jax.jit(step, donate_argnums=0)  # no caller has what is carried

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.tree_util import keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.settings import check_settings
@@ -54,6 +55,43 @@ def require_finite_start(task: Task, state: EnvState) -> None:
                 f"task {task.name!r}: expected spawn to return finite states, got {field.name} with NaN or infinity in "
                 f"world {world}. Check the settings of the task and the numbers that spawn draws."
             )
+
+
+def check_record(state: EnvState, after: EnvState) -> None:
+    """Check that a step keeps observations, info and memory as they were at the start of an episode.
+
+    Args:
+        state: State at the start of an episode.
+        after: Shapes and types of the state after a step.
+
+    Raises:
+        ConfigError: If a name, a shape or a type differs, or memory has axes of which worlds cannot be divided.
+    """
+    kinds = jax.tree.leaves(scopes(state.record))
+    had, has = (dict(tree_leaves_with_path(x.record)) for x in (state, after))
+    for (path, x), kind in zip(had.items(), kinds, strict=True):
+        name = keystr(path).lstrip(".")
+        if kind in ("batched", "opaque"):
+            raise ConfigError(
+                f"expected {name} to be declared for drones, worlds or all of them, got a field that is {kind!r}. "
+                f'Declare it with leaf("drone"), leaf("world") or leaf("shared").'
+            )
+        if kind == "drone" and x.shape[1:2] != (state.whole.core.n_drones,):
+            raise ConfigError(
+                f"expected {name} of shape (n_drones, ...) in one world, with {state.whole.core.n_drones} drones, got "
+                f"{x.shape[1:]}. Return one row for every drone."
+            )
+        y = has.get(path)
+        if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):
+            raise ConfigError(
+                f"expected a step to return {name} as it is at the start of an episode, {_described(x)}, got "
+                f"{'none' if y is None else _described(y)}. Tasks and wrappers return the same names and shapes always."
+            )
+    if further := [keystr(path).lstrip(".") for path in has if path not in had]:
+        raise ConfigError(
+            f"expected a step to return what there is at the start of an episode, got {', '.join(further)} besides. "
+            f"Set it in after_reset, too."
+        )
 
 
 def check_task(task: Task, data: SimData, action_size: int) -> None:

@@ -124,10 +124,12 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             return None
         obs, reward, info = self._outputs
         n = (self.num_envs, self.sim.n_drones)
-        info = {k: v for k, v in info.items() if not k.endswith("final_obs")}
-        info = {k: v.reshape(*n, *v.shape[1:]) if self._single and k in self._of_drone else v for k, v in info.items()}
+        of_drones = self._of_drone if self._single else ()
+        entries = {k: v.reshape(*n, *v.shape[1:]) if k in of_drones else v for k, v in info.items() if k in state.info}
+        if "final_obs" in entries:
+            entries["final_obs"] = {k: v.reshape(*n, -1) for k, v in info["final_obs"].items()}
         obs = {k: v.reshape(*n, -1) for k, v in obs.items()}
-        return state.replace(obs=obs, reward=jnp.broadcast_to(reward[:, None], n), info=info)
+        return state.replace(obs=obs, reward=jnp.broadcast_to(reward[:, None], n), info=entries)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance all worlds.

@@ -12,7 +12,8 @@ import optax
 from jax import Array
 
 from crazysim.envs.env import Env
-from crazysim.envs.state import EnvState, flatten
+from crazysim.envs.rollout import Transition, rollout
+from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
@@ -88,17 +89,17 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     def loss(policy: Layers) -> tuple[Array, Any]:
         actor = Policy(learner.stats, policy)
 
-        def step(carry: tuple[EnvState, Array], _: None) -> tuple[tuple[EnvState, Array], Any]:
-            state, weight = carry
-            raw = flatten(state.obs)
-            state = env.step(state, actor(state.obs))
-            discounted = weight * jnp.mean(state.reward)
-            return (state, weight * config.discount), (discounted, raw, jnp.mean(state.reward), state.terminated.mean())
+        def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+            del key
+            return actor(obs), memory, ()
 
-        carry = (start, jnp.ones((), start.reward.dtype))
-        (state, _), (rewards, raw, reward, crashed) = jax.lax.scan(step, carry, length=config.n_steps)
-        metrics = {"reward": reward.mean(), "crashed": crashed.mean(), "error": jnp.nanmean(state.info["error"])}
-        return -rewards.mean(), (state, raw, metrics)
+        def keep(transition: Transition) -> Any:
+            return transition.reward.mean(), flatten(transition.obs), transition.terminated.mean()
+
+        state, _, (rewards, raw, crashed) = rollout(env, start, act, learner.key, config.n_steps, keep)
+        discounts = config.discount ** jnp.arange(config.n_steps, dtype=rewards.dtype)
+        metrics = {"reward": rewards.mean(), "crashed": crashed.mean(), "error": jnp.nanmean(state.info["error"])}
+        return -(discounts * rewards).mean(), (state, raw, metrics)
 
     (cost, (state, raw, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(learner.policy)
     norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.envs.env import Env
+from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
@@ -53,27 +54,35 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     """
     env = RewardTerms(env)
 
-    def step(carry: Any, _: None) -> Any:
-        state, over, lost, total, error, done = carry
-        state = env.step(state, policy(state.obs))
-        total = total + jnp.where(over[:, None], 0.0, state.reward)
-        terms = {k[len(TERM) :]: x for k, x in state.info.items() if k.startswith(TERM)}
-        terms = {k: jnp.where(over[:, None], 0.0, x).mean() for k, x in terms.items()}
-        error = jnp.where(over[:, None], error, state.info["error"])
-        succeeded = env.succeeded(state)
-        if succeeded is not None:
-            done = done | (succeeded & ~over[:, None])
-        lost = lost | (state.info["nonfinite"] & ~over)
-        over = over | state.terminated
-        return (state, over, lost, total, error, done), (error, over, terms)
+    def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+        del key
+        return policy(obs), memory, ()
 
-    state = env.reset(key)
-    done = jnp.zeros(state.reward.shape, bool)
-    no = jnp.zeros_like(state.terminated)
-    carry = (state, no, no, jnp.zeros_like(state.reward), state.info["error"], done)
-    (_, _, lost, total, _, done), (error, over, terms) = jax.lax.scan(step, carry, length=env.max_steps)
-    flight = {"error": error, "over": over, "nonfinite": lost, "reward": total, "terms": terms}
-    return flight if env.succeeded(state) is None else flight | {"succeeded": done}
+    def keep(transition: Transition) -> dict[str, Any]:
+        state = transition.state
+        kept = {
+            name: state.info[name] for name in state.info if name in ("error", "nonfinite") or name.startswith(TERM)
+        }
+        return kept | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
+
+    _, _, kept = rollout(env, env.reset(key), act, key, env.max_steps, keep)
+    over = jnp.cumsum(kept["terminated"], axis=0) > 0
+    before = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
+    flies = ~before[..., None]
+    last = jnp.minimum(jnp.arange(env.max_steps)[:, None], before.shape[0] - before.sum(axis=0) - 1)[..., None]
+    flight = {
+        "error": jnp.take_along_axis(kept["error"], last, axis=0),
+        "over": over,
+        "nonfinite": jnp.any(kept["nonfinite"] & ~before, axis=0),
+        "reward": jnp.where(flies, kept["reward"], 0.0).sum(axis=0),
+        "terms": {
+            name[len(TERM) :]: jnp.where(flies, x, 0.0).mean(axis=(1, 2))
+            for name, x in kept.items()
+            if name.startswith(TERM)
+        },
+    }
+    succeeded = kept["succeeded"]
+    return flight if succeeded is None else flight | {"succeeded": jnp.any(succeeded & flies, axis=0)}
 
 
 def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None) -> dict[str, float]:

@@ -13,7 +13,8 @@ import optax
 from jax import Array
 
 from crazysim.envs.env import Env
-from crazysim.envs.state import EnvState, bare, flatten
+from crazysim.envs.rollout import Transition, rollout
+from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
@@ -75,7 +76,7 @@ class Learner(PyTree):
     key: Array
     """Random key."""
     env: EnvState
-    """State of the environments, without reward and info."""
+    """State of the environments."""
     iteration: Array
     """Number of completed iterations. ()"""
 
@@ -122,7 +123,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
     optimizer = _optimizer(config).init((policy, log_std, value))
     stats = RunningStats.create(n_obs).update(flatten(state.obs))
-    return Learner(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, bare(state), jnp.int32(0))
+    return Learner(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, state, jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
@@ -150,22 +151,24 @@ def _collect(
 ) -> tuple[EnvState, Sample, Array, dict[str, Array]]:
     """Return the state after a rollout, its samples, its observations before normalisation, and metrics."""
 
-    def step(state: EnvState, key: Array) -> tuple[EnvState, tuple[Sample, Array, Any]]:
-        raw = flatten(state.obs)
-        obs = learner.stats.normalize(raw)
-        mean, value = jnp.tanh(mlp(learner.policy, obs)), _value(learner, obs)
+    def policy(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
+        raw = flatten(obs)
+        seen = learner.stats.normalize(raw)
+        mean, value = jnp.tanh(mlp(learner.policy, seen)), _value(learner, seen)
         action = mean + jnp.exp(learner.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
-        state = env.step(state, action)
-        truncated = (state.truncated & ~state.terminated)[:, None]
-        final_value = _value(learner, learner.stats.normalize(flatten(state.info["final_obs"])))
-        reward = state.reward + config.discount * jnp.where(truncated, final_value, 0.0)
-        over = jnp.broadcast_to(state.done[:, None], reward.shape)
-        sample = Sample(obs, action, _log_prob(mean, learner.log_std, action), value, reward, over)
-        return bare(state), (sample, raw, (state.reward.mean(), state.terminated, state.info["error"].mean()))
+        return action, memory, (raw, seen, value, _log_prob(mean, learner.log_std, action))
 
-    state, (samples, raw, (reward, crashed, error)) = jax.lax.scan(
-        step, learner.env, jax.random.split(key, config.n_steps)
-    )
+    def keep(transition: Transition) -> tuple[Sample, Array, Any]:
+        raw, seen, value, log_prob = transition.extras
+        truncated = (transition.truncated & ~transition.terminated)[:, None]
+        final_value = _value(learner, learner.stats.normalize(flatten(transition.final_obs)))
+        reward = transition.reward + config.discount * jnp.where(truncated, final_value, 0.0)
+        over = jnp.broadcast_to(transition.done[:, None], reward.shape)
+        sample = Sample(seen, transition.action, log_prob, value, reward, over)
+        error = transition.state.info["error"].mean()
+        return sample, raw, (transition.reward.mean(), transition.terminated, error)
+
+    state, _, (samples, raw, (reward, crashed, error)) = rollout(env, learner.env, policy, key, config.n_steps, keep)
     over = samples.over.any(axis=-1)
     metrics = {
         "reward": reward.mean(),

@@ -39,7 +39,7 @@ def run(program, numbers, n_steps):
     hoisted = {
         id(s): interpret.run(s.hoisted, [numbers[slot] for slot in s.hoisted_reads], shape) for s in program.segments
     }
-    for phase, times in (("first", 1), ("each", n_steps), ("last", 1)):
+    for phase, times in (("before", 1), ("each", n_steps), ("after", 1)):
         for _ in range(times):
             for s in program.of(phase):
                 out = interpret.run(s.block, [*(numbers[slot] for slot in s.reads), *hoisted[id(s)]], shape)
@@ -160,7 +160,7 @@ def test_stages_of_other_ticks_are_not_joined():
 
 
 def test_phases_and_scopes_are_not_joined():
-    stages = [segment("a", [X], [Y], op("exp"), phase="first"), segment("b", [Y], [Z], op("neg")),
+    stages = [segment("a", [X], [Y], op("exp"), phase="before"), segment("b", [Y], [Z], op("neg")),
               segment("c", [Z], [X], op("exp"), scope="world"), segment("d", [X], [Y], op("exp"))]  # fmt: skip
     assert len(schedule.fuse(Program(LEAVES, 1, tuple(stages))).segments) == 4
 
@@ -244,7 +244,7 @@ def test_verification_finds(what):
 
 
 def test_verification_finds_phases_out_of_order():
-    late, early = segment("a", [X], [Y], op("exp"), phase="last"), segment("b", [X], [Y], op("exp"))
+    late, early = segment("a", [X], [Y], op("exp"), phase="after"), segment("b", [X], [Y], op("exp"))
     with pytest.raises(VerificationError, match="order of their phases"):
         verify(Program(LEAVES, 1, (late, early)))
 

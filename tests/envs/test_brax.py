@@ -101,7 +101,7 @@ def test_episodes_end_and_begin_as_brax_wraps_them(flown):
 
 def test_the_step_is_that_of_the_environment(functional, env, reset, flown):
     state = reset(jax.random.key(0)).pipeline_state
-    state = jax.jit(functional.step)(state, np.full(state.action.shape, 0.1, np.float32))
+    state = jax.jit(env.env.step)(state, np.full(state.action.shape, 0.1, np.float32))
     np.testing.assert_allclose(flown.obs[0], flatten(state.obs).reshape(N_WORLDS, -1), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(flown.reward[0], state.reward.mean(axis=1), rtol=1e-5)
     np.testing.assert_allclose(flown.metrics["error"][0], state.info["error"].mean(axis=1), rtol=1e-5)

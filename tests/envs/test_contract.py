@@ -1,6 +1,9 @@
 """What every task promises, by the name it is registered under: a new one is tested as soon as it is there."""
 
 import functools
+import os
+import subprocess
+import sys
 from typing import NamedTuple
 
 import gymnasium
@@ -23,10 +26,9 @@ from gymnasium.vector.utils import batch_space
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import cuda
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
-from crazysim.envs.fused_step import FusedEnvStep
 from crazysim.envs.phases import all_worlds
 from crazysim.envs.spawn import flying
-from crazysim.envs.state import EnvState, bare
+from crazysim.envs.state import EnvState
 from crazysim.envs.tasks.hover import Hover
 from crazysim.pytree import map_batched
 
@@ -92,6 +94,11 @@ def flown(name):
     return flight(name)
 
 
+def close(a, b):
+    """Compare two trees of different programs, up to rounding."""
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), a, b)
+
+
 def first_worlds(state, n=N_WORLDS):
     """Return the state of the first worlds, on the host."""
     state = map_batched(lambda x: np.asarray(x)[:n], state)
@@ -135,7 +142,7 @@ def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(env, begu
     """Whichever device the environment was made for: JAX runs what is compiled where its arguments are."""
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
-    step = jax.jit(env.base.step).trace(begun, begun.action)
+    step = jax.jit(env.env.step).trace(begun, begun.action)
     kernels = {"cpu": "crazysim_advance", "cuda": cuda.TARGET}
     for platform in kernels:
         text = step.lower(lowering_platforms=(platform,)).as_text()
@@ -144,12 +151,26 @@ def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(env, begu
         }
 
 
-def test_a_step_is_one_kernel_where_x64_is_enabled(name, x64):
-    """Indices and counts stay int32: kernels have no int64."""
+PLANNED_IN_FLOAT64 = """
+import jax, numpy as np
+from crazysim.engine.backends import kernel
+from crazysim.engine.step import Step
+from crazysim.envs import TASKS, AutoReset, make
+for name in TASKS:
     env = AutoReset(make(name))
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.action.dtype == np.float64
-    assert env.fused_step(state, state.action) is not None
+    program = Step({stage.__name__: stage for stage in env.step_fn.stages}, "lanes").plan(state.whole, ()).program
+    kernel.write(program, "host")
+    assert program.fused, (name, program.unfused_stages)
+"""
+
+
+@pytest.mark.long("plans the step of every task, in a process of its own")
+def test_every_step_is_one_kernel_where_x64_is_enabled():
+    """Indices and counts stay int32: kernels have no int64."""
+    env = os.environ | {"JAX_ENABLE_X64": "1"}
+    subprocess.run([sys.executable, "-c", PLANNED_IN_FLOAT64], check=True, env=env)
 
 
 def test_repeated_steps_are_traced_once(env, begun):
@@ -235,22 +256,22 @@ def test_episodes_end_in_time_and_are_counted(env, flown):
         np.testing.assert_allclose(returns[ends, world], sums, rtol=1e-3, atol=1e-3)
 
 
-def test_one_program_is_the_whole_step(env, begun, flown):
-    """Actions, physics, task and new episodes as one kernel equal the unfused step, where random flight leads."""
-    vec, auto = flown.env, AutoReset(env, "SameStep")
+@pytest.mark.long("compiles the batched step of each task")
+def test_the_kernel_of_a_step_is_the_step_stage_by_stage(name, env, flown):
+    """Actions, physics, task and new episodes as one kernel equal the reference, where random flight leads."""
+    vec, plain = flown.env, AutoReset(EpisodeStatistics(make(name, N_WORLDS, engine="plain")), "SameStep")
+    assert "engine: fused\n" in vec.explain()
+    assert "splits the step" not in vec.explain()
     before = one_step_to_go(env, flown.end, np.resize(ENDS, N_FLYING))
-    packed = vec.env.fused_step(bare(before).replace(obs={}), before.action, packed=True)
-    assert isinstance(packed, FusedEnvStep), packed
     vec._stepper.state = before
     obs, reward, terminated, truncated, info = vec.step(flown.actions[0])
-    end = first_worlds(vec.state.replace(info={}))
-    found = {"data": end.data, "action": end.action}
-    info = {name: info[name] for name in begun.info} | {"final_obs": info["final_obs"]}
+    end = first_worlds(vec.state)
+    found = {"data": end.data, "action": end.action, "memory": end.memory}
+    info = {name: info[name] for name in before.info}
     outputs = {"obs": obs, "reward": reward, "terminated": terminated, "truncated": truncated, "info": info}
     found |= jax.tree.map(lambda x: np.asarray(x)[:N_WORLDS], outputs)
 
-    before = first_worlds(before.replace(info={}, memory={})).replace(info=begun.info)
-    after = auto.step(before, flown.actions[0][:N_WORLDS].reshape(begun.action.shape))
+    after = plain.step(first_worlds(before), flown.actions[0][:N_WORLDS].reshape(N_WORLDS, *before.action.shape[1:]))
     np.testing.assert_array_equal(after.done, ENDS | np.asarray(after.terminated))
     expected = {name: getattr(after, name) for name in found} | {"reward": np.asarray(after.reward).mean(axis=1)}
     assert jax.tree.structure(found) == jax.tree.structure(expected)
@@ -261,8 +282,15 @@ def test_one_program_is_the_whole_step(env, begun, flown):
             np.testing.assert_allclose(x, np.reshape(y, x.shape), rtol=1e-4, atol=1e-4, err_msg=where)
 
 
-def test_next_step_begins_with_the_step_after_the_last(env, begun):
-    auto = AutoReset(env, "NextStep")
+@pytest.fixture(scope="module", params=["hover", "swarm"])
+def two(request):
+    """Name of a task, of which one has several drones: the modes of automatic resets do not depend on the task."""
+    return request.param
+
+
+def test_next_step_begins_with_the_step_after_the_last(two):
+    env, auto = compiled(two, N_WORLDS), compiled(two, N_WORLDS, "NextStep")
+    begun = env.reset(jax.random.key(0))
     last = auto.step(one_step_to_go(env, begun, ENDS), random_action(begun))
     np.testing.assert_array_equal(last.done, ENDS)
     assert trees_equal(last, env.step(one_step_to_go(env, begun, ENDS), random_action(begun)))
@@ -273,30 +301,34 @@ def test_next_step_begins_with_the_step_after_the_last(env, begun):
     assert not after.reward[ENDS].any()
     assert not after.data.core.steps[ENDS].any()
     np.testing.assert_array_equal(after.data.core.episode[:, 0] - begun.data.core.episode[:, 0], ENDS)
-    assert trees_equal(obs_of(after, ENDS), obs_of(env.restart(begun, jnp.asarray(ENDS)), ENDS))
+    close(obs_of(after, ENDS), obs_of(env.restart(begun, jnp.asarray(ENDS)), ENDS))
     assert trees_equal(of_worlds(after, ~ENDS), of_worlds(env.step(last, ignored), ~ENDS))
 
 
-def test_same_step_begins_within_the_last_step(env, begun):
-    auto = AutoReset(env, "SameStep")
-    assert trees_equal(auto.reset(jax.random.key(0)).info["final_obs"], begun.obs)
-    before, action = one_step_to_go(env, begun, ENDS), random_action(begun)
-    ended, state = env.step(before, action), auto.step(before, action)
+def test_same_step_begins_within_the_last_step(two):
+    env, auto = compiled(two, N_WORLDS), compiled(two, N_WORLDS, "SameStep")
+    begun, also = env.reset(jax.random.key(0)), auto.reset(jax.random.key(0))
+    assert trees_equal(also.final_obs, begun.obs)
+    action = random_action(begun)
+    ended, state = (x.step(one_step_to_go(env, y, ENDS), action) for x, y in ((env, begun), (auto, also)))
     np.testing.assert_array_equal(ended.done, ENDS)
     for field in ("reward", "terminated", "truncated"):
         assert trees_equal(getattr(state, field), getattr(ended, field)), field
-    assert trees_equal(state.info["final_obs"], ended.obs)
+    assert trees_equal(state.final_obs, ended.obs)
+    assert trees_equal(ended.final_obs, ended.obs)
     assert trees_equal(state.info["error"], ended.info["error"])
     new = env.restart(begun, jnp.asarray(ENDS))
-    assert trees_equal(obs_of(state, ENDS), obs_of(new, ENDS))
+    close(obs_of(state, ENDS), obs_of(new, ENDS))
     assert not state.data.core.steps[ENDS].any()
     assert not state.action[ENDS].any()
     assert trees_equal(of_worlds(state, ~ENDS, but=("info",)), of_worlds(ended, ~ENDS, but=("info",)))
     assert not auto.step(state, action).done[ENDS].any()
 
 
-def test_disabled_begins_where_and_when_it_is_said(env, begun):
-    auto, action = AutoReset(env, "Disabled"), random_action(begun)
+def test_disabled_begins_where_and_when_it_is_said(two):
+    env = auto = compiled(two, N_WORLDS, "Disabled")
+    begun = env.reset(jax.random.key(0))
+    action = random_action(begun)
     ended = auto.step(one_step_to_go(env, begun, ENDS), action)
     np.testing.assert_array_equal(ended.done, ENDS)
     on = auto.step(ended, action)
@@ -320,15 +352,23 @@ def test_a_world_that_is_lost_ends_alone(env, begun):
     np.testing.assert_array_equal(lost.info["nonfinite"], is_lost)
     assert lost.terminated[1]
     assert trees_equal(of_worlds(lost, ~is_lost), of_worlds(fine, ~is_lost))
-    for mode in ("NextStep", "SameStep"):
-        state = AutoReset(env, mode).step(AutoReset(env, mode).reset(jax.random.key(0)), bad)
-        assert state.terminated[1]
-        seen = state.info["final_obs"] if mode == "SameStep" else state.obs
-        assert all(not x[1].any() for x in jax.tree.leaves(seen)), mode
-        assert not state.reward[1].any()
-        after = AutoReset(env, mode).step(state, action)
-        assert not after.info["nonfinite"].any()
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.obs, after.reward, after.info["error"])))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_world_that_is_lost_is_whole_again_in_its_next_episode(two, mode):
+    """Law 7, within the step."""
+    auto = compiled(two, N_WORLDS, mode)
+    begun = auto.reset(jax.random.key(0))
+    action = random_action(begun)
+    bad = np.array(action)
+    bad[1] = np.nan
+    state = auto.step(begun, bad)
+    assert state.terminated[1]
+    assert all(not x[1].any() for x in jax.tree.leaves(state.final_obs)), mode
+    assert not state.reward[1].any()
+    after = auto.step(state, action)
+    assert not after.info["nonfinite"].any()
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.obs, after.reward, after.info["error"])))
 
 
 @pytest.mark.long("compiles the gradient of each task")
@@ -343,13 +383,14 @@ def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
     @jax.grad
     def slope(wrt, state):
         action, states = wrt
-        state, action = env.env.phases.act(state.replace(data=state.data.replace(states=states)), action, all_worlds)
+        state, action = env.phases.act(state.replace(data=state.data.replace(states=states)), action, all_worlds)
         data = state.data
-        for stage in env.env.stages:
+        for stage in env.base.physics.stages:
             data = stage(data)
-        return env.env.phases.observe(state.replace(data=data), action, all_worlds).reward.sum()
+        return env.phases.observe(state.replace(data=data), action, all_worlds).reward.sum()
 
-    end = first_worlds(flown.end.replace(info={}, memory={})).replace(info=begun.info)
+    end = first_worlds(flown.end.replace(info=flown.end.info | {}, memory={}))
+    end = end.replace(info={name: end.info[name] for name in begun.info})
     for state in (begun, end):
         grads = slope((np.full(state.action.shape, 0.1, np.float32), state.data.states), state)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))

@@ -59,17 +59,17 @@ def apart(found, expected):
 @pytest.mark.long("compiles every path of two environments")
 @pytest.mark.parametrize("control", ["state", "rotor_vel"])
 def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_values(control):
-    """Environments as they are written and as one kernel, their rollouts, steps of simulations, traced and not."""
+    """Environments with automatic resets and without, their rollouts, steps of simulations, traced and not."""
     env = hovering(control)
     auto, sim, n = envs.AutoReset(env), env.sim, env.n_substeps
     key = jax.random.key(0)
-    start, before = env.reset(key), sim.data
+    start, begun, before = env.reset(key), auto.reset(key), sim.data
     plain = jax.jit(by_stages(sim), static_argnums=1)
     step = sim.step_fn
     paths = {
         "env.step": jax.jit(env.step),
         "AutoReset.step": jax.jit(auto.step),
-        "rollout": jax.jit(lambda s, a: envs.rollout(auto, s, lambda *_: a, key, 1)[0]),
+        "rollout": jax.jit(lambda s, a: envs.rollout(auto, s, lambda obs, memory, key: (a, memory, ()), key, 1)[0]),
     }
     rng = np.random.default_rng(0)
     for _ in range(N_DRAWS):
@@ -78,7 +78,8 @@ def test_a_random_search_over_shared_parameters_finds_no_path_that_keeps_old_val
         sent = stage_command(data, env.actions.command(action))
         expected = numbers(plain(sent, n))
         assert apart(numbers(plain(stage_command(start.data, env.actions.command(action)), n)), expected) > 1e-3
-        found = {name: fly(start.replace(data=data), action).data for name, fly in paths.items()}
+        starts = {name: start if name == "env.step" else begun for name in paths}
+        found = {name: fly(starts[name].replace(data=data), action).data for name, fly in paths.items()}
         found["step_fn"], found["traced"] = step(sent, jnp.int32(n)), jax.jit(step)(sent, jnp.int32(n))
         sim.data = sent
         sim.step(n)
@@ -132,7 +133,7 @@ def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
     action = 0.3 * jnp.ones_like(start.action).at[..., 0].set(0.2)
     of = {name: getattr(start.data.params, name) for name in ("gravity_vec", "J_inv")}
 
-    def slopes(step):
+    def slopes(step, start=start):
         def total(values):
             states = step(start.replace(data=with_params(start.data, **values))).data.states
             return jnp.sum(states.vel) + jnp.sum(states.ang_vel)
@@ -145,6 +146,6 @@ def test_gradients_of_an_environment_step_by_parameters_that_are_zero():
     expected = slopes(as_written)
     assert all(np.all(x != 0) for x in expected.values())
     for one in (env, auto):
-        found = slopes(lambda state, one=one: one.step(state, action))
+        found = slopes(lambda state, one=one: one.step(state, action), one.reset(jax.random.key(0)))
         for name, x in expected.items():
             np.testing.assert_allclose(found[name], x, rtol=2e-4, atol=1e-6 * np.abs(x).max(), err_msg=name)

@@ -65,7 +65,7 @@ def test_an_environment_that_never_resets_ends_where_its_count_wraps(engine):
     state = state.replace(data=counted(state.data, [MAX_STEPS - 5, MAX_STEPS - 10, 0]))
     after = jax.jit(env.step)(state, jnp.zeros_like(state.action))
     is_fused = engine == "auto" and fused.missing("cpu") is None
-    assert env.explain().startswith("a step is one kernel\n") == is_fused
+    assert env.explain().startswith("engine: fused\n") == is_fused
     np.testing.assert_array_equal(after.info["nonfinite"], [True, False, False])
     np.testing.assert_array_equal(after.terminated, [True, False, False])
 
@@ -106,6 +106,6 @@ def test_law_09_lengths_of_episodes_and_rollouts_are_positive_integers(sim):
     state = env.reset(jax.random.key(0))
     for n_steps in (0, -1, 2.0, True):
         with pytest.raises(ConfigError, match=f"n_steps is {n_steps}; it must be a positive whole number"):
-            rollout(env, state, lambda state, key: state.action, jax.random.key(0), n_steps)
+            rollout(env, state, lambda obs, memory, key: (state.action, memory, ()), jax.random.key(0), n_steps)
         with pytest.raises(ConfigError, match=f"max_episode_steps is {n_steps}; it must be a positive whole number"):
             make_vector("hover", max_episode_steps=n_steps)

@@ -25,10 +25,13 @@ CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """A ``Run`` whose number of steps is an array."""
 
 
-def differentiable(run: CountedRun, on_lanes: Run, kernels: DerivativeKernels) -> Run:
+def differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels | None = None) -> Run:
     """Return a function that runs a program, with its derivatives.
 
-    For a number of steps that is an array they are those of the same program on lanes.
+    Args:
+        run: The function.
+        other: The same function with derivatives: the program on lanes, taken for a number of steps that is an array.
+        kernels: Kernels of the derivatives; None to take those of ``other``.
     """
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -39,7 +42,7 @@ def differentiable(run: CountedRun, on_lanes: Run, kernels: DerivativeKernels) -
         def derivative(primals: Any, tangents: Any) -> Any:
             (values, count), (slopes, _) = primals, tangents
             changing = [i for i, t in enumerate(slopes) if not jaxcompat.is_symbolic_zero(t)]
-            if isinstance(n_steps, int) and changing:
+            if kernels is not None and isinstance(n_steps, int) and changing:
                 present = tuple([i for i, x in enumerate(values) if x is not None])
                 case = Case(kernels, n_steps, present, tuple(changing), len(values))
                 fixed = [values[i] for i in present]
@@ -51,11 +54,12 @@ def differentiable(run: CountedRun, on_lanes: Run, kernels: DerivativeKernels) -
                 rest = [found[i] if i in found else _float0(x) for i, x in zip(numbers, written, strict=True)]
                 return (written, flagged), (rest, _float0(flagged))
 
-            announce("compiling a derivative of the steps on lanes", "10 to 40 s")
+            if kernels is not None:
+                announce("compiling a derivative of the steps on lanes", "10 to 40 s")
             known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
 
             def of(some: list[Any]) -> Any:
-                return on_lanes(with_leaves(values, changing, some), known)
+                return other(with_leaves(values, changing, some), known)
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 

@@ -19,7 +19,7 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.core.sharding import Location
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import PHASES, Phase, with_leaves
 from crazysim.engine.backends import Run, cuda, kernel, lanes, native
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
 from crazysim.engine.backends.derivatives import CountedRun, differentiable
@@ -27,6 +27,7 @@ from crazysim.engine.backends.native import Launch
 from crazysim.engine.backends.platforms import TARGETS, compiled, described
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
+from crazysim.engine.passes.layout import rows_of
 from crazysim.errors import ConfigError
 
 
@@ -121,8 +122,14 @@ class FusedRun:
         return self._run(leaves, n_steps)
 
 
-def build(program: Program, location: Location) -> FusedRun:
+def build(program: Program, location: Location, in_leaves: Program | None = None) -> FusedRun:
     """Compile a program to kernels, and return the function that runs them.
+
+    Args:
+        program: The program.
+        location: Devices to compile it for.
+        in_leaves: The same program before ``as_rows``, whose derivatives it gets, since rows have no derivative in a
+            kernel; None for a program without rows.
 
     Raises:
         UnsupportedError: If an operation or type has no source.
@@ -130,6 +137,8 @@ def build(program: Program, location: Location) -> FusedRun:
     """
     kernels = Kernels(program, location) if program.fused else None
     run = _split(program, location) if kernels is None else _one_kernel(kernels)
+    if in_leaves is not None:
+        return FusedRun(differentiable(_over_batches(program, run), _on_leaves(program, in_leaves, location)), kernels)
     on_lanes = lanes.build(program, location)
     derivatives = DERIVATIVES[program] = DerivativeKernels(program, location, on_lanes)
     return FusedRun(differentiable(_over_batches(program, run), on_lanes, derivatives), kernels)
@@ -188,6 +197,24 @@ def _over_batches(program: Program, run: CountedRun) -> CountedRun:
     return jaxcompat.batched_rule(run, batched)
 
 
+def _on_leaves(program: Program, in_leaves: Program, location: Location) -> Run:
+    """Return the run of a program with rows by the same program without, which is compiled when it is called."""
+    built: list[Run] = []
+
+    def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        built[:] = built or [build(in_leaves, location)]
+        every, given = rows_of(program), list(leaves)
+        for rows in every:
+            for i in rows.members:
+                given[i] = rows.unpack(leaves[rows.leaf], i)
+        out, flagged = built[0](given[: len(in_leaves.leaves)], n_steps)
+        after = with_leaves(given, in_leaves.written, out)
+        after = with_leaves(after, [rows.leaf for rows in every], [rows.pack(after) for rows in every])
+        return [after[i] for i in program.written], flagged
+
+    return run
+
+
 def _one_kernel(kernels: Kernels) -> CountedRun:
     return partial(_call, kernels)
 
@@ -198,25 +225,38 @@ def _parts(program: Program) -> list[Program]:
 
 
 def _split(program: Program, location: Location) -> CountedRun:
-    """Return the same for a step that unfused stages split: a kernel for the stages between them."""
+    """Return the same for a step that unfused stages split: a kernel for the stages between them, phase by phase."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
         runs = list(pool.map(lambda part: _one_kernel(Kernels(part, location)) if part.fused else None, parts))
-    written = program.written
+    by_phase: dict[Phase, list[Any]] = {
+        phase: [(part, run) for part, run in zip(parts, runs, strict=True) if part.segments[0].phase == phase]
+        for phase in PHASES
+    }
+    in_loop = sorted({i for part, _ in by_phase["each"] for i in part.written})
 
-    def turn(leaves: list[Any]) -> list[Any]:
-        for part, run in zip(parts, runs, strict=True):
-            out, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, jnp.asarray(1, jnp.int32))
+    def after(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
+        for part, run in by_phase[phase]:
+            out, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, count)
             leaves = with_leaves(leaves, part.written, out)
         return leaves
 
     def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-        def body(_: Any, values: list[Any]) -> list[Any]:
-            after = turn(with_leaves(leaves, written, values))
-            return [after[i] for i in written]
+        once = jnp.asarray(1, jnp.int32)
+        leaves = after("before", leaves, once)
+        if [part.fused for part, _ in by_phase["each"]] == [True]:
+            leaves = after("each", leaves, count)
+        elif by_phase["each"]:
 
-        out = jax.lax.fori_loop(0, count, body, [leaves[i] for i in written])
-        return out, lanes.nonfinite(program, lanes.LeafValues(program, with_leaves(leaves, written, out)))
+            def body(_: Any, values: list[Any]) -> list[Any]:
+                stepped = after("each", with_leaves(start, in_loop, values), once)
+                return [stepped[i] for i in in_loop]
+
+            start = leaves
+            leaves = with_leaves(start, in_loop, jax.lax.fori_loop(0, count, body, [start[i] for i in in_loop]))
+        flagged = lanes.nonfinite(program, lanes.LeafValues(program, leaves))
+        leaves = after("after", leaves, once)
+        return [leaves[i] for i in program.written], flagged
 
     return run
 

@@ -278,5 +278,5 @@ def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.n
     for _ in range(n_steps):
         lanes.run(program, now, "each", constants)
     flagged = lanes.nonfinite(program, now)
-    lanes.run(program, now, "last", {})
+    lanes.run(program, now, "after", {})
     return [np.ascontiguousarray(now.array(i)) for i in program.written], flagged

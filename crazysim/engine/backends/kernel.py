@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from crazysim.core.stage import Phase
 from crazysim.engine.backends.exchange import exchange_for
 from crazysim.engine.backends.frame import Kernel, framed
 from crazysim.engine.backends.source import TYPES, Writer, require, type_name
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
-from crazysim.engine.ir.program import TABLE, Phase, Program, Segment, Slot
+from crazysim.engine.ir.program import TABLE, Program, Segment, Slot
 
 REGISTERS = 255
 """Registers of a thread of a GPU."""
@@ -100,7 +101,7 @@ class Body:
                 names[slot] = access
             else:
                 names[slot] = exchange.keep(writer, names[slot], kind, access, self._depth)
-        self._write_phase("first")
+        self._write_phase("before")
         hoisted = [self._hoisted(segment) for segment in self.each]
         exchange.end(writer, 1)
         return hoisted
@@ -121,7 +122,7 @@ class Body:
         if check is not None:
             (flagged,) = writer.block(check.block, [self.names[slot] for slot in check.reads], self._depth)
             write_results(writer, "flagged", "b1", 1, [flagged], self._depth)
-        self._write_phase("last")
+        self._write_phase("after")
         for leaf in program.written:
             kind, pointer = _type(program, leaf), f"q{program.ranks[leaf]}"
             values = [self.names[leaf, k] for k in range(program.leaves[leaf].size)]
@@ -220,13 +221,13 @@ def _loaded(program: Program) -> set[Slot]:
             drones[slot] = drones.get(slot, 0) + (1 if of_world else program.n_drones)
         known.update(slot for slot, n in drones.items() if n >= program.n_drones)
 
-    for segment in program.of("first"):
+    for segment in program.of("before"):
         run(segment)
     for segment in program.of("each"):  # there may be no step
         use([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
     if program.check is not None:
         use(program.check.reads)
-    for segment in program.of("last"):
+    for segment in program.of("after"):
         run(segment)
     use(_stored(program))
     return loaded

@@ -19,9 +19,10 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.core.sharding import Location
+from crazysim.core.stage import Phase
 from crazysim.engine.backends import Run, xla
 from crazysim.engine.ir.blocks import Block
-from crazysim.engine.ir.program import TABLE, Phase, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.ir.program import TABLE, Program, Segment, Slot, UnfusedStage
 from crazysim.engine.passes.schedule import separate
 from crazysim.jaxcompat import is_key
 
@@ -136,7 +137,7 @@ Constants = dict[int, Sequence[Any]]
 
 def prepare(program: Program, values: LeafValues) -> Constants:
     """Run what comes before the first step, and compute what no step changes."""
-    run(program, values, "first", {})
+    run(program, values, "before", {})
     return {
         k: values.execute(s.hoisted, [values.get(slot) for slot in s.hoisted_reads], values.shape)
         for k, s in enumerate(program.of("each"))
@@ -244,7 +245,7 @@ def steps(
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
     end = after(carry)
     flagged = nonfinite(program, end)
-    run(program, end, "last", {})
+    run(program, end, "after", {})
     return [end.array(i) for i in program.written], flagged
 
 

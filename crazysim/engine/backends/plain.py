@@ -14,9 +14,10 @@ from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import Axes, Stage, with_leaves
+from crazysim.core.stage import PHASES, Axes, Phase, Stage, with_leaves
 from crazysim.core.stages import nonfinite
 from crazysim.engine.backends import Run
+from crazysim.pytree import declared
 
 
 def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
@@ -33,8 +34,8 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
     """
     axes = Axes(data)
 
-    def single(leaves: list[Any]) -> list[Any]:
-        for stage in stages:
+    def single(leaves: list[Any], phase: Phase) -> list[Any]:
+        for stage in [stage for stage in stages if stage.phase == phase]:
             with jax.named_scope(stage.__name__):
                 after = stage(axes.treedef.unflatten(leaves))
                 written = axes.written(leaves, after, stage)
@@ -43,25 +44,37 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
                 leaves = with_leaves(leaves, written, jax.lax.optimization_barrier([new[i] for i in written]))
         return leaves
 
-    jaxpr = jax.make_jaxpr(single)(jax.tree.leaves(data))
-    step = jaxcompat.jaxpr_as_fun(jaxpr)  # the stages are traced once
-    pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
-    written = [i for i, (before, after) in enumerate(pairs) if before is not after]
+    jaxprs = {phase: jax.make_jaxpr(single, static_argnums=1)(jax.tree.leaves(data), phase) for phase in PHASES}
+    run = {phase: jaxcompat.jaxpr_as_fun(jaxpr) for phase, jaxpr in jaxprs.items()}  # the stages are traced once
+    written = {phase: _changed(jaxpr) for phase, jaxpr in jaxprs.items()}
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
+        leaves = run["before"](*leaves)
+        in_loop = written["each"]
+
         def turn(values: list[Any]) -> list[Any]:
-            after = step(*with_leaves(leaves, written, values))
-            return [after[i] for i in written]
+            after = run["each"](*with_leaves(leaves, in_loop, values))
+            return [after[i] for i in in_loop]
 
-        start = [leaves[i] for i in written]
-        if isinstance(n_steps, int):
-            out, _ = jax.lax.scan(lambda x, _: (turn(x), None), start, length=n_steps)
-        else:
-            out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), start)
-        data = axes.treedef.unflatten(with_leaves(leaves, written, out))
-        return out, nonfinite(data)
+        out = [leaves[i] for i in in_loop]
+        if in_loop and isinstance(n_steps, int):
+            out, _ = jax.lax.scan(lambda x, _: (turn(x), None), out, length=n_steps)
+        elif in_loop:
+            out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), out)
+        leaves = with_leaves(leaves, in_loop, out)
+        flagged = nonfinite(axes.treedef.unflatten(leaves))
+        leaves = run["after"](*leaves)
+        return [leaves[i] for i in every], flagged
 
-    return steps, written
+    scratch = {i for i, x in enumerate(jax.tree.leaves(declared(data, "scratch"))) if x}
+    every = sorted({i for some in written.values() for i in some} - scratch)
+    return steps, every
+
+
+def _changed(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
+    """Return the numbers of the leaves that a function of leaves does not return as they are."""
+    pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
+    return [i for i, (before, after) in enumerate(pairs) if before is not after]
 
 
 class Reset:

@@ -239,7 +239,7 @@ def write(reverse: Reverse, target: str) -> Kernel:
             if slot in slots:
                 writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
 
-    last, each, first = program.of("last"), program.of("each"), program.of("first")
+    last, each, first = program.of("after"), program.of("each"), program.of("before")
     writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
     writer.line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
     writer.line("const bool back = turn >= n_intervals - 1;", 2)

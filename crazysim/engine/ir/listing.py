@@ -66,7 +66,7 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
 
 
 def _of_segment(program: Program, segment: Segment, names: _Names) -> Iterator[str]:
-    when = {"first": "before the first step", "each": "at each step", "last": "after the last step"}[segment.phase]
+    when = {"before": "before the first step", "each": "at each step", "after": "after the last step"}[segment.phase]
     yield f"segment of one {segment.scope}, {when}: {', '.join(segment.stages)}"
     if segment.hoisted.outputs:
         yield f"{INDENT}hoisted, once before the first step:"

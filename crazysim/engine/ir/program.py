@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from crazysim.core.stage import Phase
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
 from crazysim.jaxcompat import is_key
@@ -21,16 +22,11 @@ from crazysim.jaxcompat import is_key
 Slot = tuple[int, int]
 """Place of a number: which leaf, and which element of the part of it that belongs to one drone (or one world)."""
 
-Phase = Literal["first", "each", "last"]
-"""When a segment runs: once before the first step, at each step, once after the last."""
-
 TABLE = -1
 """Element of a slot that means the whole leaf, a table: only shared leaves are tables."""
 
 PACKED = "packed"
 """Name of the leaf of shared numbers."""
-
-PHASES: tuple[Phase, ...] = ("first", "each", "last")
 
 Zeros = tuple[tuple[int, frozenset[int]], ...]
 """Leaves with the elements of them that are known to be zero."""
@@ -230,6 +226,7 @@ class Program:
         return changing
 
     def parts(self) -> Iterator[Program]:
-        """Iterate over programs that run one after the other: what one kernel can run, and each unfused stage."""
-        for _, segments in itertools.groupby(self.segments, lambda s: id(s) if isinstance(s, UnfusedStage) else 0):
-            yield dataclasses.replace(self, segments=tuple(segments), check=None)
+        """Iterate over programs of one phase each: what one kernel can run, and each unfused stage, in order."""
+        kinds = itertools.groupby(self.segments, lambda s: (s.phase, id(s) if isinstance(s, UnfusedStage) else 0))
+        for _, segments in kinds:
+            yield dataclasses.replace(self, segments=tuple(segments), check=None, scratch=frozenset())

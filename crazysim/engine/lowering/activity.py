@@ -49,7 +49,7 @@ def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict
         reads = program.per_drone(s, s.reads)
         found.update(places[k] for k in of(s.block, reads, constants.get(s, ())))
 
-    for s in program.of("first"):
+    for s in program.of("before"):
         run(s)
     for s in program.of("each"):
         constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
@@ -59,7 +59,7 @@ def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict
             run(s)
         if len(found) == before:
             break
-    for s in program.of("last"):
+    for s in program.of("after"):
         run(s)
     return found, constants
 

@@ -52,7 +52,7 @@ class RelativeStage(Stage):
             scope = next(iter(scopes))
             if scope == "world":
                 fn, when = of_world(stage, axes.declared), None
-        super().__init__(fn, scope, when, name=stage.__name__, why=stage.why)
+        super().__init__(fn, scope, when, name=stage.__name__, why=stage.why, phase=stage.phase)
 
     def __call__(self, data: Any) -> Any:
         """Return the viewed data of all worlds after the stage."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -11,14 +11,15 @@ import numpy as np
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.others import reduce_over_others_p
-from crazysim.core.stage import Axes, Stage, at_the_start
+from crazysim.core.stage import PHASES, Axes, Phase, Stage, at_the_start
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
-from crazysim.engine.ir.program import TABLE, Leaf, Phase, Program, Segment, Slot, UnfusedStage, Zeros
+from crazysim.engine.ir.program import TABLE, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
 from crazysim.engine.lowering.jaxprs import Elements, Entry, Lowering, as_elements, inputs, scalars
 from crazysim.engine.lowering.relative import RelativeAxes, viewed
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
 from crazysim.jaxcompat import equations, is_key
+from crazysim.pytree import declared
 
 MAX_UNROLLED_DRONES = 8
 """Most drones of a world for which a stage of one world is lowered; its block grows with their square."""
@@ -29,9 +30,6 @@ def lower_stages(
     data: Any,
     zeros: Zeros = (),
     watched: Callable[[Any], list[Any]] | None = None,
-    first: Sequence[Stage] = (),
-    last: Sequence[Stage] = (),
-    scratch: Collection[int] = (),
     population: str = "drone",
     tracer: Tracer | None = None,
 ) -> Program:
@@ -40,15 +38,12 @@ def lower_stages(
     A stage that cannot be lowered becomes an ``UnfusedStage``, which says why.
 
     Args:
-        stages: Stages of a step, in order.
+        stages: Stages of a step, in order within their phases.
         data: Data of the simulation, or its shapes and types.
         zeros: Leaves with the elements that are known to be zero: their terms are left out, unless a stage writes the
             leaf.
         watched: Picks the leaves that are checked for NaN and infinity after the last step; called with a tree of the
-            structure of the data.
-        first: Stages that run once, before the first step.
-        last: Stages that run once, after the last step.
-        scratch: Leaves that only carry numbers from one stage to another; what is written there is not kept.
+            structure of the data. None for no check; there is none either where a stage writes the flag itself.
         population: Population whose members are computed side by side; below they are called drones.
         tracer: Cache of traced stages; None for a new one.
     """
@@ -58,24 +53,25 @@ def lower_stages(
     known = dict(zeros)
     n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
-    phases: dict[Phase, Sequence[Stage]] = {"first": first, "each": stages, "last": last}
-    for phase, some in phases.items():
+    for phase in PHASES:
+        some = [stage for stage in stages if stage.phase == phase]
         own = [_lower_stage(axes.stage(stage), phase, axes, leaves, known, n_drones, tracer) for stage in some]
         segments += _before_the_steps(own, some, axes.numbers.core.steps) if phase == "each" else own
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
     ])  # fmt: skip
-    program = Program(described, n_drones, tuple(segments), None, frozenset(scratch), (), population, axes.views)
+    scratch = frozenset(i for i, x in enumerate(jax.tree.leaves(declared(data, "scratch"))) if x)
+    program = Program(described, n_drones, tuple(segments), None, scratch, (), population, axes.views)
     changed = known.keys() & set(program.written)
     if changed:  # an element is only known to be zero while no stage writes it
         zeros = tuple([(i, some) for i, some in zeros if i not in changed])
-        return lower_stages(stages, data, zeros, watched, first, last, scratch, population, tracer)
-    if watched is None:
+        return lower_stages(stages, data, zeros, watched, population, tracer)
+    core = axes.numbers.core
+    if watched is None or core.nonfinite in program.written:
         return program
     own = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
     checked = sorted((own | axes.views & set(program.written)) & set(watched(axes.numbers)))
-    core = axes.numbers.core
     return dataclasses.replace(program, check=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
 
 
@@ -91,7 +87,7 @@ def _before_the_steps(
         return list(segments)
     begins = [stage.when is at_the_start and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)]
     n = (*begins, False).index(False)
-    first = [dataclasses.replace(s, phase="first") for s in segments[:n] if isinstance(s, Segment)]
+    first = [dataclasses.replace(s, phase="before") for s in segments[:n] if isinstance(s, Segment)]
     return [*first, *segments[n:]]
 
 
@@ -218,4 +214,4 @@ def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watc
     too_long = builder.add("lt", (builder.input(avals[steps].dtype), constant(0, avals[steps].dtype)), bool)
     bad = builder.add("or", (too_long, builder.add("not", (finite,), bool)), bool)
     flagged = builder.add("or", (builder.input(bool), bad), bool)
-    return Segment("drone", ("finite_check",), "last", builder.finish([flagged]), tuple(reads), ())
+    return Segment("drone", ("finite_check",), "after", builder.finish([flagged]), tuple(reads), ())

@@ -48,7 +48,7 @@ def with_tangents(program: Program, perturbed: Collection[int]) -> Program:
     zero = dict.fromkeys((i, k) for s in segments for i in s.written if i >= n and i - n not in perturbed
                          for k in range(program.leaves[i - n].size))  # fmt: skip
     zeros = [constant(0, program.leaves[i - n].number) for i, _ in zero]
-    start = Segment("drone", ("tangents",), "first", Block((), (), tuple(zeros)), (), tuple(zero))
+    start = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero))
     return dataclasses.replace(
         program,
         leaves=(*program.leaves, *map(_tangent_of, program.leaves)),

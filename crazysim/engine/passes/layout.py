@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
 
 from crazysim.engine.ir.program import PACKED, Leaf, Program, Segment, Slot
 from crazysim.jaxcompat import is_key
@@ -63,6 +67,42 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
         return new, drone * n_rows + first + k
 
     return dataclasses.replace(_moved(program, move), leaves=tuple(leaves))
+
+
+class Rows(NamedTuple):
+    """A leaf of rows, and the leaves whose numbers are its rows; arrays are those of a program, with its views."""
+
+    program: Program
+    """The program, after ``as_rows``."""
+    leaf: int
+    """Number of the leaf of rows."""
+
+    @property
+    def members(self) -> tuple[int, ...]:
+        """Leaves whose numbers are the rows, from the first row on."""
+        return self.program.leaves[self.leaf].rows_of
+
+    def pack(self, leaves: Sequence[Any]) -> Array:
+        """Return the rows. (n_rows, n_lanes)"""
+        n_drones = self.program.n_drones
+
+        def of_leaf(x: Any) -> Array:
+            x = jnp.broadcast_to(x, (x.shape[0], n_drones, *x.shape[2:]))
+            return x.reshape(x.shape[0] * n_drones, -1).T
+
+        return jnp.concatenate([of_leaf(leaves[i]) for i in self.members])
+
+    def unpack(self, rows: Array, leaf: int) -> Array:
+        """Return one of the members."""
+        sizes = {i: self.program.leaves[i].size for i in self.members}
+        first, like = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
+        x = rows[first : first + like.size].T.reshape(-1, self.program.n_drones, *like.shape[2:])
+        return x[:, :1] if like.scope == "world" else x
+
+
+def rows_of(program: Program) -> list[Rows]:
+    """Return the leaves of rows of a program."""
+    return [Rows(program, i) for i, leaf in enumerate(program.leaves) if leaf.rows_of]
 
 
 def _moved(program: Program, move: Callable[[Slot], Slot]) -> Program:

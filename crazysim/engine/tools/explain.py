@@ -9,11 +9,11 @@ import jax.numpy as jnp
 
 from crazysim.core.data import SimData
 from crazysim.engine.backends import fused
-from crazysim.engine.ir.program import UnfusedStage
+from crazysim.engine.ir.program import UnfusedStage, Zeros
 from crazysim.engine.step import Step
 
 
-def explain(step: Step, data: SimData, measure: bool = False) -> str:
+def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | None = None) -> str:
     """Return in a few lines which engine runs the step, which stages it fuses, and which it does not and why.
 
     Args:
@@ -21,8 +21,9 @@ def explain(step: Step, data: SimData, measure: bool = False) -> str:
         data: Data to step.
         measure: True to measure the cost of stages that are not fused, which compiles the step once more without them
             and takes 256 steps.
+        zeros: As for ``Step``; with it, shapes and types of the data are enough.
     """
-    plan = step.plan(data)
+    plan = step.plan(data, zeros)
     lines = [f"engine: {plan.engine}" + (f" ({plan.why})" if plan.why else "")]
     if plan.program is None:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])

@@ -32,11 +32,11 @@ class Wrapper(Hooks, Env):
         """Refuse wrappers that step the environment themselves, which is compiled as a whole.
 
         Raises:
-            ConfigError: If the class overrides reset, restart or step without being an automatic reset.
+            ConfigError: If the class overrides reset, restart or step.
         """
         super().__init_subclass__(**kwargs)
         own = {"reset", "restart", "step"} & set(vars(cls))
-        if own and not cls.auto_resets:
+        if own:
             raise ConfigError(
                 f"expected hooks for one world, got {cls.__name__}.{sorted(own)[0]}. Override before_step, after_step "
                 f"or after_reset: docs/guides/tasks.md"

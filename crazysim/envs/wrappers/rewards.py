@@ -19,8 +19,8 @@ class EpisodeSums(PyTree):
 
     reward: Array = leaf("drone")
     """Sum of the rewards of the episode. (n_worlds, n_drones)"""
-    length: Array = leaf("batched")
-    """Number of its steps. (n_worlds,)"""
+    length: Array = leaf("world")
+    """Number of its steps. (n_worlds, 1)"""
 
 
 class LastAction(PyTree):

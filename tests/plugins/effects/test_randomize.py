@@ -213,8 +213,8 @@ def test_drones_are_drawn_before_the_steps_unless_a_stage_sets_the_clock_back():
 
     drawn, reset = flown("interpret"), flown("interpret", again)
     phases = [[s.phase for s in sim.step_fn.plan(sim.data).program.fused_segments] for sim in (drawn, reset)]
-    assert phases[0] == ["first", "each"]
-    assert "first" not in phases[1]
+    assert phases[0] == ["before", "each"]
+    assert "before" not in phases[1]
     for sim, stages in ((drawn, ()), (reset, (again,))):
         factors = sim.data.plugins["randomize"].factors
         np.testing.assert_array_equal(factors, flown("plain", *stages).data.plugins["randomize"].factors)

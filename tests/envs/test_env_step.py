@@ -1,4 +1,4 @@
-"""An environment step as one kernel gives what the same step gives unfused, or says why it is not fused."""
+"""The step and the rollout of an environment: the same on every engine, and split only where ``explain`` says so."""
 
 import dataclasses
 
@@ -10,7 +10,6 @@ import pytest
 import crazysim.envs as envs
 from crazysim.core.stage import over_worlds
 from crazysim.engine.backends import fused
-from crazysim.engine.errors import UnsupportedError
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, EngineWarning
@@ -18,17 +17,6 @@ from crazysim.pytree import CORE_NDIM_KEY, PyTree, leaf
 
 pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
 N = 6
-
-
-class AsWritten(AutoReset):
-    """The same without a kernel for the whole step."""
-
-    def fused_step(self, *_, **__):
-        return None
-
-
-def both(env, mode="SameStep"):
-    return AutoReset(env, mode), AsWritten(env, mode)
 
 
 def close(found, expected, tolerance=2e-5):
@@ -63,27 +51,36 @@ class Bound(Wrapper):
         return self.halve(state)
 
 
-CASES = {
-    "hover, same step": (
-        lambda: Bound(envs.EpisodeStatistics(envs.ObservationNoise(envs.make("hover", N, seconds=0.3), {"pos": 0.1}))),
-        "SameStep",
-    ),
-    "hover, next step": (
-        lambda: envs.FrameStack(
-            envs.ActionDelay(envs.RandomizeWith(envs.make("hover", N, seconds=0.3), lopsided, ("J", "J_inv")), 1), 2
-        ),
-        "NextStep",
-    ),
-    "swarm": (lambda: envs.make("swarm", N, n_drones=3, seconds=0.3), "Disabled"),
-}
+def noisy_hover(engine):
+    env = envs.make("hover", N, seconds=0.3, engine=engine)
+    return AutoReset(Bound(envs.EpisodeStatistics(envs.ObservationNoise(env, {"pos": 0.1}))), "SameStep")
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_a_whole_step_is_the_step_as_it_is_written(name):
-    make, mode = CASES[name]
-    one, written = both(make(), mode)
+def lopsided_hover(engine):
+    env = envs.RandomizeWith(envs.make("hover", N, seconds=0.3, engine=engine), lopsided, ("J", "J_inv"))
+    return AutoReset(envs.FrameStack(envs.ActionDelay(env, 1), 2), "NextStep")
+
+
+def swarm(engine):
+    return AutoReset(envs.make("swarm", N, n_drones=3, seconds=0.3, engine=engine), "Disabled")
+
+
+def normalised_hover(engine):
+    """Return an environment with a wrapper of all worlds, at which the step is split."""
+    return AutoReset(envs.Normalize(envs.make("hover", N, seconds=0.3, engine=engine)), "SameStep")
+
+
+@pytest.mark.long("compiles each case for two engines")
+@pytest.mark.parametrize(
+    ("make", "engine"),
+    [(noisy_hover, "fused"), (lopsided_hover, "fused"), (swarm, "fused"), (normalised_hover, "fused"),
+     (noisy_hover, "lanes"), (normalised_hover, "lanes"), (swarm, "interpret")],
+)  # fmt: skip
+def test_an_engine_steps_an_environment_as_the_reference_does(make, engine):
+    one, written = make(engine), make("plain")
     state = jax.jit(written.reset)(jax.random.key(0))
-    assert one.explain().startswith("a step is one kernel\nits physics, as in sim.explain():\nengine: fused\n")
+    assert one.explain().startswith(f"engine: {engine}")
+    assert ("splits the step" in one.explain()) == (make is normalised_hover)
     step, expected = jax.jit(one.step), jax.jit(written.step)
     ended = 0
     for k in range(40):
@@ -91,7 +88,7 @@ def test_a_whole_step_is_the_step_as_it_is_written(name):
         after = step(state, action)
         close(after, expected(state, action))
         state, ended = after, ended + int(after.done.sum())
-    assert ended or mode == "Disabled", "no episode has ended"
+    assert ended or make is swarm, "no episode has ended"
 
 
 @pytest.fixture(scope="module")
@@ -99,50 +96,61 @@ def hover():
     return envs.make("hover", N, seconds=0.3)
 
 
-def test_a_rollout_in_rows_is_a_loop_of_steps():
+@pytest.mark.long("compiles a rollout and a loop, and derivatives of both")
+def test_a_rollout_is_a_loop_of_steps(hover):
     """What a policy sees, what is kept and what remains; and derivatives and vmap of it."""
-    one, written = both(envs.make("hover", N, seconds=0.3, control="rotor_vel"))
-    start = jax.jit(one.reset)(jax.random.key(0))
+    env = AutoReset(envs.make("hover", N, seconds=0.3, control="rotor_vel"))
+    start = jax.jit(env.reset)(jax.random.key(0))
+    key = jax.random.key(1)
 
-    def fly(env, gain=1.0):
-        # All that a step reads depends on the number that is differentiated: JAX goes through the step once.
-        states, obs = jax.tree.map(lambda x: gain * x, (start.data.states, start.obs))
-        begun = start.replace(data=start.data.replace(states=states), obs=obs)
+    def act(gain, obs, memory, key):
+        noise = jax.random.uniform(key, (N, 1, 4), minval=-0.3, maxval=0.3)
+        return noise - gain * (0.1 * obs["vel"][..., :1] + memory[:, None, None]), memory + 0.01, memory
 
-        def act(state, key):
-            noise = jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3)
-            return noise - gain * 0.1 * (state.data.states.vel[..., :1] + state.obs["vel"][..., :1])
+    def fly(gain):
+        policy = lambda obs, memory, key: act(gain, obs, memory, key)  # noqa: E731
+        keep = lambda t: (t.reward, t.done, t.state.info["error"], t.final_obs["pos"], t.extras, t.action)  # noqa: E731
+        return envs.rollout(env, start, policy, key, 20, keep, jnp.zeros(N))
 
-        keep = lambda s: (s.reward, s.done, s.info["error"], s.data.states.pos)  # noqa: E731
-        return envs.rollout(env, begun, act, jax.random.key(1), 20, keep)
+    def loop(gain):
+        def step(carry, key):
+            state, memory = carry
+            action, memory, extras = act(gain, state.obs, memory, key)
+            state = env.step(state, action)
+            memory = jnp.where(state.done, 0.0, memory)
+            kept = state.reward, state.done, state.info["error"], state.info["final_obs"]["pos"], extras, action
+            return (state, memory), kept
 
-    def total(env):
-        def rewarded(gain):
-            end, kept = fly(env, gain)
-            return kept[0].sum(), (end, kept)
+        (state, memory), kept = jax.lax.scan(step, (start, jnp.zeros(N)), jax.random.split(key, 20))
+        return state, memory, kept
 
-        return rewarded
-
-    # One compilation for each of values, values in a batch, and slopes in reverse; without a kernel, one for all.
-    slope_too = jax.jit(lambda gain: jax.jvp(total(written), (gain,), (1.0,), has_aux=True))
-    _, expected_slope, expected = slope_too(1.0)
-    close(jax.jit(lambda: fly(one))(), expected)
-    totals, _ = jax.jit(jax.vmap(total(one)))(jnp.array([0.5, 1.0]))
-    np.testing.assert_allclose(totals[1], expected[1][0].sum(), rtol=1e-5)
-    slope = jax.jit(jax.grad(lambda gain: total(one)(gain)[0]))(1.0)
-    np.testing.assert_allclose(slope, expected_slope, rtol=1e-3)
+    found, expected = jax.jit(fly)(1.0), jax.jit(loop)(1.0)
+    close(found, expected)
+    assert expected[2][1].any(), "no episode has ended"
+    slopes = [jax.jit(jax.grad(lambda gain, f=f: f(gain)[2][0].sum()))(1.0) for f in (fly, loop)]
+    np.testing.assert_allclose(*slopes, rtol=1e-3)
+    totals = jax.jit(jax.vmap(lambda gain: fly(gain)[2][0].sum()))(jnp.array([0.5, 1.0]))
+    np.testing.assert_allclose(totals[1], expected[2][0].sum(), rtol=1e-5)
 
 
-def test_a_rollout_in_rows_takes_the_actions_of_each_step_where_a_wrapper_changes_them():
-    one, written = both(envs.ActionDelay(envs.make("hover", N, seconds=0.3, control="rotor_vel"), 2))
-    start = jax.jit(one.reset)(jax.random.key(0))
-
-    def act(state, key):
-        return jax.random.uniform(key, state.action.shape, minval=-0.3, maxval=0.3)
-
-    keep = lambda s: (s.reward, s.action, s.data.states.vel)  # noqa: E731
-    fly = lambda env: jax.jit(lambda: envs.rollout(env, start, act, jax.random.key(1), 20, keep))()  # noqa: E731
-    close(fly(one), fly(written))
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+def test_a_policys_memory_begins_anew_with_an_episode(mode):
+    env = AutoReset(envs.make("hover", 3, seconds=0.06, engine="interpret"), mode)  # three steps
+    start = env.reset(jax.random.key(0))
+    policy = lambda obs, memory, key: (jnp.zeros((3, 1, 4)), memory + 1, memory)  # noqa: E731
+    keep = lambda t: (t.extras, t.state.data.core.steps[:, 0])  # noqa: E731
+    _, last, (memory, steps) = envs.rollout(
+        env, start, policy, jax.random.key(0), 8, keep, jnp.zeros(3) + 5, jnp.zeros(3)
+    )
+    expected = {
+        "SameStep": [5, 6, 7, 0, 1, 2, 0, 1],
+        "NextStep": [5, 6, 7, 8, 0, 1, 2, 3],
+        "Disabled": [5, 6, 7, 8, 9, 10, 11, 12],
+    }
+    np.testing.assert_array_equal(memory, np.broadcast_to(np.array(expected[mode])[:, None], (8, 3)))
+    if mode != "Disabled":
+        np.testing.assert_array_equal(np.diff(steps, axis=0)[:-1] < 0, np.diff(memory, axis=0)[1:] < 0)
+    assert last.shape == (3,)
 
 
 class Remembered(PyTree):
@@ -173,20 +181,36 @@ class Confused(Wrapper):
     after_step = after_reset
 
 
-def test_law_02_memory_is_of_drones_where_it_is_declared_so():
+class Counting(Wrapper):
+    """Adds entries of ``info``: one of the world, one of drones, and one that is neither."""
+
+    def __init__(self, env, wrong=False):
+        super().__init__(env)
+        self.wrong = wrong
+
+    def after_step(self, state):
+        own = {"n": jnp.float32(2), "each": state.data.states.pos}
+        return state.replace(info=state.info | own | ({"three": jnp.zeros(3)} if self.wrong else {}))
+
+
+def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
     """An axis that is as long as there are drones is not theirs."""
-    env = envs.make("hover", N, n_drones=2, control="rotor_vel")
-    one, written = both(Remembers(env), "Disabled")
-    state = jax.jit(written.reset)(jax.random.key(0))
-    fused_step = one.fused_step(state, state.action)
-    scopes = {x.name: x.scope for x in fused_step.program.leaves if ".memory" in x.name}
+    env = envs.make("hover", N, n_drones=2, control="rotor_vel", engine="interpret")
+    one = AutoReset(Counting(Remembers(env)), "Disabled")
+    state = one.reset(jax.random.key(0))
+    after = one.step(state, state.action)
+    assert jax.tree.structure(state) == jax.tree.structure(after)
+    scopes = {x.name: x.scope for x in one.step_fn.plan(state.whole, ()).program.leaves if ".memory" in x.name}
     assert sorted(scopes.values()) == ["drone", "world", "world"]
-    after = jax.jit(fused_step)(state, state.action)
-    close(after, jax.jit(written.step)(state, state.action))
-    assert after.memory["Remembers"][1].of_world.shape == (N, 1, 2)
-    state = jax.eval_shape(Confused(env).reset, jax.random.key(0))
-    with pytest.raises(ConfigError, match=r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"):
-        AutoReset(Confused(env)).fused_step(state, state.action)
+    plain, record = after.memory["Remembers"]
+    assert (plain.shape, record.of_drones.shape, record.of_world.shape) == ((N, 2), (N, 2), (N, 1, 2))
+    assert (after.info["n"].shape, after.info["each"].shape) == ((N,), (N, 2, 3))
+    for wrong, message in (
+        (Confused(env), r"expected obs\['pos'\] of shape \(n_drones, ...\).* 2 drones, got \(3,\)"),
+        (Counting(env, wrong=True), r"expected info\['three'\] as one number of a world, .* 2 drones in front"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            wrong.reset(jax.random.key(0))
 
 
 class Fourier(Hover):
@@ -260,7 +284,6 @@ REFUSED = {
     "task 'hover' is declared to need all worlds at once": lambda env: AutoReset(envs.DroneEnv(env.sim, Ranked())),
     "wrapper 'Normalize' is declared to need all worlds at once": lambda env: AutoReset(envs.Normalize(env)),
     "a stage of one world is unrolled for at most 8 drones": lambda _: AutoReset(envs.make("swarm", 2, n_drones=9)),
-    "the engine is 'lanes'": lambda env: AutoReset(envs.make("hover", N, engine="lanes")),
     "'own' of the reset pipeline takes all worlds at once": with_reset_stage,
     "episodes begin from different data in different worlds": with_other_defaults,
     "different data in different worlds": with_the_numbers_of_worlds,
@@ -268,38 +291,39 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("why", REFUSED)
-def test_a_step_that_is_not_one_kernel_says_why_in_one_line(hover, why):
+def test_a_step_that_is_split_says_where_and_why(hover, why):
     env = REFUSED[why](hover)
-    line, engine = env.explain().split("\n")[0:3:2]
-    assert line.startswith("a step is not one kernel: ")
-    assert engine.startswith("engine: ")
-    assert why in line
+    text = env.explain()
+    assert text.startswith("engine: fused\n")
+    assert why in next(line for line in text.split("\n") if line.startswith("splits the step: "))
 
 
 def test_a_step_that_the_engine_cannot_lower_warns_once_or_raises(hover):
     env = AutoReset(envs.DroneEnv(hover.sim, Fourier()))
-    with pytest.warns(
-        EngineWarning, match=r"environment steps run unfused: primitive .*complex64 \(stage 'observations'"
-    ):
-        line = env.explain()
-    assert line.startswith("a step is not one kernel: primitive ")
-    assert env.explain() == line  # without another warning, which would be an error here
+    with pytest.warns(EngineWarning, match=r"stage 'observe' is not fused: .*complex64"):
+        text = env.explain()
+    assert "splits the step: 'observe' is not fused" in text
+    assert env.explain() == text  # without another warning, which would be an error here
     strict = AutoReset(envs.DroneEnv(envs.make("hover", N, strict=True).sim, Fourier()))
-    with pytest.raises(UnsupportedError, match="complex64"):
+    with pytest.raises(ConfigError, match="complex64"):
         strict.explain()
 
 
+@pytest.mark.long("plans the steps of six environments")
 def test_every_environment_explains_its_step(hover):
-    """One without automatic resets is not one kernel; those of other libraries have it inside."""
-    assert hover.explain().startswith("a step is not one kernel: it begins no new episodes. AutoReset(env)")
+    """With automatic resets and without, and those of other libraries."""
     for adapted in (
+        hover,
+        AutoReset(hover),
         envs.DroneVectorEnv(hover),
         envs.BraxEnv(hover),
         envs.DroneSingleEnv(envs.make("hover")),
         envs.make_parallel("swarm", n_drones=2),
     ):
-        assert "engine: fused" in adapted.explain()
-    assert envs.DroneVectorEnv(hover).explain().startswith("a step is one kernel\n")
+        text = adapted.explain()
+        assert text.startswith("engine: fused\n")
+        assert "observe" in text
+        assert "splits" not in text
 
 
 def test_a_task_of_all_worlds_is_rewarded_across_them(hover):
@@ -325,7 +349,7 @@ def test_episodes_begin_as_the_simulation_resets(hover, make):
     if make is with_reset_stage:
         np.testing.assert_array_equal(state.data.controls.rotor_vel, 7.0)
     else:
-        fresh = np.asarray(jax.jit(env.base.default_of)(state.data).states.pos)
+        fresh = np.asarray(jax.jit(env.base.resets.default_of)(state.data).states.pos)
         np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N - 1)])
 
 
@@ -345,10 +369,7 @@ class Buggy(Hover):
         return data.replace(states=data.states.pos[..., 2] + None)
 
 
-def test_a_bug_in_a_task_is_not_taken_for_a_step_that_cannot_be_fused(hover):
+def test_a_bug_in_a_task_is_raised_as_it_is(hover):
     env = AutoReset(envs.DroneEnv(hover.sim, Buggy()))
-    state = jax.eval_shape(env.reset, jax.random.key(0))
     with pytest.raises(TypeError, match="NoneType"):
-        env.explain()
-    with pytest.raises(TypeError, match="NoneType"):
-        jax.eval_shape(env.step, state, state.action)
+        jax.eval_shape(env.reset, jax.random.key(0))
