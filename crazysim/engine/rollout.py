@@ -16,6 +16,7 @@ from crazysim.engine.ir.program import Zeros
 from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
 from crazysim.progress import progress_bar
+from crazysim.pytree import numbered
 
 Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
@@ -67,8 +68,9 @@ def rollout(
     if n_control_steps % every:
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
-    start = step.flatten(data, zeros, n_substeps, frozenset() if step.platform == "gpu" else None)
-    changed = sorted({*start.plan.written, start.plan.synced, *F.staged_leaves(start.plan.numbers)})
+    staged = F.staged_leaves(numbered(data))
+    start = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
+    changed = sorted({*start.plan.written, start.plan.synced, *staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
         now = start.replaced(changed, carry)

@@ -53,7 +53,13 @@ class FlatData:
         return record
 
     def replaced(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:
-        """Return the data with other values of some leaves, none of which is in rows."""
+        """Return the data with other values of some leaves.
+
+        Raises:
+            ValueError: If one is in rows, where its value would not be read.
+        """
+        if any(i in rows.members for rows in self.plan.rows for i in numbers):
+            raise ValueError("a leaf that is in rows cannot be replaced; keep it apart")
         if isinstance(self.leaves, HostLeaves):
             return FlatData(self.leaves.replaced(numbers, values), self.plan)
         return FlatData(with_leaves(self.leaves, numbers, values), self.plan)
@@ -144,7 +150,14 @@ class Step:
         return self.of([stage for stage in self.stages if stage.__name__ not in names])
 
     def of(self, stages: Sequence[Stage]) -> Step:
-        """Return the step of other stages, with the same engine and devices."""
+        """Return the step of other stages, with the same engine and devices.
+
+        Raises:
+            ConfigError: If two of them have the same name.
+        """
+        names = [stage.__name__ for stage in stages]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ConfigError(f"expected stages of different names, got {', '.join(twice)} twice. Rename yours.")
         devices = self.location.devices
         device = devices[0] if self.mesh is None and devices is not None else None
         pipeline: Pipeline = {stage.__name__: stage for stage in stages}

@@ -41,7 +41,7 @@ class Env(ABC):
     """
 
     auto_resets: ClassVar[bool] = False
-    """True if new episodes begin within ``step``."""
+    """True for the wrapper that decides when new episodes begin within ``step``."""
 
     @property
     @abstractmethod
@@ -79,7 +79,7 @@ class Env(ABC):
         return self.base.max_steps
 
     @property
-    def policy(self) -> ResetPolicy | None:
+    def reset_policy(self) -> ResetPolicy | None:
         """Rule by which new episodes begin within a step; None if none do."""
         return None
 
@@ -94,7 +94,7 @@ class Env(ABC):
             base.sim.n_drones,
             last_step,
             base.resets,
-            self.policy,
+            self.reset_policy,
             base.measured,
         )
 
@@ -144,7 +144,9 @@ class Env(ABC):
         steps = state.whole.core.steps
         with beside(steps):
             mask = as_mask(mask, steps.shape[:1])
-            return select_states(mask, self.begin(state), state)
+            new = self.begin(state)
+            new = new if self.reset_policy is None else self.reset_policy.end(new)
+            return select_states(mask, new, state)
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one environment step later; with ``AutoReset``, with new episodes where one is over.
@@ -165,14 +167,19 @@ class Env(ABC):
             return EnvState(after).replace(next_action=state.record.next_action)
 
     def flatten(self, state: EnvState) -> FlatData:
-        """Return the state as flat data for ``advance``, which steps it faster in a loop than ``step`` a state."""
+        """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
         self._require_own(state)
         record = numbered(state.whole).plugins[NAME]
         outputs = jax.tree.leaves([getattr(record, name) for name in OUTPUTS])
         return self.step_fn.flatten(state.whole, (), self.n_substeps, frozenset(outputs))
 
     def advance(self, flat: FlatData, action: Array) -> FlatData:
-        """Return flat data one environment step later; ``EnvState(flat.data())`` is its state. See ``step``."""
+        """Return flat data one environment step later; ``EnvState(flat.data())`` is its state.
+
+        Args:
+            flat: Result of ``flatten`` or ``advance``.
+            action: Action of every drone, in the type of the state's, which is not checked. (n_worlds, n_drones, k)
+        """
         flat = flat.replaced([flat.plan.numbers.plugins[NAME].next_action], [action])
         return self.step_fn.advance(flat, self.n_substeps)
 
@@ -182,7 +189,7 @@ class Env(ABC):
         Raises:
             ConfigError: If it is of an environment with another mode of automatic resets.
         """
-        expected = self.policy is not None and self.policy.keeps_final_obs
+        expected = self.reset_policy is not None and self.reset_policy.keeps_final_obs
         if expected != ("final_obs" in state.record.drone_info):
             raise ConfigError(
                 f"expected a state of this environment, {'with' if expected else 'without'} info['final_obs'], got one "
@@ -198,7 +205,7 @@ class Env(ABC):
 
     def _complete(self, state: EnvState) -> EnvState:
         """Return the state at the start of the first episode with everything that a step adds, as zeros."""
-        state = state if self.policy is None else self.policy.end(state)
+        state = state if self.reset_policy is None else self.reset_policy.end(state)
         state = state.replace(next_action=jnp.zeros_like(state.action), over=jnp.zeros_like(state.terminated))
         leaves, treedef = jax.tree.flatten(state)
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]))
@@ -316,7 +323,7 @@ class DroneEnv(Env):
 
     @property
     def wrappers(self) -> tuple[Hooks, ...]:
-        """None."""
+        """No wrappers, ``()``."""
         return ()
 
     @property

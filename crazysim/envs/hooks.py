@@ -27,7 +27,8 @@ class Hooks:
     """
 
     name: str = ""
-    """Key of its memory in ``state.memory``; the name of the class if empty."""
+    """Key of its memory in ``state.memory``; the name of the class if empty. A second wrapper of that name around an
+    environment gets a number behind it."""
     batched: bool = False
     """True for a wrapper that needs all worlds at once: its hooks then receive them with their axis, and steps are not
     fused. Leaves of its memory without that axis are declared ``leaf("shared")``."""

@@ -62,7 +62,7 @@ class Phases:
     """Physics steps of an episode."""
     resets: Resets
     """Resets of data at the start of an episode."""
-    policy: ResetPolicy | None = None
+    reset_policy: ResetPolicy | None = None
     """Rule by which new episodes begin within a step; None if none do."""
     measured: Callable[[SimData], SimData] | None = None
     """``measured(data)``: the data that the task observes, of one world, or of all if it is batched; None for the true
@@ -91,7 +91,7 @@ class Phases:
             stage("flag nonfinite", _flag_nonfinite, "after", batched),
             stage("observe", self._observe, "after", batched),
         ]
-        if self.policy is not None:
+        if self.reset_policy is not None:
             stages.append(stage("begin", self._begin, "after", batched or self.resets.batched, over))
         return stages
 
@@ -108,7 +108,7 @@ class Phases:
         ended, batched = EnvState(data), apply is all_worlds
         default = self.resets.default_of(ended.data) if batched else self.resets.default_of_world(ended.data)
         new = self.begin(ended, default, apply)
-        new = new if self.policy is None else self.policy.begin(ended, new)
+        new = new if self.reset_policy is None else self.reset_policy.begin(ended, new)
         return _as_before(data, select_states(data.plugins[NAME].over[:, 0], new, ended) if batched else new)
 
     def outline(self, state: EnvState) -> EnvState:
@@ -120,9 +120,9 @@ class Phases:
         """Return the result of ``observe``, noting where a new episode begins."""
         was_done = state.done
         state = self.observe(state, action, apply)
-        if self.policy is None:
+        if self.reset_policy is None:
             return state
-        return self.policy.end(state).replace(over=self.policy.is_over(was_done, state))
+        return self.reset_policy.end(state).replace(over=self.reset_policy.is_over(was_done, state))
 
     def act(self, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
         """Return the state with the action's command staged, and the action as the wrappers pass it on.

@@ -25,7 +25,7 @@ class AutoresetMode(StrEnum):
 
 @dataclass(frozen=True)
 class ResetPolicy:
-    """Rule by which new episodes begin within a step; all functions are of one world."""
+    """Rule by which new episodes begin within a step; all functions take one world or all."""
 
     is_over: Callable[[Array, EnvState], Array]
     """``is_over(was_done, ended)``: true where a new episode begins; ``was_done`` is ``done`` before the step. ()"""

@@ -1,4 +1,4 @@
-"""Resets of data at the start of an episode, to default data in which what is alike everywhere is stored once."""
+"""Resets of data at the start of an episode. Default values that are equal in all worlds are stored once."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class Resets:
         self.batched_pipeline = bool(names) or self.foreign
         """True if ``data`` takes all worlds at once."""
         self.batched: str | None = None
-        """Reason why new episodes begin in all worlds at once, and are selected where one is over; None for none."""
+        """Reason why new episodes are computed in all worlds and then selected; None where each world begins alone."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, numbered(default))), strict=True)
         world_id = numbered(default).core.world_id
         if names:
             self.batched = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
         elif any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows):
             self.batched = "episodes begin from different data in different worlds"
-        self.data = _reset_all(sim) if self.batched_pipeline else _reset_world(sim, [fn for _, fn in others])
+        self.data = _reset_all(sim) if self.batched_pipeline else _reset_world([fn for _, fn in others])
         """``data(data, default)``: data of one world after a reset, or of all worlds if ``batched_pipeline``."""
 
     def default_of(self, data: SimData) -> SimData:
@@ -65,12 +65,12 @@ def _reset_all(sim: Sim) -> Callable[[SimData, SimData], SimData]:
     return lambda data, default: reset_all(data, default, worlds)
 
 
-def _reset_world(sim: Sim, stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]:
+def _reset_world(stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]:
     """Return a function that resets one world and applies stages of the reset pipeline to it."""
-    axes = Axes(sim.data)
 
     def reset_one(data: SimData, default: SimData) -> SimData:
         data = reset_world(data, default)
+        axes = Axes(data)  # a wrapper may have made parameters one per drone
         for stage in stages:
             data = of_world(stage, axes)(data)
         return data
@@ -91,7 +91,7 @@ def compact(data: SimData) -> SimData:
         host = np.asarray(x)
         for axis in _AXES.get(scope, (0,) if has_members(scope) else ()):
             first = host.take([0], axis)
-            if np.array_equal(host, np.broadcast_to(first, host.shape)):
+            if np.array_equal(host, np.broadcast_to(first, host.shape), equal_nan=host.dtype.kind == "f"):
                 host = first
         return host
 
@@ -110,7 +110,7 @@ def spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
 
 
 def with_own(default: SimData, data: SimData) -> SimData:
-    """Return the default data with the seed, numbers and flags of the data."""
+    """Return the default data with the seed, numbers of worlds, drones and members of the data."""
     own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
     members = {
         name: default.plugins[name].replace(member_id=record.member_id)

@@ -20,7 +20,7 @@ of arrays for ``Transition.extras``. Memory has worlds in front, (n_worlds, ...)
 
 
 class Transition(PyTree):
-    """One step of all worlds; of the arrays of a transition only those that ``keep`` returns are computed."""
+    """One step of all worlds; only the arrays that ``keep`` returns are stored."""
 
     obs: Obs
     """Observations that the policy got. (n_worlds, n_drones, k) each"""
@@ -68,8 +68,8 @@ def rollout(
     key: Array,
     n_steps: int,
     keep: Keep = lambda transition: (transition.reward, transition.done),
-    memory: Any = (),
-    fresh: Any = None,
+    initial_memory: Any = (),
+    memory: Any = None,
 ) -> tuple[EnvState, Any, Any]:
     """Return the state some steps later, the policy's memory, and what was kept on the way; pure, for jit and grad.
 
@@ -80,8 +80,8 @@ def rollout(
         key: Random key; each step receives one of its own.
         n_steps: Number of steps, a positive integer.
         keep: ``keep(transition)``: the part of each transition to return; rewards and ends by default.
-        memory: Memory of the policy before the first step; ``()`` for none. (n_worlds, ...) each
-        fresh: Memory with which a new episode begins; None for ``memory``.
+        initial_memory: Memory of the policy at the start of an episode; ``()`` for none. (n_worlds, ...) each
+        memory: Its memory before the first step, as another rollout returned it; None for ``initial_memory``.
 
     Returns:
         The state, the memory, and what was kept, with time in front, (n_steps, ...).
@@ -90,7 +90,8 @@ def rollout(
         ConfigError: If the number of steps is not a positive integer.
         ValueError: If the policy returns actions of another shape.
     """
-    n_steps, fresh = positive("n_steps", n_steps), memory if fresh is None else fresh
+    n_steps = positive("n_steps", n_steps)
+    memory = initial_memory if memory is None else memory
     start = env.flatten(state)
     carried = sorted({*start.plan.written, start.plan.synced})
 
@@ -100,9 +101,9 @@ def rollout(
         action, memory, extras = policy(seen.obs, memory, key)
         after = env.advance(before, validate_action(action, seen, env.actions))
         new = EnvState(after.data())
-        if env.policy is not None:
-            over = env.policy.is_over(seen.done, new)
-            memory = jax.tree.map(lambda first, x: select_worlds(over, first, x), fresh, memory)
+        if env.reset_policy is not None:
+            over = env.reset_policy.is_over(seen.done, new)
+            memory = jax.tree.map(lambda first, x: select_worlds(over, first, x), initial_memory, memory)
         kept = keep(Transition(seen.obs, action, extras, new))
         return ([after.leaves[i] for i in carried], memory), kept
 

@@ -1,4 +1,4 @@
-"""Environment steps one call at a time, with few arrays: each costs more than the arithmetic on it."""
+"""Environment steps one call at a time, with few arrays: each array of a call costs more than the arithmetic on it."""
 
 from __future__ import annotations
 
@@ -76,19 +76,20 @@ class EnvStepper:
         return output, *self._ends
 
     def _compile(self, flat: FlatData) -> None:
-        """Make the compiled step, which takes and returns what calls carry: results that none reads are left out."""
+        """Compile the step. Its carry omits results that the next step does not read."""
         plan, env = flat.plan, self._env
         record, n = plan.numbers.plugins[NAME], len(flat.leaves)
         flags = [record.terminated, record.truncated]
-        results = set(jax.tree.leaves([getattr(record, name) for name in OUTPUTS])) - set(plan.inputs)
-        self._carried = carried = [i for i in plan.written if i not in results and i not in flags]
-        self._fixed = fixed = [i for i in plan.inputs if i not in (*carried, *flags, record.next_action)]
-        shape = flat.leaves[record.next_action].shape
+        outputs = set(jax.tree.leaves([getattr(record, name) for name in OUTPUTS]))
+        self._carried = carried = [i for i in plan.written if i not in outputs - set(plan.inputs) and i not in flags]
+        constant = outputs - set(plan.written)  # entries of info that only a reset sets
+        self._fixed = fixed = sorted({*plan.inputs, *constant} - {*carried, *flags, record.next_action})
+        like = flat.leaves[record.next_action]
 
         def step(carry: list[Array], rest: list[Array], ends: tuple[Array, Array], actions: ArrayLike) -> Any:
             leaves = with_leaves(with_leaves([None] * n, fixed, rest), carried, carry)
             leaves = with_leaves(leaves, flags, [x[:, None] for x in ends])
-            after = env.advance(FlatData(leaves, plan), jnp.asarray(actions).reshape(shape))
+            after = env.advance(FlatData(leaves, plan), jnp.asarray(actions, like.dtype).reshape(like.shape))
             state = EnvState(after.data())
             return [after.leaves[i] for i in carried], self._output(state), (state.terminated, state.truncated)
 

@@ -5,6 +5,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
+from crazysim.commands.airframe_check import UNSTABLE
+from crazysim.control import Auto
 from crazysim.control.allocation import allocation_matrix
 from crazysim.control.bandwidth import authority, precession
 from crazysim.core.pipeline import remove_fn
@@ -13,6 +15,9 @@ from crazysim.errors import ConfigError
 GRAVITY = 9.81
 LEAST = np.array([4.0, 4.0, 0.2])
 """Angular acceleration in hover below which an airframe is not drawn, rad/s^2; ``airframe check`` warns below 0.2."""
+
+SLOWEST = 0.2
+"""Longest time constant of rotors that are drawn, s; ``airframe check`` warns of longer ones."""
 
 TURN = 2.0
 """Body rate of the flights, rad/s, at which the net momentum of the rotors takes up to half of the authority."""
@@ -49,6 +54,8 @@ def draw(rng, n, name):
         up, down = 1 / tau, 1 / tau * rng.uniform(0.5, 1.0) ** rng.choice([-1, 1])
         quadratic = rng.uniform(0.0, 0.8) * rng.choice([0, 1])
         lag = [rate * part for rate in (up, down) for part in (1 - quadratic, quadratic / 2 / hover)]
+        if min(up, down) < 1 / SLOWEST:
+            continue
         if max(up, down) * (1 - quadratic + quadratic * np.sqrt(ratio * n * np.max(lift))) > 600:
             continue  # too quick for steps of 2 ms
         try:
@@ -72,7 +79,9 @@ def draw(rng, n, name):
         except ConfigError:
             continue
         acc = authority(airframe)
-        if np.all(acc > LEAST) and 2 * TURN * precession(airframe) < np.min(acc[:2]):
+        if not np.all(acc > LEAST) or 2 * TURN * precession(airframe) > np.min(acc[:2]):
+            continue
+        if precession(airframe) < UNSTABLE * np.sqrt(Auto().params(airframe).stiffness[0]):
             return airframe
 
 

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 import crazysim.envs as envs
+from crazysim import Sim
+from crazysim.core.pipeline import append_fn
 from crazysim.core.stage import over_worlds
 from crazysim.engine.backends import fused
+from crazysim.engine.rollout import rollout
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, EngineWarning
@@ -140,7 +143,7 @@ def test_a_policys_memory_begins_anew_with_an_episode(mode):
     policy = lambda obs, memory, key: (jnp.zeros((3, 1, 4)), memory + 1, memory)  # noqa: E731
     keep = lambda t: (t.extras, t.state.data.core.steps[:, 0])  # noqa: E731
     _, last, (memory, steps) = envs.rollout(
-        env, start, policy, jax.random.key(0), 8, keep, jnp.zeros(3) + 5, jnp.zeros(3)
+        env, start, policy, jax.random.key(0), 8, keep, jnp.zeros(3), jnp.zeros(3) + 5
     )
     expected = {
         "SameStep": [5, 6, 7, 0, 1, 2, 0, 1],
@@ -373,3 +376,60 @@ def test_a_bug_in_a_task_is_raised_as_it_is(hover):
     env = AutoReset(envs.DroneEnv(hover.sim, Buggy()))
     with pytest.raises(TypeError, match="NoneType"):
         jax.eval_shape(env.reset, jax.random.key(0))
+
+
+class Begun(Wrapper):
+    """Sets an entry of ``info`` at the start of an episode alone."""
+
+    def after_reset(self, state):
+        return state.replace(info=state.info | {"start": state.data.states.pos})
+
+
+@pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
+def test_info_that_only_a_reset_sets_stays(mode):
+    vec = envs.DroneVectorEnv(Begun(envs.make("hover", 2, engine="interpret")), mode)
+    _, begun = vec.reset(seed=0)
+    _, _, _, _, info = vec.step(np.zeros((2, 4), np.float32))
+    np.testing.assert_array_equal(info["start"], begun["start"])
+
+
+def test_a_restart_observes_the_episodes_that_it_begins():
+    env = AutoReset(envs.make("hover", 2, engine="interpret"))
+    state = env.step(env.reset(jax.random.key(0)), np.zeros((2, 1, 4), np.float32))
+    after = env.restart(state, np.array([True, False]))
+    for name, x in after.obs.items():
+        np.testing.assert_array_equal(after.final_obs[name][0], x[0])
+
+
+def test_two_wrappers_of_one_class_remember_apart():
+    env = envs.make("hover", 1, engine="interpret")
+    twice, once = (AutoReset(x) for x in (envs.ActionDelay(envs.ActionDelay(env, 1), 1), envs.ActionDelay(env, 2)))
+    assert [wrapper.name for wrapper in twice.wrappers][:2] == ["ActionDelay", "ActionDelay 2"]
+    action, sent = np.full((1, 1, 4), 0.5, np.float32), []
+    for delayed in (twice, once):
+        state = delayed.reset(jax.random.key(0))
+        for _ in range(3):
+            state = delayed.step(state, action)
+            sent.append(float(state.action[0, 0, 0]))
+    assert sent == [0, 0, 0.5] * 2
+
+
+def test_law_09_stages_have_names_of_their_own():
+    sim = envs.make("hover", 1, engine="interpret").sim
+    append_fn(sim.step_pipeline, lambda data: data, "observe")
+    env = envs.DroneEnv(sim, Hover())
+    with pytest.raises(ConfigError, match="expected stages of different names, got observe twice"):
+        env.explain()
+
+
+def test_a_rollout_in_rows_takes_commands_of_every_level():
+    """As on GPUs; what the policy commands may also be written by the step, as limits of rotor speeds are."""
+    for control in ("rotor_vel", "state"):
+        sim = Sim(2, control=control)
+        command = jnp.zeros((2, 1, 4)) + 15e3 if control == "rotor_vel" else jnp.zeros((2, 1, 16)).at[..., 2].set(1.0)
+        step, ends = sim.step_fn, []
+        for platform in ("cpu", "gpu"):
+            step.platform = platform  # which decides on rows alone
+            fly = lambda data: rollout(step, data, lambda params, data: command, None, 4, 5)[0].states  # noqa: B023, E731
+            ends.append(jax.jit(fly)(sim.data))
+        close(*ends)

@@ -25,6 +25,6 @@ class AutoReset(Wrapper):
         self.mode = member(AutoresetMode, "mode", mode)
 
     @property
-    def policy(self) -> ResetPolicy | None:
+    def reset_policy(self) -> ResetPolicy | None:
         """Rule by which new episodes begin within a step."""
         return POLICIES[self.mode]

@@ -16,7 +16,7 @@ class Wrapper(Hooks, Env):
         """Take the environment to wrap.
 
         Raises:
-            ConfigError: If that resets automatically; the wrapper would not be called when an episode starts.
+            ConfigError: If ``env`` resets automatically; the wrapper would not be called when an episode starts.
         """
         if not isinstance(env, Env):
             raise ConfigError(f"expected an environment, got {env!r}")
@@ -26,7 +26,9 @@ class Wrapper(Hooks, Env):
                 f"{type(self).__name__} inside."
             )
         self.env = env
-        self.name = self.name or type(self).__name__
+        name, others = self.name or type(self).__name__, {wrapper.name for wrapper in env.wrappers}
+        numbers = range(2, len(others) + 2)
+        self.name = name if name not in others else next(x for k in numbers if (x := f"{name} {k}") not in others)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Refuse wrappers that step the environment themselves, which is compiled as a whole.
