@@ -117,8 +117,9 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
-    """Return the data distributed over a mesh."""
-    return jax.device_put(data, shardings_of(data, mesh))
+    """Return the data distributed over a mesh; under a trace, the compiled function returns it so."""
+    place = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
+    return place(data, shardings_of(data, mesh))
 
 
 def shard_scene(mjx_data: T, mesh: Mesh) -> T:

@@ -10,6 +10,7 @@ import pytest
 import crazysim.envs as envs
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
+from crazysim.core.sharding import world_mesh
 from crazysim.core.stage import over_worlds
 from crazysim.engine.backends import fused
 from crazysim.engine.rollout import rollout
@@ -433,3 +434,25 @@ def test_a_rollout_in_rows_takes_commands_of_every_level():
             fly = lambda data: rollout(step, data, lambda params, data: command, None, 4, 5)[0].states  # noqa: B023, E731
             ends.append(jax.jit(fly)(sim.data))
         close(*ends)
+
+
+@pytest.mark.long("compiles a step for one device and for two")
+def test_law_10_worlds_over_devices_step_by_the_same_kernel_to_the_same_numbers():
+    def flown(**devices):
+        sim, task = Sim(4, control="attitude", **devices), Hover(seconds=0.06)
+        task.install(sim)
+        env = AutoReset(envs.DroneEnv(sim, task))
+        begun = state = jax.jit(env.reset)(jax.random.key(0))
+        step, action = jax.jit(env.step), np.random.default_rng(0).uniform(-1, 1, (4, 1, 4)).astype(np.float32)
+        for _ in range(5):
+            state = step(state, action)
+        policy = lambda obs, memory, key: (jnp.asarray(action), memory, ())  # noqa: E731
+        _, _, kept = jax.jit(lambda state: envs.rollout(env, state, policy, jax.random.key(1), 3))(state)
+        assert env.explain().startswith("engine: fused")
+        return begun, state, kept
+
+    one, several = flown(), flown(mesh=world_mesh(jax.devices()[:2]))
+    assert all(len(x.devices()) == 2 for x in (several[0].obs["pos"], several[1].obs["pos"]))
+    for x, y in zip(*map(jax.tree.leaves, (one, several)), strict=True):
+        if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(x, y)
