@@ -164,9 +164,10 @@ def test_what_makes_flights_slow_is_warned_of_with_its_figure():
     places = [[0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0], [0.1, 0.1, 0], [0, 0, 0.1]]
     five = rotors | {"position": places, "yaw_torque_sign": [-1, 1, -1, 1, 1], "torque_curve": [0, 0, 2e-10]}
     heavy = warnings_of(quad | {"rotors": five | {"inertia": 2e-4, "lag": [20, 0, 20, 0], "thrust_min": 0.1}})
-    assert len(heavy) == 2
+    assert len(heavy) == 3
     assert "their drag turns" in heavy[0]
     assert "at 1 rad/s of roll or pitch their momentum takes 29 of" in heavy[1]
+    assert "turns roll into pitch at 29 rad/s, against a bandwidth of controller 'auto' of" in heavy[2]
 
 
 def warnings_of(airframe):

@@ -59,7 +59,9 @@ class FlatData:
             ValueError: If one is in rows, where its value would not be read.
         """
         if any(i in rows.members for rows in self.plan.rows for i in numbers):
-            raise ValueError("a leaf that is in rows cannot be replaced; keep it apart")
+            raise ValueError(
+                "expected leaves that are not in rows, got one that is. Name it in apart= of Step.flatten."
+            )
         if isinstance(self.leaves, HostLeaves):
             return FlatData(self.leaves.replaced(numbers, values), self.plan)
         return FlatData(with_leaves(self.leaves, numbers, values), self.plan)
