@@ -218,7 +218,7 @@ def test_every_effect_is_fused(every):
     assert {*STAGES} <= fused
     own = set(every.step_pipeline) - set(hovering(engine="interpret").step_pipeline)
     assert own == {*STAGES} - {"integration"}, "an effect's stages are listed in STAGES"
-    assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "first"), ("drone", "each")]
+    assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "before"), ("drone", "each")]
 
 
 @pytest.mark.long("compiles all effects in every engine")
