@@ -157,8 +157,8 @@ def test_presets_fly_and_take_changes():
 
 def test_a_task_flies_other_drones_in_every_episode():
     env = AutoReset(make("hover", 4, randomize="crazyflie", seconds=0.1))
-    assert "one kernel" in env.explain(), "draws at resets are fused too"
-    assert "randomize_begin" not in [s.__name__ for s in env.base.stages], "and nothing is drawn again in a step"
+    assert "splits the step" not in env.explain(), "draws at resets are fused too"
+    assert "randomize_begin" not in [s.__name__ for s in env.step_fn.stages], "and nothing is drawn again in a step"
     state = jax.jit(env.reset)(jax.random.key(0))
     step, seen = jax.jit(env.step), [np.asarray(state.data.plugins["randomize"].factors)[:, 0, 0]]
     for _ in range(8):
