@@ -81,7 +81,7 @@ def test_closed_forms_hold(check):
 
 
 def test_a_figure_out_of_its_bound_fails_the_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(closed_forms, "GRAVITY", 9.80)
+    monkeypatch.setattr(closed_forms, "GRAVITY_MAGNITUDE", 9.80)
     monkeypatch.setattr(closed_forms, "CHECKS", (closed_forms.free_fall,))
     out = tmp_path / "page.md"
     assert main(["validate", "--only", "closed", "--out", str(out)]) == 1
