@@ -14,6 +14,7 @@ from crazysim.errors import ConfigError
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.journal import HEAD, Journal, is_journal, read_journal
 from crazysim.sim import Sim
+from crazysim.storage import unfinished_path
 
 CHUNKS = [(b"AAAA", b"first"), (b"BBBB", b""), (b"CCCC", bytes(range(256)))]
 
@@ -111,11 +112,12 @@ KILLED = textwrap.dedent("""
 
 def test_a_film_survives_the_end_of_its_process(tmp_path):
     """A killed simulation loses no frame; a killed encoder what it had not yet encoded, some seconds."""
-    path = tmp_path / "film.mp4"
+    film = path = tmp_path / "film.mp4"
     ended = subprocess.run([sys.executable, "-c", KILLED, path, "200", "python"], check=False)
     assert ended.returncode == -signal.SIGKILL
+    path = unfinished_path(path)  # only a film that is closed gets its name
     wait_for(lambda: path.exists() and path.stat().st_size and len(frames_of(path, 48, 64)) == 200)
-    subprocess.run([sys.executable, "-c", KILLED, path, "400", "ffmpeg"], check=True)
+    subprocess.run([sys.executable, "-c", KILLED, film, "400", "ffmpeg"], check=True)
     assert len(frames_of(path, 48, 64)) > 200
 
 
