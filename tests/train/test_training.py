@@ -6,13 +6,13 @@ import functools
 import io
 import json
 import re
-import resource
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disks import full_disk
 from pictures import frames_of
 
 import crazysim
@@ -339,13 +339,8 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(tmp_path):
 def test_a_full_disk_leaves_the_last_checkpoint_and_nothing_else(tmp_path):
     path = tmp_path / CHECKPOINT
     checkpoint.save(path, {"x": np.zeros(2)}, {"round": 1})
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
-    try:
-        with pytest.raises(ConfigError, match=r"expected a file that can be written, got .*checkpoint\.npz"):
-            checkpoint.save(path, {"x": np.zeros(2000)}, {"round": 2})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(2000), pytest.raises(ConfigError, match=r"expected a file that can be written, got .*checkpoint"):
+        checkpoint.save(path, {"x": np.zeros(2000)}, {"round": 2})
     assert [p.name for p in tmp_path.iterdir()] == [CHECKPOINT]
     assert checkpoint.read(path)[1] == {"round": 1}
 
