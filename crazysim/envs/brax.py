@@ -11,7 +11,6 @@ from jax import Array
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.wrappers import AutoReset
-from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 
 
@@ -48,8 +47,6 @@ class BraxEnv:
         Raises:
             ConfigError: If it resets automatically.
         """
-        if isinstance(env, AutoReset):
-            raise ConfigError("expected an environment without AutoReset, which BraxEnv adds itself, got one with it")
         self.env = AutoReset(env)
         self.sim = env.sim
         shapes = jax.eval_shape(env.reset, jax.random.key(0))

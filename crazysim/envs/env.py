@@ -6,7 +6,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from operator import is_
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,9 +39,6 @@ class Env(ABC):
     A step has four phases: ``act`` stages the command of an action, the physics advances the simulation, ``observe``
     evaluates the task, and ``begin`` starts new episodes where one is over, if ``AutoReset`` is around it.
     """
-
-    auto_resets: ClassVar[bool] = False
-    """True for the wrapper that decides when new episodes begin within ``step``."""
 
     @property
     @abstractmethod
@@ -371,7 +368,7 @@ class DroneEnv(Env):
                 "expected the default data with which the environment was made, got others: an environment does not "
                 "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
             )
-        data, mesh = self.resets.spread(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
+        data, mesh = self.resets.default_data(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=data.core.replace(rng_key=key))
         if mesh is not None:
             return shard(data, mesh)

@@ -17,7 +17,6 @@ from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
 from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, flatten
-from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, UnknownNameError, not_installed
 
 try:
@@ -49,7 +48,7 @@ class DroneParallelEnv(ParallelEnv):
                 f"expected an environment of one world, got {env.sim.n_worlds} worlds. Make it with n_worlds=1, or use "
                 f"crazysim.envs.DroneVectorEnv."
             )
-        if isinstance(env, AutoReset):
+        if env.reset_policy is not None:
             raise ConfigError(
                 "expected an environment without AutoReset, got one with it. Call reset() after an episode."
             )

@@ -29,7 +29,7 @@ from crazysim.envs.resets import Resets
 from crazysim.envs.state import NAME, EnvState, Obs
 from crazysim.envs.task import Task, total
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_batch_axes, scopes, select_worlds
+from crazysim.pytree import map_batched, select_worlds
 
 Apply = Callable[[Callable[..., Any], bool], Callable[..., Any]]
 """``apply(fn, batched)``: the function as a phase calls it; ``batched`` for functions that take all worlds anyway."""
@@ -124,7 +124,7 @@ class Phases:
             return state
         return self.reset_policy.end(state).replace(over=self.reset_policy.is_over(was_done, state))
 
-    def act(self, state: EnvState, action: Array, apply: Apply = one_world) -> tuple[EnvState, Array]:
+    def act(self, state: EnvState, action: Array, apply: Apply) -> tuple[EnvState, Array]:
         """Return the state with the action's command staged, and the action as the wrappers pass it on.
 
         Args:
@@ -137,7 +137,7 @@ class Phases:
         data = apply(self.task.before_step, self.task.batched)(state.data)
         return state.replace(data=stage_command(data, self.actions.command(action))), action
 
-    def observe(self, state: EnvState, action: Array, apply: Apply = one_world) -> EnvState:
+    def observe(self, state: EnvState, action: Array, apply: Apply) -> EnvState:
         """Return the state after the physics: observations, reward and the end of the episode.
 
         Args:
@@ -169,7 +169,7 @@ class Phases:
             state = apply(wrapper.after_step, wrapper.batched)(state)
         return state
 
-    def begin(self, state: EnvState, default: SimData, apply: Apply = one_world) -> EnvState:
+    def begin(self, state: EnvState, default: SimData, apply: Apply) -> EnvState:
         """Return the state at the start of an episode; of the state before, only data, info and memory are read.
 
         Args:
@@ -233,10 +233,7 @@ def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
         new: State of the worlds in the mask.
         old: State of the others.
     """
-    kinds = jax.tree.leaves(scopes(new))
-    pairs = zip(kinds, jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
-    leaves = [select_worlds(mask, x, y) if n_batch_axes(kind) else x for kind, x, y in pairs]
-    return jax.tree.structure(new).unflatten(leaves)
+    return map_batched(functools.partial(select_worlds, mask), new, old)
 
 
 def _step_info(task: Task, data: SimData) -> dict[str, Array]:

@@ -45,7 +45,7 @@ class Resets:
     def default_of(self, data: SimData) -> SimData:
         """Return the data of all worlds that an episode begins from; seed and numbers are those of the data given."""
         n_worlds, n_drones = data.states.pos.shape[:2]
-        return with_own(self.spread(n_worlds, n_drones), data)
+        return with_own(self.default_data(n_worlds, n_drones), data)
 
     def default_of_world(self, data: SimData) -> SimData:
         """Return the data of one world that an episode begins from, where worlds do not differ in that."""
@@ -55,9 +55,15 @@ class Resets:
 
         return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
 
-    def spread(self, n_worlds: int, n_drones: int) -> SimData:
+    def default_data(self, n_worlds: int, n_drones: int) -> SimData:
         """Return the default data with all worlds and drones."""
-        return spread(self._default, n_worlds, n_drones)
+        shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
+
+        def repeat(scope: str, x: Array) -> Array:
+            shape = shapes.get(scope, (n_worlds,) if has_members(scope) else ())
+            return jnp.broadcast_to(x, (*shape, *x.shape[len(shape) :])) if shape else x
+
+        return jax.tree.map(repeat, scopes(self._default), self._default)
 
 
 def _reset_all(sim: Sim) -> Callable[[SimData, SimData], SimData]:
@@ -96,17 +102,6 @@ def compact(data: SimData) -> SimData:
         return host
 
     return jax.tree.map(one, scopes(data), data)
-
-
-def spread(data: SimData, n_worlds: int, n_drones: int) -> SimData:
-    """Return compacted data with all worlds and drones."""
-    shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
-
-    def all_of(scope: str, x: Array) -> Array:
-        shape = shapes.get(scope, (n_worlds,) if has_members(scope) else ())
-        return jnp.broadcast_to(x, (*shape, *x.shape[len(shape) :])) if shape else x
-
-    return jax.tree.map(all_of, scopes(data), data)
 
 
 def with_own(default: SimData, data: SimData) -> SimData:

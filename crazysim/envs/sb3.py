@@ -59,10 +59,6 @@ class DroneVecEnv(VecEnv):
         Raises:
             ConfigError: If there is no such mode, or the environment resets automatically.
         """
-        if isinstance(env, AutoReset):
-            raise ConfigError(
-                "expected an environment without AutoReset, which DroneVecEnv adds itself, got one with it"
-            )
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
         self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
         self._begin, self._advance = jax.jit(self._first), jax.jit(self._next)

@@ -56,10 +56,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ConfigError: If there is no such mode or world, or the environment resets automatically.
         """
-        if isinstance(env, AutoReset):
-            raise ConfigError(
-                "expected an environment without AutoReset, got one with it. Use autoreset_mode= instead."
-            )
         mode = member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode

@@ -232,7 +232,7 @@ def test_what_comes_before_a_reset_is_refused():
         env.step(np.zeros((1, 4)))
     with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
         env.render()
-    with pytest.raises(ConfigError, match=r"got one with it. Use autoreset_mode= instead"):
+    with pytest.raises(ConfigError, match="adapters to other libraries add it themselves"):
         DroneVectorEnv(AutoReset(env.env.env))
 
 

@@ -54,7 +54,7 @@ def test_nothing_goes_around_automatic_resets(env):
     auto = AutoReset(env)
     same = lambda e: RandomizeWith(e, lambda d, k: d)  # noqa: E731
     for around in (EpisodeStatistics, AutoReset, lambda e: FrameStack(e, 2), same):
-        with pytest.raises(ConfigError, match="without AutoReset, which is the outermost wrapper"):
+        with pytest.raises(ConfigError, match="without AutoReset, got one with it"):
             around(auto)
 
 

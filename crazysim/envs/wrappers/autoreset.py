@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from crazysim.core.settings import member
 from crazysim.envs.env import Env
 from crazysim.envs.reset_policy import POLICIES, AutoresetMode, ResetPolicy
@@ -12,8 +10,6 @@ from crazysim.envs.wrappers.base import Wrapper
 
 class AutoReset(Wrapper):
     """Begin a new episode where one is over; the outermost of all wrappers."""
-
-    auto_resets: ClassVar[bool] = True
 
     def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
         """Take the environment and the mode.

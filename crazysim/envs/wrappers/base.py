@@ -20,10 +20,10 @@ class Wrapper(Hooks, Env):
         """
         if not isinstance(env, Env):
             raise ConfigError(f"expected an environment, got {env!r}")
-        if env.auto_resets:
+        if env.reset_policy is not None:
             raise ConfigError(
-                f"expected an environment without AutoReset, which is the outermost wrapper, got one with it. Put "
-                f"{type(self).__name__} inside."
+                "expected an environment without AutoReset, got one with it. AutoReset is the outermost wrapper, and "
+                "adapters to other libraries add it themselves."
             )
         self.env = env
         name, others = self.name or type(self).__name__, {wrapper.name for wrapper in env.wrappers}
