@@ -13,7 +13,7 @@ import argparse
 import json
 from pathlib import Path
 
-from crazysim.validate.closed_loop import compare, laboratory, read_flight
+from crazysim.lab.validate.closed_loop import compare, laboratory, read_flight
 
 
 def main() -> None:

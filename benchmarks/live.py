@@ -22,8 +22,8 @@ from typing import Any
 from measure import digits, report
 
 from crazysim import Sim
-from crazysim.live import Browser, Live
-from crazysim.live.circles import Circles
+from crazysim.lab.live import Browser, Live
+from crazysim.lab.live.circles import Circles
 
 CASES = ("max", "recorded", "pictures", "jitter")
 

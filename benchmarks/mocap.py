@@ -17,7 +17,7 @@ import numpy as np
 from measure import digits, report
 
 from crazysim import Sim
-from crazysim.live.mocap import FunctionSource, RealTimeSource, Twin, Twins
+from crazysim.lab.live.mocap import FunctionSource, RealTimeSource, Twin, Twins
 
 
 def main() -> None:

@@ -23,8 +23,8 @@ from measure import digits, report
 from mocap import circling_bodies
 
 from crazysim import Sim
-from crazysim.live import FunctionSource, Live, RealTimeSource, Twin, Twins
-from crazysim.live.circles import Circles
+from crazysim.lab.live import FunctionSource, Live, RealTimeSource, Twin, Twins
+from crazysim.lab.live.circles import Circles
 
 FREQ = 240.0
 """Frames per second of motion capture, Hz."""

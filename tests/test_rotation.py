@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from crazysim import rotation as rot
-from crazysim.live import attitude
+from crazysim.lab.live import attitude
 
 # Everything below runs in float64, so what is left is its rounding (1.1e-16) times a few operations.
 ROUNDING = {"rtol": 1e-12, "atol": 1e-12}

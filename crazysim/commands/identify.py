@@ -14,7 +14,7 @@ from crazysim.commands.options import DefaultsFormatter
 from crazysim.drones import load_airframe
 from crazysim.dynamics.utils.identification import FITTED
 from crazysim.errors import ConfigError
-from crazysim.identify import (
+from crazysim.lab.identify import (
     Columns,
     FittedModel,
     Log,

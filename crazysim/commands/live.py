@@ -39,9 +39,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly drones live, and print the figures."""
-    from crazysim.live import Browser, CommandServer, Fleet, Gamepad, Live, Pilot, RemoteCommands, Window
-    from crazysim.live.circles import Circles
-    from crazysim.live.piloting import Sticks, keyboard_sticks
+    from crazysim.lab.live import Browser, CommandServer, Fleet, Gamepad, Live, Pilot, RemoteCommands, Window
+    from crazysim.lab.live.circles import Circles
+    from crazysim.lab.live.piloting import Sticks, keyboard_sticks
     from crazysim.sim.sim import Sim
 
     viewers = [name for name in ("window", "browser") if getattr(options, name)]

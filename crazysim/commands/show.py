@@ -9,8 +9,8 @@ from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given
 from crazysim.errors import ConfigError
+from crazysim.lab.show_files import Show, load_show
 from crazysim.storage import check_writable, write_file
-from crazysim.trajectories.files import Show, load_show
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -35,9 +35,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly a show, and write figures, films and pages of it."""
+    from crazysim.lab.shows import film, fly, page, report, summary
+    from crazysim.lab.shows.view import play
     from crazysim.progress import progress_bar
-    from crazysim.shows import film, fly, page, report, summary
-    from crazysim.shows.view import play
 
     for path, suffixes in ((options.report, (".json",)), (options.page, (".html",)), (options.film, (".mp4", ".gif"))):
         if path is not None:
@@ -73,10 +73,10 @@ def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any])
     """Fly a show in real time, and print the report of the loop."""
     import numpy as np
 
-    from crazysim.live import Browser, Window
-    from crazysim.shows.flight import planned_at
-    from crazysim.shows.live_show import live_show
-    from crazysim.shows.view import camera_around
+    from crazysim.lab.live import Browser, Window
+    from crazysim.lab.shows.flight import planned_at
+    from crazysim.lab.shows.live_show import live_show
+    from crazysim.lab.shows.view import camera_around
 
     written = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
     if written is not None:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import crazysim
 from crazysim.commands.options import DefaultsFormatter
+from crazysim.lab.validate import NAMES, Row, validate
+from crazysim.lab.validate.page import bound_text, page
+from crazysim.lab.validate.pictures import draw
+from crazysim.lab.validate.rows import Section
+from crazysim.lab.validate.sections import sections
 from crazysim.storage import check_writable, write_file
-from crazysim.validate import NAMES, Row, validate
-from crazysim.validate.page import bound_text, page
-from crazysim.validate.pictures import draw
-from crazysim.validate.rows import Section
-from crazysim.validate.sections import sections
 
 PICTURES = "pictures"
 """Name of the folder of the pictures, beside the page."""

@@ -3,15 +3,10 @@
 from crazysim.trajectories import formation
 from crazysim.trajectories.approaches import Approach
 from crazysim.trajectories.files import (
-    Cue,
-    Lights,
-    Show,
     load_csv,
-    load_show,
     pack_compressed,
     save_csv,
     save_samples,
-    save_show,
 )
 from crazysim.trajectories.limits import Limits, Report, Violation, check
 from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
@@ -22,11 +17,8 @@ from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
 
 __all__ = [
     "Approach",
-    "Cue",
-    "Lights",
     "Limits",
     "Report",
-    "Show",
     "Trajectory",
     "Violation",
     "check",
@@ -38,14 +30,12 @@ __all__ = [
     "line",
     "lissajous",
     "load_csv",
-    "load_show",
     "minimum_jerk",
     "minimum_snap",
     "of_bezier",
     "pack_compressed",
     "save_csv",
     "save_samples",
-    "save_show",
     "smoothest",
     "spline",
 ]

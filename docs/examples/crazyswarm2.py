@@ -3,8 +3,8 @@
 import numpy as np
 
 from crazysim import Sim
-from crazysim.live import Swarm
-from crazysim.live.crazyflie_py import Crazyswarm, use  # was: from crazyflie_py import Crazyswarm
+from crazysim.lab.live import Swarm
+from crazysim.lab.live.crazyflie_py import Crazyswarm, use  # was: from crazyflie_py import Crazyswarm
 
 HEIGHT, RADIUS, TURN = 1.0, 0.6, 6.0
 

@@ -14,7 +14,7 @@ import sys
 import numpy as np
 
 from crazysim import Sim
-from crazysim.live import Browser, Live, Pilot, Window
+from crazysim.lab.live import Browser, Live, Pilot, Window
 
 KEYS = (("up", 3.0, 4.0), ("left", 4.5, 5.5), ("w", 6.0, 6.5), ("a", 6.5, 7.5))
 """Keys that the example presses itself, with the times at which they are pressed and released, s."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from crazysim import Cars, SharedLoad, Sim
-from crazysim.live import FunctionSource, Live, ReplaySource, Twin, Twins
+from crazysim.lab.live import FunctionSource, Live, ReplaySource, Twin, Twins
 from crazysim.plugins import vehicles
 from crazysim.trajectories import figure_eight
 

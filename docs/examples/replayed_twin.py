@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from crazysim import Sim
-from crazysim.live import FunctionSource, ReplaySource, Twin, Twins
+from crazysim.lab.live import FunctionSource, ReplaySource, Twin, Twins
 
 KEEP = 0.6
 """Distance that the simulated drone keeps, m."""

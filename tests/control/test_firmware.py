@@ -14,7 +14,7 @@ from crazysim.control.power_distribution import PowerDistributionParams, distrib
 from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import curve
 from crazysim.errors import ConfigError
-from crazysim.validate import firmware_controllers as flown
+from crazysim.lab.validate import firmware_controllers as flown
 
 jitted = jax.jit(distribute, static_argnames="whole_numbers")
 

@@ -6,8 +6,8 @@ import pytest
 from cases import with_states
 from scipy.spatial.transform import Rotation
 
-from crazysim.validate.closed_forms import free_body, free_fall_error
-from crazysim.validate.peers import mujoco_differences
+from crazysim.lab.validate.closed_forms import free_body, free_fall_error
+from crazysim.lab.validate.peers import mujoco_differences
 
 INTEGRATORS = ("euler", "symplectic_euler", "rk4")
 

@@ -22,10 +22,10 @@ from crazysim.envs.tasks.bring_load import BringLoad
 from crazysim.envs.tasks.goals import GoalTask
 from crazysim.envs.tasks.touch_down import TouchDown
 from crazysim.errors import ConfigError
-from crazysim.live.mocap.playback import Playback
-from crazysim.live.mocap.tracker import Rules
-from crazysim.live.mocap.twins import Twin
-from crazysim.live.sitl import Origin
+from crazysim.lab.live.mocap.playback import Playback
+from crazysim.lab.live.mocap.tracker import Rules
+from crazysim.lab.live.mocap.twins import Twin
+from crazysim.lab.live.sitl import Origin
 from crazysim.plugins.effects import Battery, Grid
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
 from crazysim.plugins.estimators.estimator import Estimator

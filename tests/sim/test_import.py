@@ -20,6 +20,7 @@ sim.reset()
 sim.data
 sim.scene.add("gate")
 sim.step()
+assert not [name for name in sys.modules if name.startswith("crazysim.lab")]
 import crazysim.commands.validate  # Crazyflow, which it compares with, refuses to be imported after SciPy
 print(json.dumps(sorted(packages() - before - set(sys.stdlib_module_names))))
 from crazysim.scene import mjx

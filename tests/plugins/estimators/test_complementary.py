@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, rotation
+from crazysim.lab.validate import firmware_filters
 from crazysim.plugins.estimators import Complementary, complementary
 from crazysim.plugins.sensors import IMU, Barometer, TimeOfFlight
-from crazysim.validate import firmware_filters
 
 
 @pytest.mark.parametrize("kind", ["pressure", "ground"])

@@ -9,9 +9,9 @@ from consistency import assert_chi_squared, errors, normalised
 from crazysim import ConfigError, Plugin, Sim, rotation
 from crazysim.core.random import drone_key
 from crazysim.envs import make
+from crazysim.lab.validate import firmware_filters
 from crazysim.plugins.estimators import Kalman, error_state, updates
 from crazysim.plugins.sensors import IMU, UWB, Barometer, Lighthouse, MotionCapture, OpticalFlow, TimeOfFlight, Triad
-from crazysim.validate import firmware_filters
 
 ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
 

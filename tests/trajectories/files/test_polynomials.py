@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from crazysim.errors import ConfigError
+from crazysim.lab.show_files.show_trajectory import format_trajectory
 from crazysim.trajectories import Trajectory, line
 from crazysim.trajectories.files import (
     load_csv,
@@ -23,7 +24,6 @@ from crazysim.trajectories.files import (
 )
 from crazysim.trajectories.files.csv import POLYNOMIALS
 from crazysim.trajectories.files.pieces import pieces_of
-from crazysim.trajectories.files.show_trajectory import format_trajectory
 
 FIGURE_EIGHT = (
     "1.050000,0.0,-0.0,0.0,-0.0,0.830443,-0.276140,-0.384219,0.180493,-0.0,0.0,-0.0,0.0,-1.356107,0.688430,0.587426,"

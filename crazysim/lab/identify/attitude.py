@@ -1,0 +1,151 @@
+"""Fits of the models ``so_rpy`` to logs with attitude commands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim.drones import Airframe, load_airframe
+from crazysim.dynamics import fitted
+from crazysim.dynamics.models import Dynamics
+from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing
+from crazysim.dynamics.utils.identification import fit_rotation, fit_translation
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.checks import check_turning
+from crazysim.lab.identify.logs import Log
+from crazysim.lab.identify.prediction import PADDING, State, Windows
+from crazysim.pytree import PyTree
+
+UNITS = {
+    "acc_coef": "N", "cmd_f_coef": "1", "thrust_dyn_coef": "1/s", "drag_coefficients": "N s/m",
+    "rpy_coef": "1/s^2", "rpy_rates_coef": "1/s", "cmd_rpy_coef": "1/s^2",
+}  # fmt: skip
+
+
+class FittedModel(PyTree):
+    """Fitted model that predicts a flight from its attitude commands."""
+
+    params: fitted.Params
+    """Parameters of the model."""
+
+    @staticmethod
+    def create(airframe: Airframe, dynamics: str, mass: float | None = None) -> FittedModel:
+        """Return the model of an airframe.
+
+        Args:
+            airframe: Airframe.
+            dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
+            mass: Mass, kg; None for that of the airframe.
+
+        Raises:
+            ConfigError: If the airframe has no fit of that model.
+        """
+        params = fitted.Params.create(airframe, Dynamics(dynamics))
+        return FittedModel(params if mass is None else params.replace(mass=jnp.asarray([mass], jnp.float32)))
+
+    def prepared(self, log: Log) -> Log:
+        """Return the log with attitudes relative to the first 0.1 s, and the lagged thrust as its rotor speeds.
+
+        Raises:
+            ConfigError: If the log has no attitude commands or has gaps.
+        """
+        columns = _columns(log)
+        thrust = columns["cmd_f"]
+        if self.params.thrust_dyn_coef is not None:
+            from scipy.signal import lfilter  # a fifth of a second to import
+
+            decay = np.exp(-float(self.params.thrust_dyn_coef[0]) * log.dt)
+            thrust, _ = lfilter([0.0, 1 - decay], [1.0, -decay], thrust, zi=thrust[:1])
+        return replace(log, quat=preprocessing(columns)["quat"], rotor_vel=thrust[:, None])
+
+    def start(self, window: Windows) -> Array:
+        """Return the lagged thrust at the first sample, N. (1,)"""
+        return window.rotor_vel[PADDING]
+
+    def inputs(self, window: Windows, dt: float) -> Array:
+        """Return the commands, held from sample to sample. (n - 1, 3, 4)
+
+        Raises:
+            ConfigError: If the window has no commands.
+        """
+        del dt  # an argument of every predictor
+        cmd = window.attitude_command
+        if cmd is None:
+            raise ConfigError("expected windows with attitude commands, got none. Cut them from prepared logs.")
+        return jnp.repeat(cmd[:-1, None], 3, axis=1)
+
+    def derivative(self, state: State, inputs: Array) -> State:
+        """Return the time derivatives of a state under a command."""
+        pos, quat, vel, ang_vel, thrust = state
+        _, acc, ang_acc, rate = fitted.dynamics(pos, quat, vel, ang_vel, inputs, thrust, params=self.params)
+        return vel, ang_vel, acc, ang_acc, rate
+
+
+def _columns(log: Log) -> dict[str, NDArray]:
+    """Return a log under Crazyflow's names.
+
+    Raises:
+        ConfigError: If the log has no attitude commands or has gaps.
+    """
+    cmd = log.attitude_command
+    if cmd is None:
+        raise ConfigError(
+            f"{log.name}: expected attitude commands, got none. Name roll, pitch, yaw and thrust as attitude_command."
+        )
+    if len(log.gaps):
+        ends = np.array([0, *log.gaps, len(log.t)])
+        longest = int(np.argmax(log.t[ends[1:] - 1] - log.t[ends[:-1]]))
+        first, last = log.t[ends[longest]], log.t[ends[longest + 1] - 1]
+        raise ConfigError(
+            f"{log.name}: expected no gaps, got {len(log.gaps)}. Cut the log: its longest piece without gaps is "
+            f"from t = {first:.6g} to {last:.6g} s."
+        )
+    return {"time": log.t, "pos": log.pos, "quat": log.quat, "cmd_rpy": cmd[:, :3], "cmd_f": cmd[:, 3]}
+
+
+def identify_attitude(
+    logs: Sequence[Log], airframe: str | Path, dynamics: str, source: str, *, mass: float | None = None
+) -> tuple[Airframe, str]:
+    """Return an airframe with a fitted model of logs with attitude commands, and its TOML file.
+
+    Args:
+        logs: Logs with ``attitude_command`` that begin in hover, without gaps.
+        airframe: Name or path of the airframe to start from.
+        dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
+        source: Description of the logs, with date.
+        mass: Mass in the flights, kg; None for that of the airframe.
+
+    Raises:
+        ConfigError: If a log has no attitude commands or has gaps, or the fit is no airframe.
+    """
+    base = load_airframe(airframe)
+    known = float(base.value("rigid_body.mass"))
+    weight = known if mass is None else float(mass)
+    check_turning(logs)
+    data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
+    force, force_spread = fit_translation(dynamics, weight, data)
+    turn, turn_spread = fit_rotation(data)
+    table: dict[str, float | list[float]] = {"acc_coef": 0.0, "cmd_f_coef": force["cmd_f_coef"]}
+    if "thrust_dyn_coef" in force:
+        table["thrust_dyn_coef"] = force["thrust_dyn_coef"]
+    if "drag_xy_coef" in force:
+        table["drag_coefficients"] = [force["drag_xy_coef"], force["drag_xy_coef"], force["drag_z_coef"]]
+    table |= {name: x.tolist() for name, x in turn.items()}
+    tables: dict = {"name": f"{base.name}_identified", "base": str(airframe), "fitted": {dynamics: table}}
+    lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
+    if weight != known:
+        tables["rigid_body"] = {"mass": weight}
+        lines += ["", "[rigid_body]", f'mass = {{ value = {weight}, unit = "kg", source = "flights" }}']
+    lines += ["", f"[fitted.{dynamics}]"]
+    lines += [f'{k} = {{ value = {x}, unit = "{UNITS[k]}", source = "flights" }}' for k, x in table.items()]
+    lines += ["", "# Standard deviations:"]
+    lines += [f"# {name}: {x:.2g}" for name, x in force_spread.items()]
+    lines += [f"# {name}: {', '.join(f'{v:.2g}' for v in x)}" for name, x in turn_spread.items()]
+    return load_airframe(tables), "\n".join(lines) + "\n"

@@ -1,0 +1,208 @@
+"""ROS bags as tables of columns at equal times."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.dynamics.rotor import RPM_TO_RAD_S
+from crazysim.errors import ConfigError, not_installed
+from crazysim.lab.identify.columns import Columns, plausible
+from crazysim.lab.identify.readers import Stream, at_equal_times
+from crazysim.storage import read_text
+
+XYZ, XYZW = "xyz", "xyzw"
+POSES = {
+    "nav_msgs/msg/Odometry": ("pose/pose/position", "pose/pose/orientation"),
+    "geometry_msgs/msg/PoseStamped": ("pose/position", "pose/orientation"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose/pose/position", "pose/pose/orientation"),
+    "geometry_msgs/msg/TransformStamped": ("transform/translation", "transform/rotation"),
+    "geometry_msgs/msg/Pose": ("position", "orientation"),
+}
+"""Fields of position and attitude by type of message, most informative first."""
+ROTORS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
+"""Fields of rotor speeds, rad/s, by type of message."""
+
+MAX_METADATA = 2**24
+"""Largest ``metadata.yaml``, bytes."""
+
+
+class _BagFile(io.BufferedReader):
+    """File whose ``read`` allocates no more bytes than are left, whatever size a damaged record states."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return at most ``size`` bytes; all that are left by default."""
+        if size is None or size < 0:
+            return super().read()
+        return super().read(min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0)))
+
+
+class _BagPath(type(Path())):
+    """Path whose files are read within bounds."""
+
+    def open(self, *args: Any, **kwargs: Any) -> Any:
+        """Open the file for reading."""
+        del args, kwargs
+        return _BagFile(io.FileIO(self))
+
+    def read_text(self, *args: Any, **kwargs: Any) -> str:
+        """Return the text of ``metadata.yaml``, in UTF-8 whatever the locale."""
+        del args, kwargs
+        return read_text(self, MAX_METADATA)
+
+
+def is_bag(path: Path) -> bool:
+    """Return True for a file or folder of a ROS bag."""
+    return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
+    """Return the columns of a bag of ROS 1 or 2, interpolated at the times of the fastest topic.
+
+    A name such as ``/drone/odom/pose/pose/position/x`` or ``/motors/data[0]`` is a topic and a field of its messages.
+    Without such names, the columns are those of crazysim's logs: position and attitude of the only topic of a type in
+    ``POSES``; the twist of Odometry, which is in the frame of the body (nav_msgs/Odometry), with the velocity
+    turned to the world; the angular velocity of the only Imu, which precedes; and rotor speeds of the only Actuators,
+    rad/s (actuator_msgs, mav_msgs). Units are SI (REP 103). Times are those of headers, or else of the bag.
+
+    Args:
+        path: File ``.bag``, ``.mcap`` or ``.db3``, or folder with ``metadata.yaml``.
+        repairs: List that descriptions of repairs are appended to.
+        wanted: Names of the columns.
+
+    Raises:
+        ConfigError: If a topic or a field is missing, or topics are ambiguous.
+        ImportError: If rosbags is not installed.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(not_installed("ROS bags need", "rosbags", "logs")) from error
+    names = [] if wanted is None else [x for x in wanted.names if "/" in x]
+    folder = path.parent if path.suffix in (".mcap", ".db3") and (path.parent / "metadata.yaml").is_file() else path
+    with AnyReader([_BagPath(folder)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        topics = {c.topic: c.msgtype for c in bag.connections}
+        if names:
+            columns = {name: _split(path.name, name, topics) for name in names}
+        else:
+            columns = _default(path.name, topics)
+        streams: dict[str, Stream] = {}
+        for topic in {topic for topic, _ in columns.values()}:
+            fields = {name: field for name, (other, field) in columns.items() if other == topic}
+            streams[topic] = _stream(path.name, bag, topic, topics[topic], fields)
+    if not names:
+        streams = {topic: _turned(stream) for topic, stream in streams.items()}
+    return at_equal_times(path.name, streams, repairs, wanted if names else None)
+
+
+def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
+    """Return topic and field of a column."""
+    fitting = [topic for topic in topics if column.startswith(f"{topic}/")]
+    if not fitting:
+        known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+        raise ConfigError(
+            f"{name}: expected a topic and a field, such as /odom/pose/pose/position/x, got {column!r}. "
+            f"The bag has {known}."
+        )
+    topic = max(fitting, key=len)
+    return topic, column[len(topic) + 1 :]
+
+
+def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
+    """Return topics and fields of the columns that follow from the types of messages."""
+
+    def only(kinds: Sequence[str]) -> tuple[str, str] | None:
+        for kind in kinds:
+            found = sorted(topic for topic, other in topics.items() if other == kind)
+            if len(found) > 1:
+                raise ConfigError(
+                    f"{name}: expected one topic of {kind}, got {', '.join(found)}. "
+                    f"Name the columns, such as pos={found[0]}/..."
+                )
+            if found:
+                return found[0], kind
+        return None
+
+    known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+    columns = {}
+    pose, imu, rotors = only(list(POSES)), only(["sensor_msgs/msg/Imu"]), only(list(ROTORS))
+    if pose is None:
+        raise ConfigError(
+            f"{name}: expected a topic of {', '.join(POSES)}, got {known}. Name the columns, such as "
+            "pos=/topic/x,/topic/y,/topic/z."
+        )
+    topic, kind = pose
+    place, turn = POSES[kind]
+    columns |= {axis: (topic, f"{place}/{axis}") for axis in XYZ}
+    columns |= {f"q{axis}": (topic, f"{turn}/{axis}") for axis in XYZW}
+    if kind == "nav_msgs/msg/Odometry":
+        columns |= {f"v{axis}": (topic, f"twist/twist/linear/{axis}") for axis in XYZ}
+        columns |= {f"w{axis}": (topic, f"twist/twist/angular/{axis}") for axis in XYZ}
+    if imu is not None:
+        columns |= {f"w{axis}": (imu[0], f"angular_velocity/{axis}") for axis in XYZ}
+    if rotors is not None:
+        columns["rpm"] = (rotors[0], ROTORS[rotors[1]])
+    return columns
+
+
+def _stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) -> Stream:
+    """Return the messages of a topic."""
+    get = {column: _getter(field) for column, field in fields.items()}
+    times, rows = [], []
+    for connection, stamp, raw in bag.messages([c for c in bag.connections if c.topic == topic]):
+        message = bag.deserialize(raw, connection.msgtype)
+        header = getattr(message, "header", None)
+        at = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
+        times.append(at or 1e-9 * stamp)
+        try:
+            rows.append([get[column](message) for column in fields])
+        except (AttributeError, IndexError, TypeError) as error:
+            raise ConfigError(
+                f"{name}: expected fields {', '.join(fields.values())} of {topic} ({kind}), got {error}. "
+                f"ros2 interface show {kind} lists its fields."
+            ) from error
+    if not rows:
+        raise ConfigError(f"{name}: expected messages of {topic}, got none. Record it while the drone flies.")
+    columns: dict[str, NDArray] = {}
+    for column, values in zip(fields, zip(*rows, strict=True), strict=True):
+        x = plausible(np.array(values, np.float64))
+        if column == "rpm":
+            columns |= {f"rpm{k + 1}": np.abs(c) / RPM_TO_RAD_S for k, c in enumerate(x.T)}
+        elif x.ndim == 1:
+            columns[column] = x
+        else:
+            raise ConfigError(f"{name}: expected a number in {topic}/{fields[column]}, got {x.shape[1]}. Add [0].")
+    return Stream(np.array(times), columns)
+
+
+def _getter(field: str) -> Callable[[Any], Any]:
+    """Return the function that reads a field, such as ``pose/position/x`` or ``data[0]``."""
+    parts = re.findall(r"[^/\[\]]+", field)
+
+    def get(message: Any) -> Any:
+        for part in parts:
+            message = message[int(part)] if part.isdigit() else attrgetter(part)(message)
+        return message
+
+    return get
+
+
+def _turned(stream: Stream) -> Stream:
+    """Return the stream with velocities turned from the body to the world, where it has them."""
+    c = stream.columns
+    if "vx" not in c:
+        return stream
+    q, v = np.stack([c[f"q{k}"] for k in XYZW], -1), np.stack([c[f"v{k}"] for k in XYZ], -1)
+    world = np.asarray(rotation.rotate(jnp.asarray(q), jnp.asarray(v)), np.float64)
+    return Stream(stream.t, c | dict(zip(("vx", "vy", "vz"), world.T, strict=True)))

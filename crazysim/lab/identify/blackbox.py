@@ -1,0 +1,103 @@
+"""Logs of Betaflight's blackbox, as CSV files of blackbox_decode or of the Blackbox Explorer."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.columns import plausible
+from crazysim.lab.identify.delimited import number, rows_of
+from crazysim.lab.identify.readers import decimated
+
+POLES = 14
+"""Magnetic poles of the motors where the file does not state ``motor_poles``: Betaflight's default."""
+HEADER_WITHIN = 1000
+"""Lines within which the names of the columns stand, after the settings that the Blackbox Explorer writes first."""
+
+
+def header_of(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
+    """Return number and cells of the line that names the columns, and the settings before it; None for other files."""
+    settings: dict[str, str] = {}
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for at, line in zip(range(HEADER_WITHIN), file, strict=False):
+            cells = [x.strip().strip('"') for x in line.split(",")]
+            if any(x.startswith("time") for x in cells) and any(x.startswith("gyroADC[") for x in cells):
+                return at, cells, settings
+            settings[cells[0]] = cells[-1]
+    return None
+
+
+def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
+    """Return the columns of a blackbox log in the names of crazysim's logs, at 250 Hz at most.
+
+    ``wx``, ``wy``, ``wz``, body axes forward, left, up; ``rpm1`` to ``rpmN`` where bidirectional DSHOT was on, in
+    Betaflight's order; ``command1`` to ``commandN``, the outputs to the motors; ``voltage``; and ``qx`` to ``qw`` where
+    the log has ``imuQuaternion``. Position and velocity are not in such logs.
+
+    Units are those of the Blackbox Explorer (betaflight/blackbox-log-viewer, flightlog_fields_presenter.js): degrees/s
+    for ``gyroADC``, ten times as much with ``blackbox_high_resolution``; 100 electrical rpm for ``eRPM``; 0.01 V for
+    ``vbatLatest``, and V where blackbox_decode names the unit; microseconds for the time. Axes follow from Betaflight's
+    src/main/flight/imu.c, whose yaw is negative where the rotation about body z is positive.
+
+    Args:
+        path: File.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If columns are missing, or most rows are damaged.
+    """
+    found = header_of(path)
+    if found is None:
+        raise ConfigError(
+            f"{path.name}: expected columns time and gyroADC[0] in the first {HEADER_WITHIN} lines, got none. "
+            "Convert the log with blackbox_decode or the Blackbox Explorer."
+        )
+    start, names, settings = found
+    unit = {}
+    for name in names:
+        key, _, rest = name.partition(" (")
+        unit[key] = rest.rstrip(")")
+    keys = list(unit)
+    if len(keys) != len(names):
+        raise ConfigError(f"{path.name}: expected columns of different names, got some twice. Export the log again.")
+    wanted = [
+        key for key in keys if key in ("time", "vbatLatest") or key.startswith(("gyroADC", "motor[", "eRPM[", "imuQua"))
+    ]
+    n_rotors = sum(key.startswith("motor[") for key in keys)
+    needed = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
+    if "imuQuaternion[0]" in keys:
+        needed += ["imuQuaternion[1]", "imuQuaternion[2]"]
+    missing = [key for key in needed if key not in keys]
+    if missing:
+        raise ConfigError(
+            f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)[:300]}. "
+            "Log these fields in Betaflight."
+        )
+    with path.open(encoding="utf-8", errors="replace") as file:
+        lines = [*file][start + 1 :]
+    cells = rows_of(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
+    at = [keys.index(key) for key in wanted]
+    rows = [[number(row[k]) for k in at] for row in cells]
+    data = dict(zip(wanted, plausible(np.array(rows)).T, strict=True))
+
+    high = 10.0 if number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
+    per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)
+    poles = number(settings.get("motor_poles", str(POLES)))
+    if not 2 <= poles < math.inf:
+        raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
+    table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}
+    table |= {f"w{axis}": per_unit * data[f"gyroADC[{k}]"] for k, axis in enumerate("xyz")}
+    table |= {f"command{k + 1}": data[f"motor[{k}]"] for k in range(n_rotors)}
+    rotors = [k for k in range(n_rotors) if f"eRPM[{k}]" in data]
+    table |= {f"rpm{k + 1}": 200 / poles * data[f"eRPM[{k}]"] for k in rotors}
+    if "vbatLatest" in data:
+        table["voltage"] = data["vbatLatest"] * (1.0 if unit["vbatLatest"] == "V" else 0.01)
+    if "imuQuaternion[0]" in data:
+        vector = np.stack([data[f"imuQuaternion[{k}]"] for k in range(3)]) / 32767
+        scalar = np.sqrt(np.clip(1 - np.sum(vector**2, axis=0), 0, 1))
+        table |= dict(zip(("qx", "qy", "qz", "qw"), [*vector, scalar], strict=True))
+    return decimated(table, repairs)

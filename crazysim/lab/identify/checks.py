@@ -1,0 +1,293 @@
+"""Checks that the columns of a log describe one motion: units, axes, signs and order follow from mechanics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations, product
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.columns import Columns
+from crazysim.lab.identify.motion import body_rates, integral
+
+if TYPE_CHECKING:
+    from crazysim.lab.identify.logs import Log
+
+RATIOS = (0.5, 2.0)
+"""Ratios of measured to expected motion that count as agreement, on each axis that moves. Of the logs of two public
+benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
+"""Units of positions, and with /s of velocities, in m."""
+DIVERGED = 10.0
+"""Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
+TURNING = 0.01
+"""Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
+(BMI088, 0.014 degrees/s over the root of Hz) gives 0.003 rad/s at 250 Hz."""
+STILL = 0.3
+"""Span of the position below which a fault is that of a drone at rest, whose estimator drifts, m."""
+PIECE = 2.0
+"""Duration of the pieces that are left out where a rate has diverged, s."""
+
+
+class Pair(NamedTuple):
+    """Changes over windows of equal duration that must be equal."""
+
+    what: str
+    """Property of the columns that makes them equal."""
+    measured: NDArray
+    """Measured changes. (n, 3)"""
+    expected: NDArray
+    """Changes that follow from other columns. (n, 3)"""
+    floor: float
+    """Change below which an axis does not move, in the unit of the changes."""
+
+    def sizes(self) -> NDArray:
+        """Return medians of both where the expected one is largest, its own sign being positive. (3, 2)"""
+        found = np.zeros((3, 2))
+        for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
+            most = np.abs(y) >= np.quantile(np.abs(y), 0.75)
+            along, size = np.median(x[most] * np.sign(y[most])), np.median(np.abs(y[most]))
+            if max(size, np.median(np.abs(x[most]))) > self.floor:
+                found[k] = (along, size) if size > 0 else (np.inf, 1.0)
+        return found
+
+    def ratios(self) -> NDArray:
+        """Return the ratio of both on each axis, NaN for axes that do not move. (3,)"""
+        along, size = self.sizes().T
+        return np.divide(along, size, out=np.full(3, np.nan), where=size > 0)
+
+    def agrees(self) -> bool:
+        """Return True if the ratios of all axes that move are those of one motion, but for half of the floor."""
+        along, size = self.sizes().T
+        slack = self.floor / 2
+        return bool(np.all((along >= RATIOS[0] * size - slack) & (along <= RATIOS[1] * size + slack)))
+
+
+def check_motion(
+    name: str, t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...], repairs: list[str]
+) -> NDArray:
+    """Return True for the samples whose columns describe one motion. (n,)
+
+    The velocity must move the position, the angular velocity must turn the attitude, the thrust must point up on
+    average, and thrust and gravity must accelerate the drone. Pieces in which a measured rate has diverged, such as
+    that of a gyroscope that failed, are left out.
+
+    Args:
+        name: Name of the log, for messages.
+        t: Time, s. (n,)
+        data: Columns by field of ``Columns``, in the units of a log.
+        derived: Fields that were not measured but differentiated; the attitude, if it was given as angles.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If they do not, with the change of the columns that mends it, if one does.
+    """
+    keep = np.ones(len(t), bool)
+    for pair, width in _rates(t, data, derived):
+        bad = _diverged(pair, round(PIECE / float(np.median(np.diff(t)))))
+        if 0 < np.sum(bad) <= len(bad) / 2:
+            keep[np.flatnonzero(bad)[:, None] + np.arange(width + 1)] = False
+            repairs.append(f"dropped {np.sum(~keep)} samples without {pair.what}, which the others have")
+    t, data = t[keep], {key: x[keep] for key, x in data.items()}
+    laws = _laws(t, data, derived)
+    broken = [k for k, law in enumerate(laws) if law.fault]
+    if not broken:
+        return keep
+    fault = laws[broken[0]].fault
+    span = float(np.max(np.ptp(data["pos"], axis=0)))
+    if span < STILL:
+        raise ConfigError(
+            f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
+            f"{STILL:g} m or more, or give metres_per_unit."
+        )
+    remedy, least = "", len(broken)
+    for words, changed in _alternatives(data, derived):
+        after = _laws(t, changed, derived)
+        # Another law may be broken by another mistake. A factor that makes a motion vanish explains nothing.
+        worse = any((y.fault and not x.fault) or (x.moves and not y.moves) for x, y in zip(laws, after, strict=True))
+        left = sum(bool(law.fault) for law in after)
+        if left < least and not worse and not after[broken[0]].fault:
+            remedy, least = words, left
+            if not left:
+                break
+    if remedy:
+        raise ConfigError(f"{name}: expected {fault}. {remedy}.")
+    raise ConfigError(
+        f"{name}: expected {fault}. Check units, signs and order of the columns: z up, quaternions xyzw and body to "
+        "world, angular velocities in the body frame, rad/s."
+    )
+
+
+def check_turning(logs: Sequence[Log]) -> None:
+    """Check that some log turns about the x and y axes, so that a rotation can be fitted to it.
+
+    Raises:
+        ConfigError: If none does.
+    """
+    rates = np.max([np.std(log.ang_vel[:, :2], axis=0) for log in logs], axis=0, initial=0.0)
+    if np.any(rates < TURNING):
+        raise ConfigError(
+            f"expected a flight that turns about x and y, got body rates whose standard deviations are "
+            f"{rates[0]:.2g} and {rates[1]:.2g} rad/s. Take a log of a flight with changes of direction."
+        )
+
+
+class Law(NamedTuple):
+    """A law of mechanics, in a log."""
+
+    fault: str
+    """Description of what breaks it, empty if nothing does."""
+    moves: bool
+    """True if it is about a motion that the log has."""
+
+
+def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> list[Law]:
+    """Return the laws that the columns must follow."""
+    up, found = float(np.median(_thrust_axis(data["quat"])[:, 2])), "a thrust that points up in most samples, got"
+    laws = [Law("" if up > 0 else f"{found} {up:.2f} as the median of its z component", True)]
+    for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
+        ratios = pair.ratios()
+        shown = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
+        text = f"{pair.what}, got ratios of measured to expected changes of {shown} on x, y, z, where 1 is right"
+        laws.append(Law("" if pair.agrees() else text, not np.all(np.isnan(ratios))))
+    return laws
+
+
+def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
+    """Yield the rates that were measured, beside what they are the rates of, and the samples of a window."""
+    if "vel" not in derived:
+        width, (moved, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
+        yield Pair("a velocity that moves the position", moved, expected, 0.01), width
+    if "ang_vel" not in derived:
+        turned = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
+        turned = np.concatenate([np.zeros((1, 3)), turned])
+        width, (moved, expected) = _changes(t, 0.1, turned, integral(data["ang_vel"], t))
+        yield Pair("an angular velocity that turns the attitude", moved, expected, 0.01), width
+
+
+def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
+    """Return changes of the acceleration beside those that follow from attitude, rotor speeds and gravity.
+
+    The thrust over the mass is proportional to the squares of the speeds, with the weight as its median along z;
+    without speeds it balances the weight. Changes between windows leave out what is
+    constant, such as the drag of a cruise.
+    """
+    axis = _thrust_axis(data["quat"])
+    if data["rotor_vel"].shape[1]:
+        squares = np.sum(data["rotor_vel"] ** 2, axis=1)
+        middle = float(np.median(squares * axis[:, 2]))
+        thrust = GRAVITY_MAGNITUDE * squares / middle if middle > 0 else np.zeros(len(t))
+        flying = squares > np.median(squares) / 2
+    else:
+        thrust, flying = GRAVITY_MAGNITUDE / np.maximum(axis[:, 2], 0.3), np.ones(len(t), bool)
+    expected = integral(thrust[:, None] * axis - [0, 0, GRAVITY_MAGNITUDE], t)
+    ground = np.cumsum(~flying)[:, None] * np.ones(3)
+    width, (measured, expected, ground) = _changes(t, 0.25, data["vel"], expected, ground)
+    air = (ground[width:, 0] == 0) & (ground[:-width, 0] == 0)
+    if not np.any(air):
+        return Pair("", np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
+    measured, expected = ((x[width:] - x[:-width])[air] for x in (measured, expected))
+    if not data["rotor_vel"].shape[1]:
+        measured = measured * [1, 1, 0]  # Nothing is expected of z without speeds.
+    return Pair("accelerations that follow from thrust and gravity", measured, expected, 0.1)
+
+
+def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
+    """Return the samples of a window, and the changes of series over all windows; zero for those that cross a gap."""
+    dt = float(np.median(np.diff(t)))
+    width = min(max(1, round(duration / dt)), len(t) - 1)
+    whole = t[width:] - t[:-width] < 1.5 * width * dt
+    return width, [(x[width:] - x[:-width]) * whole[:, None] for x in series]
+
+
+def _diverged(pair: Pair, size: int) -> NDArray:
+    """Return True for the windows of pieces in which the error exceeds ten times the motion. (n,)"""
+    motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
+    typical, bad = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
+    for k in range(0, len(motion), size):
+        part = slice(k, k + size)
+        bad[part] = np.median(error[part]) > DIVERGED * max(typical, float(np.median(motion[part])))
+    return bad
+
+
+def _thrust_axis(quat: NDArray) -> NDArray:
+    """Return the z axis of the body in the world. (n, 3)"""
+    x, y, z, w = quat.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+
+
+def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
+    """Yield columns as they would be if a common mistake were mended, with the change that mends it."""
+
+    def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
+        return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
+
+    for (unit, x), (other, y) in product(UNITS.items(), repeat=2):
+        if "vel" in derived and x != y:
+            continue
+        if y == 1 or "vel" in derived:
+            words = f"The position seems to be in {unit}: give metres_per_unit={x:g}"
+        elif x == 1:
+            words = f"The velocity seems to be in {other}/s: give speed_per_unit={y:g}"
+        else:
+            factors = f"metres_per_unit={x:g} and speed_per_unit={y:g}"
+            words = f"Position and velocity seem to be in {unit} and {other}/s: give {factors}"
+        if (x, y) != (1, 1):
+            yield words, scaled(pos=x, vel=y)
+    degrees = math.pi / 180
+    yield (
+        f"The angular velocity seems to be in degrees per second: give rad_per_unit={degrees:.6g}",
+        scaled(ang_vel=degrees),
+    )
+    if "quat" in derived:
+        angles = np.asarray(rotation.to_rpy(jnp.asarray(data["quat"])))
+        for signs, x in product(product((1, -1), repeat=3), (1.0, degrees)):
+            names = ",".join(
+                ("-" if s < 0 else "") + key for s, key in zip(signs, ("roll", "pitch", "yaw"), strict=True)
+            )
+            turned = np.asarray(rotation.from_rpy(jnp.asarray(angles * np.array(signs))), np.float64)
+            also = "" if x == 1 else f", and the angular velocity in degrees per second: give rad_per_unit={x:.6g}"
+            yield (
+                f"The angles seem to be rpy={names}, with names of your columns{also}",
+                {**scaled(ang_vel=x), "quat": turned},
+            )
+    else:
+        first, inverse = data["quat"][:, [1, 2, 3, 0]], (-1, -1, -1, 1)
+        yield (
+            "The quaternions seem to be in the order w, x, y, z: name them in the order x, y, z, w",
+            {**data, "quat": first},
+        )
+        yield "The quaternions seem to be world to body: give the signs quat=-qx,-qy,-qz,qw", scaled(quat=inverse)
+        yield (
+            "The quaternions seem to be in the order w, x, y, z and world to body: give quat=-qx,-qy,-qz,qw",
+            {**data, "quat": first * np.array(inverse)},
+        )
+    down = (1, -1, -1)
+    yield (
+        "z seems to point down, in world and body: give the signs pos=x,-y,-z vel=vx,-vy,-vz quat=qx,-qy,-qz,qw "
+        "ang_vel=wx,-wy,-wz",
+        scaled(pos=down, vel=down, quat=(*down, 1), ang_vel=down),
+    )
+    yield "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz", scaled(pos=(1, 1, -1), vel=(1, 1, -1))
+    for key, word, unit, given in (
+        ("vel", "velocity", 1.0, ""),
+        ("ang_vel", "angular velocity", 1.0, ""),
+        ("ang_vel", "angular velocity", degrees, f" and rad_per_unit={degrees:.6g}"),
+        ("pos", "position", 1.0, ""),
+    ):
+        if key in derived:
+            continue
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+            fields = getattr(Columns(), key)
+            names = ",".join(("-" if sign < 0 else "") + fields[k] for k, sign in zip(order, signs, strict=True))
+            yield (
+                f"The {word} fits as {key}={names}{given}, with names of your columns",
+                {**data, key: data[key][:, order] * signs * unit},
+            )

@@ -1,0 +1,104 @@
+"""Rows and numbers of text files whose cells are parted by commas."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.repairs import REPAIRABLE
+
+MAX_COLUMNS = 10_000
+"""Most columns of a file."""
+MAX_TEXT = 40
+"""Most characters that are kept of a cell without a number."""
+
+
+def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
+    """Return the columns of a file whose first line names them; a column without numbers stays text.
+
+    Args:
+        path: File.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If the first line has no names, or most rows have another number of cells.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header, *lines = [*file] or [""]
+    if (width := header.count(",") + 1) > MAX_COLUMNS:
+        raise ConfigError(f"{path.name}: expected at most {MAX_COLUMNS} columns, got {width}. Export fewer of them.")
+    names = [x.strip().strip('"') for x in header.split(",")]
+    if len(names) < 2:
+        other = next((word for mark, word in ((";", "semicolons"), ("\t", "tabs")) if mark in header), None)
+        got = f"{other} between them" if other else repr(header.strip()[:40])
+        raise ConfigError(
+            f"{path.name}: expected names of columns in the first line, with commas between them, got {got}. "
+            "Export the log with commas, decimal points and a header."
+        )
+    if not any(math.isnan(number(x)) for x in names):
+        raise ConfigError(
+            f"{path.name}: expected names of columns in the first line, got numbers: {header.strip()[:40]}. "
+            "Add a first line such as t,x,y,z,qx,qy,qz,qw."
+        )
+    if twice := sorted(x for x, n in Counter(names).items() if n > 1):
+        raise ConfigError(f"{path.name}: expected columns of different names, got {twice[0][:60]!r} twice. Rename one.")
+    rows = rows_of(path.name, lines, len(names), 2, repairs, "Export the log again.")
+    return {key: _column(cells) for key, cells in zip(names, zip(*rows, strict=True), strict=True)}
+
+
+def rows_of(
+    name: str, lines: Iterable[str], width: int, first: int, repairs: list[str], remedy: str
+) -> list[list[str]]:
+    """Return the cells of the rows that have as many as the header; a few others are dropped.
+
+    Args:
+        name: Name of the file, for messages.
+        lines: Lines after the header.
+        width: Number of cells.
+        first: Number of the first of these lines in the file, from 1.
+        repairs: List that descriptions of repairs are appended to.
+        remedy: Last sentence of the error.
+
+    Raises:
+        ConfigError: If over 5% of the rows have another number of cells, or no row has that number.
+    """
+    rows, damaged = [], []
+    for at, line in enumerate(lines, first):
+        cells = line.split(",")
+        if len(cells) == width:
+            rows.append(cells)
+        elif line.strip():
+            damaged.append(f"{len(cells)} in line {at}")
+    if len(damaged) > REPAIRABLE * (len(rows) + len(damaged)) or not rows:
+        raise ConfigError(
+            f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and {len(damaged)} "
+            f"others{f', the first with {damaged[0]}' if damaged else ''}. {remedy}"
+        )
+    if damaged:
+        repairs.append(f"dropped {len(damaged)} rows that have another number of cells, the first {damaged[0]}")
+    return rows
+
+
+def number(text: str) -> float:
+    """Return the number in a cell, NaN if it has none."""
+    try:
+        return float(text.strip().strip('"'))
+    except ValueError:
+        return math.nan
+
+
+def _column(cells: Sequence[str]) -> NDArray:
+    """Return numbers, NaN where a cell has none; the text if most cells have none."""
+    try:
+        return np.array(cells, np.float64)
+    except ValueError:
+        values = np.array([number(x) for x in cells])
+        return (
+            values if 2 * np.sum(np.isfinite(values)) > len(values) else np.array([x.strip()[:MAX_TEXT] for x in cells])
+        )

@@ -1,0 +1,403 @@
+"""Fits of an airframe's parameters to logs."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.drones import Airframe, load_airframe
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.checks import check_turning
+from crazysim.lab.identify.logs import Log
+from crazysim.lab.identify.motion import integral
+from crazysim.lab.identify.motors import motor_lag, with_speeds
+from crazysim.lab.identify.prediction import Model, windows
+from crazysim.lab.identify.rotation import BLOCK, FEWEST, SAMPLING, aligned, enlarged, fast_rotation, median
+from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
+from crazysim.rotation import rotate, rotate_inverse
+
+DURATION = 0.5
+"""Duration of the windows over which forces and torques change the velocities, s."""
+SLOW_CORNER = 0.2
+"""Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
+samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples, whose cause is unknown."""
+LARGEST = 10.0
+"""Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
+checked, a thrust factor stays below 2.5 squared times that of the mass."""
+LEAST = {"rotor inertia": 0.0}
+"""Factors that may be smaller: flights that hardly yaw do not show the inertia of the rotors."""
+
+
+FACTORS = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
+"""Factors of the airframe's curves and moments."""
+FORCES = (
+    "thrust factor", "drag x", "drag y", "drag z", "quadratic drag x", "quadratic drag y", "quadratic drag z",
+)  # fmt: skip
+"""Parameters of the force: a factor, and coefficients in N s/m and N s^2/m^2."""
+TORQUES = (
+    "centre of mass x", "centre of mass y", "torque z", *(f"torque {a} per velocity {b}" for a in "xyz" for b in "xyz"),
+)  # fmt: skip
+"""Parameters of the torque, m, N m and N s."""
+UNITS = dict(
+    zip((*FORCES, *TORQUES), ("", *["N s/m"] * 3, *["N s^2/m^2"] * 3, "m", "m", "N m", *["N s"] * 9), strict=True)
+)
+"""Units of these parameters; empty for factors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Result of ``identify``."""
+
+    base: str
+    """Name or path of the airframe that the fit began with."""
+    airframe: Airframe
+    """Airframe with the identified numbers."""
+    model: Model
+    """Model of that airframe, with its residual."""
+    values: dict[str, float]
+    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, of logs with
+    commands and measured speeds."""
+    deviations: dict[str, float]
+    """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged where these are few, so
+    that three of them contain the truth in 99% of the fits; NaN of fewer than three blocks."""
+    delays: dict[str, float]
+    """Delay of the state behind the rotor speeds in each log, by its name, s."""
+    changes: dict[str, NDArray]
+    """Numbers that differ from the base airframe, by dotted path."""
+
+    def with_residual(self, residual: ResidualData) -> Identification:
+        """Return the result with another residual, such as one from ``fit_residual``."""
+        changes = {key: x for key, x in self.changes.items() if not key.startswith("residual.")}
+        for key in ("linear", "hidden", "output"):
+            if (x := getattr(residual, key)) is not None:
+                changes[f"residual.{key}"] = np.asarray(x, np.float64)
+        airframe = load_airframe(_nested(self.base, self.airframe.name.removesuffix("_identified"), changes))
+        return replace(self, airframe=airframe, model=Model.create(airframe), changes=changes)
+
+    def describe(self) -> list[str]:
+        """Return a line for each parameter: name, value, standard deviation and unit."""
+        units = UNITS | {"motor lag": "1/s"}
+        spreads = {key: "unknown" if math.isnan(x) else f"{x:.2g}" for key, x in self.deviations.items()}
+        return [f"{key:26}{x:10.4g} +- {spreads[key]} {units.get(key, '')}".rstrip() for key, x in self.values.items()]
+
+    @property
+    def doubtful(self) -> list[str]:
+        """Names of factors below 1/3 or above 3: the fit predicts with them, but they are hardly those of the body."""
+        return [name for name in FACTORS if not 1 / 3 < self.values[name] < 3]
+
+    def toml(self, source: str) -> str:
+        """Return the airframe as a TOML file that names its base.
+
+        Args:
+            source: Description of the logs, with date.
+        """
+        units = {
+            "rigid_body.mass": "kg", "rigid_body.inertia": "kg m^2", "rotors.position": "m",
+            "rotors.thrust_curve": "N, N/rpm, N/rpm^2", "rotors.torque_curve": "N m, N m/rpm, N m/rpm^2",
+            "rotors.inertia": "kg m^2", "rotors.lag": "1/s, 1/(s rpm), twice",
+            "drag.coefficients": "N s/m", "controller.thrust2torque": "m",
+            "residual.linear": "N and N m per input", "residual.hidden": "1 per input", "residual.output": "N and N m",
+        }  # fmt: skip
+        lines = [f"base = {json.dumps(self.base)}", "", "[sources]", f"flights = {json.dumps(source)}"]
+        if self.doubtful:
+            lines.insert(0, f"# Doubtful, more than three times from the base: {', '.join(self.doubtful)}.")
+        table = ""
+        for path, value in sorted(self.changes.items(), key=lambda x: x[0].rpartition(".")[0]):
+            owner, _, key = path.rpartition(".")
+            if owner != table:
+                table = owner
+                lines += ["", f"[{table}]"]
+            text = [float(f"{x:.6g}") for x in value.ravel()]
+            numbers = np.reshape(text, value.shape).tolist()
+            lines.append(f'{key} = {{ value = {numbers}, unit = "{units[path]}", source = "flights" }}')
+        lines += ["", "# Every parameter with its standard deviation."]
+        lines += [f"# {line}" for line in self.describe()]
+        return "\n".join(lines) + "\n"
+
+
+def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: float | None = None) -> Identification:
+    """Fit the parameters of an airframe to logs with rotor speeds, measured or from ``with_speeds``.
+
+    Three linear regressions: of the changes of velocity over 0.5 s on thrust and drag, turned by the measured attitude;
+    of fast rotation on the torques of the rotors (``fast_rotation``); and of the changes of angular velocity over
+    0.5 s on the other torques. The mass is not observable from the motion, so it is a given number.
+
+    Args:
+        logs: Logs of the same sample time.
+        airframe: Name or path of the airframe to start from.
+        mass: Mass in the flights, kg; None for that of the airframe.
+
+    Raises:
+        ConfigError: If the mass is not positive, if sample times, lengths or rotors of the logs do not fit, or if a
+            factor is below 1/10 or above 10.
+    """
+    base = load_airframe(airframe)
+    if mass is not None and not 0 < mass < np.inf:
+        raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
+    logs = [with_speeds(log, base) for log in logs]
+    _check(logs, base)
+    windows(logs, DURATION, DURATION)
+    check_turning(logs)
+    if base.n_rotors <= 4:
+        _check_order(logs, base)
+    weight = float(base.value("rigid_body.mass")) if mass is None else float(mass)
+    params = Model.create(base, weight).params
+    fast = fast_rotation(logs, params, float(_forces(logs, params)[0][0]))
+    logs = [aligned(log, delay) for log, delay in zip(logs, fast.delays, strict=True)]
+    force, force_spread = _forces(logs, params)
+    force_spread[0] = math.hypot(force_spread[0], SAMPLING * force[0])
+    torque, torque_spread = _torques(logs, params, float(force[0]), fast.values)
+    late = [aligned(log, SLOW_CORNER * log.dt) for log in logs]
+    torque_spread = np.hypot(torque_spread, _torques(late, params, float(force[0]), fast.values)[0] - torque)
+    for k, step in enumerate(fast.deviations):
+        if math.isfinite(step):
+            other = _torques(logs, params, float(force[0]), fast.values + step * (np.arange(5) == k))[0]
+            torque_spread = np.hypot(torque_spread, other - torque)
+
+    def named(force: NDArray, torque: NDArray, fast: NDArray) -> dict[str, float]:
+        numbers = [*force, *torque, *fast]
+        return dict(zip((*FORCES, *TORQUES, *FACTORS[1:]), map(float, numbers), strict=True))
+
+    values = named(force, torque, fast.values)
+    deviations = named(force_spread, torque_spread, fast.deviations)
+    if wrong := [
+        f"{name} {values[name]:.3g}" for name in FACTORS if not LEAST.get(name, 1 / LARGEST) <= values[name] <= LARGEST
+    ]:
+        raise ConfigError(
+            f"expected factors from {1 / LARGEST:g} to {LARGEST:g}, got {', '.join(wrong)}, which no body that flies "
+            f"like {base.name!r} explains. Check its mass and the logs, add flights that turn and climb more, or start "
+            "from an airframe file nearer to the drone (--airframe)."
+        )
+    changes = _changes(base, weight, values)
+    rates = motor_lag(logs)
+    if 2 * np.sum(np.isfinite(rates)) > rates.size:
+        rates = rates[np.isfinite(rates)]
+        values["motor lag"], deviations["motor lag"] = median(rates, np.ones(len(rates)))
+        changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
+    try:
+        identified = load_airframe(_nested(str(airframe), base.name, changes))
+    except ConfigError as error:
+        raise ConfigError(f"the fit is no airframe: {error} Add flights that turn and climb more.") from error
+    return Identification(
+        base=str(airframe),
+        airframe=identified,
+        model=Model.create(identified),
+        values=values,
+        deviations=deviations,
+        delays=dict(zip([log.name for log in logs], fast.delays.tolist(), strict=True)),
+        changes=changes,
+    )
+
+
+def _forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArray, NDArray]:
+    """Return the parameters of the force, see ``FORCES``, and their deviations."""
+    mass, gravity = float(params.mass[0]), np.asarray(params.gravity_vec, np.float64)
+
+    def terms(log: Log) -> tuple[NDArray, NDArray]:
+        thrust = np.asarray(curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64)
+        vel, speed = _body(log, log.vel), np.linalg.norm(log.vel, axis=-1, keepdims=True)
+        axes = np.eye(3)
+        body = [thrust.sum(-1, keepdims=True) * axes[2]]
+        body += [(x[:, k : k + 1] * axes[k]) for x in (vel, vel * speed) for k in range(3)]
+        world = np.stack([np.asarray(rotate(jnp.asarray(log.quat), jnp.asarray(x))) for x in body], axis=-1)
+        return world, mass * (log.vel - gravity * log.t[:, None])
+
+    return _regressed(logs, terms, np.arange(7) > 0)
+
+
+def _torques(
+    logs: Sequence[Log], params: first_principles.Params, thrust_factor: float, fast: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return the parameters of the torque, see ``TORQUES``, and their deviations."""
+    mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
+    root = np.sqrt(fast[:3])
+    inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
+    rotor_inertia = fast[4] * RPM_TO_RAD_S * np.asarray(params.prop_inertia, np.float64)
+
+    def terms(log: Log) -> tuple[NDArray, NDArray]:
+        speed = jnp.asarray(log.rotor_vel)
+        thrust = thrust_factor * np.asarray(curve(speed, params.rpm2thrust), np.float64)
+        drag = fast[3] * np.asarray(curve(speed, params.rpm2torque), np.float64)
+        spin = np.zeros_like(log.ang_vel)
+        spin[:, 2] = -(rotor_inertia * log.rotor_vel) @ mixing[2]
+        momentum = log.ang_vel @ inertia + spin
+        rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
+        # Everything known, integrated, goes to the left side.
+        known = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
+        vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
+        columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
+        columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
+        return np.stack(columns, axis=-1), momentum - known
+
+    return _regressed(logs, terms, np.zeros(len(TORQUES), bool))
+
+
+def _body(log: Log, vector: NDArray) -> NDArray:
+    """Return vectors of the world frame in the body frame. (n, 3)"""
+    return np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(vector)), np.float64)
+
+
+def _regressed(
+    logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], not_positive: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return coefficients by robust linear least squares, and their deviations from the scatter between blocks.
+
+    Args:
+        logs: Logs.
+        terms: From a log to the rate of momentum per coefficient, (n, 3, k), and the momentum, (n, 3).
+        not_positive: True for coefficients that are at most zero. (k,)
+    """
+    rates, changes, blocks = [], [], []
+    for number, log in enumerate(logs):
+        x, momentum = terms(log)
+        total, size = integral(x, log.t), round(DURATION / log.dt)
+        starts = np.arange(0, len(log.t) - size, max(1, size // 5))
+        starts = starts[[not np.any((log.gaps > k) & (log.gaps <= k + size)) for k in starts]]
+        rates.append(total[starts + size] - total[starts])
+        changes.append(momentum[starts + size] - momentum[starts])
+        blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK)
+    x, y, block = np.concatenate(rates), np.concatenate(changes), np.concatenate(blocks)
+    k = x.shape[-1]
+    weights = np.ones(y.shape)
+    found, free = np.zeros(k), np.ones(k, bool)
+    for _ in range(10):
+        normal = np.einsum("wri,wr,wrj->ij", x, weights, x)
+        vector = np.einsum("wri,wr,wr->i", x, weights, y)
+        free = np.ones(k, bool)
+        while True:
+            found = np.zeros(k)
+            found[free] = np.linalg.lstsq(normal[np.ix_(free, free)], vector[free], rcond=None)[0]
+            wrong = not_positive & (found > 0)
+            if not np.any(wrong):
+                break
+            free &= ~wrong
+        rest = y - x @ found
+        scale = 1.4826 * np.median(np.abs(rest), axis=0)  # of a normal distribution with that median
+        weights = 1 / np.maximum(scale, np.abs(rest) / 2) / np.maximum(scale, 1e-30)
+    # Deviations by leaving each block out (jackknife), without bounds, which hide what other coefficients may be.
+    numbers = np.unique(block)
+    if len(numbers) < FEWEST:
+        return found, np.full(k, np.nan)
+    without = []
+    for b in numbers:
+        keep = block != b
+        normal = np.einsum("wri,wr,wrj->ij", x[keep], weights[keep], x[keep])
+        vector = np.einsum("wri,wr,wr->i", x[keep], weights[keep], y[keep])
+        without.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
+    each = np.array(without) - np.mean(without, axis=0)
+    n = len(numbers)
+    return found, enlarged(n) * np.sqrt((n - 1) / n * np.sum(each**2, axis=0))
+
+
+def _smooth(x: NDArray, size: int = 9) -> NDArray:
+    kernel = np.hanning(size + 2)[1:-1]
+    return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
+
+
+def _regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return smoothed accelerations without gravity, angular accelerations, body velocities, and thrusts."""
+    sl = slice(10, -10)
+    acc = np.gradient(_smooth(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
+    ang_acc = np.gradient(_smooth(log.ang_vel), log.t, axis=0)
+    body = np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(np.stack([acc, _smooth(log.vel)]))))
+    thrust = _smooth(np.asarray(curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
+    return body[0][sl], ang_acc[sl], body[1][sl], thrust[sl]
+
+
+def _check(logs: Sequence[Log], airframe: Airframe) -> None:
+    """Check that logs and airframe fit: sample times, number and unit of rotors."""
+    if not logs:
+        raise ConfigError("expected at least one log, got none")
+    params = first_principles.Params.create(airframe)
+    hover = np.broadcast_to(np.asarray(first_principles.hover_rotor_vel(params)).ravel(), airframe.n_rotors)
+    for log in logs:
+        if abs(log.dt - logs[0].dt) > 1e-4:
+            raise ConfigError(
+                f"{log.name}: expected samples every {logs[0].dt:.4g} s as in the first log, got {log.dt:.4g}"
+            )
+        if log.rotor_vel.shape[1] != airframe.n_rotors:
+            raise ConfigError(
+                f"{log.name}: expected measured speeds of {airframe.n_rotors} rotors, got {log.rotor_vel.shape[1]}. "
+                "Name their columns as rotor_vel; or log commands, as shares of the voltage, and the voltage, for an "
+                "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy)."
+            )
+        found = np.median(log.rotor_vel, axis=0)
+        if np.any((found < 0.4 * hover) | (found > 2.5 * hover)):
+            raise ConfigError(
+                f"{log.name}: expected each rotor near {hover.mean():.0f} rpm, as in hover, got medians of "
+                f"{', '.join(f'{x:.0f}' for x in found)}. Correct the column of a rotor that does not turn, or "
+                f"give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole pairs for electrical rpm."
+            )
+
+
+def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
+    """Check that no other order of the rotors explains the angular accelerations much better."""
+    params = first_principles.Params.create(airframe)
+    pieces = [_regressors(log, params) for log in logs]
+    _, ang_acc, vel, thrust = [np.concatenate(x) for x in zip(*pieces, strict=True)]
+    mixing = airframe.mixing_matrix
+
+    def explained(order: tuple[int, ...]) -> float:
+        total = 0.0
+        for axis in range(2):
+            rest = np.c_[vel, np.ones(len(vel))]
+            torque = thrust[:, order] @ mixing[axis]
+            full = np.linalg.lstsq(np.c_[torque, rest], ang_acc[:, axis], rcond=None)[0]
+            alone = np.linalg.lstsq(rest, ang_acc[:, axis], rcond=None)[0]
+            gain = np.var(ang_acc[:, axis] - rest @ alone) - np.var(ang_acc[:, axis] - np.c_[torque, rest] @ full)
+            total += np.sign(full[0]) * gain / np.var(ang_acc[:, axis])
+        return total
+
+    given = tuple(range(airframe.n_rotors))
+    best = max(itertools.permutations(given), key=explained)
+    if explained(best) > explained(given) + 0.2:
+        raise ConfigError(
+            f"expected rotors in the order of airframe {airframe.name!r}; the angular accelerations fit "
+            f"the order {[k + 1 for k in best]} much better ({explained(best):.2f} against {explained(given):.2f}, "
+            "of at most 2). Name the columns of rotor_vel, and of command, in that order."
+        )
+
+
+def _changes(base: Airframe, mass: float, values: dict[str, float]) -> dict[str, NDArray]:
+    """Return the numbers of the identified airframe that differ from its base."""
+    thrust, *moments, torque, rotor = [values[name] for name in FACTORS]
+    root = np.sqrt(moments)
+    inertia = base.inertia * np.outer(root, root)
+    inertia = np.diag(inertia) if np.allclose(inertia, np.diag(np.diag(inertia)), atol=0) else inertia
+    x = np.array([values[name] for name in (*FORCES, *TORQUES)])
+    linear = np.zeros((6, N_INPUTS))
+    linear[range(3), range(4, 7)] = x[4:7]
+    linear[5, 0], linear[3:, 1:4] = x[9], x[10:].reshape(3, 3)
+    changes = {
+        "rigid_body.mass": np.asarray(mass),
+        "rigid_body.inertia": inertia,
+        "rotors.position": base.value("rotors.position") - [x[7], x[8], 0.0],
+        "rotors.thrust_curve": base.value("rotors.thrust_curve") * thrust,
+        "rotors.torque_curve": base.value("rotors.torque_curve") * torque,
+        "rotors.inertia": base.value("rotors.inertia") * rotor,
+        "drag.coefficients": x[1:4],
+        "residual.linear": linear,
+    }
+    if "controller.thrust2torque" in base.values:
+        ratio = base.value("controller.thrust2torque") * torque / thrust
+        changes["controller.thrust2torque"] = np.asarray(ratio)
+    return changes
+
+
+def _nested(base: str, name: str, changes: dict[str, NDArray]) -> dict:
+    """Return the tables of an airframe with a base and changes."""
+    tables: dict = {"name": f"{name}_identified", "base": base}
+    for path, value in changes.items():
+        table, _, key = path.rpartition(".")
+        tables.setdefault(table, {})[key] = value.tolist()
+    return tables

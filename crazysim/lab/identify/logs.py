@@ -1,0 +1,148 @@
+"""Logs of flights: reading, checks, and repairs that are reported."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.identify import motion as capture
+from crazysim.lab.identify.checks import check_motion
+from crazysim.lab.identify.columns import KNOWN, OPTIONAL, Columns, missing, numbered, plain, stacked
+from crazysim.lab.identify.repairs import SHORTEST, airborne, bridged, gaps_of, increasing, without_spikes
+from crazysim.lab.identify.tables import read_table
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One flight, with samples at equal intervals."""
+
+    name: str
+    """Name for messages."""
+    t: NDArray
+    """Time, s. (n,)"""
+    pos: NDArray
+    """Position, world frame, m. (n, 3)"""
+    quat: NDArray
+    """Attitude, body to world, unit, xyzw. (n, 4)"""
+    vel: NDArray
+    """Velocity, world frame, m/s. (n, 3)"""
+    ang_vel: NDArray
+    """Angular velocity, body frame, rad/s. (n, 3)"""
+    rotor_vel: NDArray
+    """Rotor speeds, rpm; of no rotor where the log has none. (n, n_rotors)"""
+    command: NDArray | None = None
+    """Commands of the rotors, in the unit of the log; None if it has none. (n, n_rotors)"""
+    attitude_command: NDArray | None = None
+    """Commanded roll, pitch and yaw, rad, and collective thrust, N; None if the log has none. (n, 4)"""
+    voltage: NDArray | None = None
+    """Voltage of the battery, V; None if the log has none. (n,)"""
+    gaps: NDArray = field(default_factory=lambda: np.zeros(0, int))
+    """Indices of samples that follow a gap. (n_gaps,)"""
+    repairs: tuple[str, ...] = ()
+    """Descriptions of the repairs."""
+    modelled: bool = False
+    """True for rotor speeds that were not measured: see ``with_speeds``."""
+
+    @property
+    def dt(self) -> float:
+        """Interval between samples, s."""
+        return float(np.median(np.diff(self.t)))
+
+
+def read_log(
+    path: str | Path | Mapping[str, NDArray],
+    columns: Columns | str | None = None,
+    motion: str | Path | Mapping[str, NDArray] | None = None,
+    between: tuple[float, float] = (0.0, math.inf),
+) -> Log:
+    """Return the log of a file or of a dict of columns, checked and repaired.
+
+    A file is a table, ``.csv`` or ``.npz``; a Betaflight blackbox log that was converted to ``.csv``; a PX4 ULog,
+    ``.ulg``; a ROS bag, ``.bag``, ``.mcap``, ``.db3`` or a folder; or, with any other ending, a log of a Crazyflie's
+    micro-SD card, whose columns are its log variables.
+
+    Args:
+        path: File, or columns by name.
+        columns: Names of the columns, or a key of ``KNOWN``; by default the first of ``KNOWN`` that the log has.
+        motion: Motion capture of the same flight, whose columns are added to those of the log. Its clock may be another
+            one: it is moved to where the angular velocities agree.
+        between: Start and end of the part that is read, s after the first sample.
+
+    Raises:
+        ConfigError: If columns are missing, or the samples cannot be repaired.
+    """
+    repairs: list[str] = []
+    if isinstance(columns, str):
+        if columns not in KNOWN:
+            raise ConfigError(
+                f"expected columns as one of {', '.join(KNOWN)} or a Columns, got {columns!r}. "
+                "Name the columns in a Columns."
+            )
+        columns = KNOWN[columns]
+    name, table = read_table(path, repairs, columns)
+    if motion is not None:
+        _, other = read_table(motion, repairs, columns)
+        table = capture.joined(name, table, other, columns or KNOWN["crazysim"], repairs)
+    if columns is None:
+        columns = next((c for c in reversed(KNOWN.values()) if not missing(table, c)), KNOWN["crazysim"])
+    columns = numbered(table, columns)
+    if absent := missing(table, columns):
+        slow = "".join(f", and {x}" for x in repairs if x.startswith("left out a slow stream"))
+        raise ConfigError(
+            f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}{slow}. Name them, as in "
+            "--columns time=seconds pos=px,py,pz or a Columns, or give the motion capture of the flight (--motion)."
+        )
+    factors = {
+        "pos": columns.metres_per_unit,
+        "vel": columns.speed_per_unit,
+        "rotor_vel": columns.rpm_per_unit,
+        "ang_vel": columns.rad_per_unit,
+        "command": columns.share_per_command,
+    }
+    data = {}
+    for key in ("pos", "quat", *OPTIONAL):
+        names = getattr(columns, key)
+        if names and plain(names[0]) in table:
+            # With the time, whose length all columns must have.
+            data[key] = stacked(name, table, (columns.time, *names))[:, 1:] * factors.get(key, 1.0)
+    if "attitude_command" in data:
+        data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]
+    t = stacked(name, table, [columns.time])[:, 0]
+    keep = increasing(name, t, repairs)
+    since = t - t[keep][0]
+    keep &= (since >= between[0]) & (since <= between[1])
+    if np.sum(keep) < SHORTEST:
+        raise ConfigError(
+            f"{name}: expected at least {SHORTEST} samples between {between[0]:g} and {between[1]:g} s, got "
+            f"{np.sum(keep)} of a log of {since[np.isfinite(since)].max():.3g} s. Give other times."
+        )
+    t, data = bridged(name, t[keep], {key: x[keep] for key, x in data.items()}, repairs)
+    thrust = np.sum(data["rotor_vel"] ** 2, axis=1) if "rotor_vel" in data else None
+    if thrust is None and "attitude_command" in data:
+        thrust = data["attitude_command"][:, 3]
+    if thrust is not None:
+        keep = airborne(name, t, thrust, repairs)
+        t, data = t[keep], {key: x[keep] for key, x in data.items()}
+    if "rotor_vel" in data:
+        data["rotor_vel"] = without_spikes(name, data["rotor_vel"], repairs)
+    else:
+        data["rotor_vel"] = np.zeros((len(t), 0))
+    derived = tuple(key for key in ("vel", "ang_vel") if key not in data)
+    if "vel" in derived:
+        data["vel"] = capture.velocity_of(t, data["pos"])
+        repairs.append("differentiated the position, since the log has no velocity")
+    if "ang_vel" in derived:
+        data["ang_vel"] = capture.ang_vel_of(t, data["quat"])
+        repairs.append("differentiated the attitude, since the log has no angular velocity")
+    keep = check_motion(name, t, data, (*derived, *(["quat"] if columns.rpy else [])), repairs)
+    t, data = t[keep], {key: x[keep] for key, x in data.items()}
+    if "voltage" in data:
+        data["voltage"] = data["voltage"][:, 0]
+    gaps = gaps_of(name, t, repairs)
+    return Log(name, t, **data, gaps=gaps, repairs=tuple(repairs), modelled=False)

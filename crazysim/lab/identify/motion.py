@@ -1,0 +1,142 @@
+"""Motion capture beside a log of another clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.columns import Columns, plain, stacked
+from crazysim.lab.identify.readers import Stream, at_equal_times
+
+STEP = 0.005
+"""Interval at which angular velocities are compared, s."""
+MAX_SPAN = 100
+"""Longest duration, in steps for each sample."""
+DERIVED_OVER = 0.06
+"""Duration over which positions and attitudes are differentiated, s."""
+
+
+def joined(
+    name: str,
+    table: Mapping[str, NDArray],
+    motion: Mapping[str, NDArray],
+    columns: Columns,
+    repairs: list[str],
+) -> dict[str, NDArray]:
+    """Return a log's columns with those of motion capture that it lacks, on the clock of the log.
+
+    The clocks may differ by any time, which is found where the sizes of the angular velocities of both agree best.
+
+    Args:
+        name: Name of the log, for messages.
+        table: Columns of the log.
+        motion: Columns of the motion capture.
+        columns: Names of the columns in both.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If both do not move alike.
+    """
+    time, quat = columns.time, [plain(x) for x in columns.quat]
+    ang_vel = stacked(name, table, columns.ang_vel, columns.rad_per_unit)
+    missing = [c for c in (time, *quat) if c not in motion]
+    if missing:
+        raise ConfigError(
+            f"{name}: expected columns {', '.join(missing)} in its motion capture, got {', '.join(sorted(motion))}. "
+            "Give the names as time= and quat=."
+        )
+    t, other = (np.asarray(x[time], np.float64) for x in (table, motion))
+    turned = body_rates(other, stacked(name, motion, columns.quat))
+    size = round(DERIVED_OVER / STEP)
+    series = []
+    for at, rates in ((t, ang_vel), ((other[1:] + other[:-1]) / 2, turned)):
+        good = np.isfinite(at) & np.all(np.isfinite(rates), axis=-1)
+        order = np.unique(at[good], return_index=True)[1]
+        span = np.ptp(at[good]) if len(order) > 1 else 0.0
+        if not 0 < span < MAX_SPAN * STEP * len(order):
+            raise ConfigError(
+                f"{name}: expected samples of one flight, got {len(order)} with times and angular velocities, over "
+                f"{span:.3g} s. Cut the log and its motion capture to the flight."
+            )
+        grid = np.arange(at[good].min(), at[good].max(), STEP)
+        speed = np.interp(grid, at[good][order], np.linalg.norm(rates[good][order], axis=-1))
+        series.append((grid[0], np.convolve(speed, np.ones(size) / size, "same")))
+    (first, a), (second, b) = series
+    lag, agreement = _lag(a, b)
+    if agreement < 0.7:
+        raise ConfigError(
+            f"{name}: expected motion capture of the same flight, got angular velocities that agree by "
+            f"{agreement:.2f} of 1 at best. Check that both files are of one flight, that it turns, and quat=."
+        )
+    shift = first - second + lag * STEP
+    repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
+    streams = {
+        "the log": Stream(t, _numbers(table, len(t), (time,))),
+        "motion capture": Stream(other + shift, _numbers(motion, len(other), (time, *table))),
+    }
+    both = at_equal_times(name, streams, repairs, columns)
+    return both | {time: both.pop("t")}
+
+
+def _numbers(table: Mapping[str, NDArray], n: int, without: Sequence[str]) -> dict[str, NDArray]:
+    """Return the columns of n numbers."""
+    columns = {key: np.asarray(x) for key, x in table.items() if key not in without}
+    return {key: x.astype(np.float64) for key, x in columns.items() if x.shape == (n,) and x.dtype.kind in "fiub"}
+
+
+def _lag(a: NDArray, b: NDArray) -> tuple[float, float]:
+    """Return the samples by which b must move to agree with a, and the correlation there, 0 to 1."""
+    n = len(a) + len(b)
+
+    def product(x: NDArray, y: NDArray) -> NDArray:
+        return np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
+
+    one, other = np.ones(len(a)), np.ones(len(b))
+    count = np.round(product(one, other))
+    safe = np.maximum(count, 1)
+    mean_a, mean_b = product(a, other) / safe, product(one, b) / safe
+    covariance = product(a, b) / safe - mean_a * mean_b
+    variance = (product(a * a, other) / safe - mean_a**2) * (product(one, b * b) / safe - mean_b**2)
+    overlap = count >= 0.5 * min(len(a), len(b))
+    agreement = np.where(overlap, covariance / np.sqrt(np.maximum(variance, 1e-12)), -1.0)
+    k = int(np.argmax(agreement))
+    left, middle, right = agreement[k - 1], agreement[k], agreement[(k + 1) % n]
+    bend = left - 2 * middle + right
+    peak = k + (0.5 * (left - right) / bend if bend < 0 else 0.0)
+    return (peak if k < len(a) else peak - n), float(middle)
+
+
+def body_rates(t: NDArray, quat: NDArray) -> NDArray:
+    """Return angular velocities that follow from an attitude over the time, body frame, rad/s. (n - 1, 3)"""
+    (a, aw), (b, bw) = [(q[:, :3], q[:, 3:]) for q in (quat[:-1], quat[1:])]
+    vector, scalar = aw * b - bw * a - np.cross(a, b), aw * bw + np.sum(a * b, axis=-1, keepdims=True)
+    return 2 * vector * np.sign(scalar) / np.diff(t)[:, None]
+
+
+def velocity_of(t: NDArray, pos: NDArray) -> NDArray:
+    """Return the velocity that follows from positions: lines through ``DERIVED_OVER``, m/s. (n, 3)"""
+    half = max(1, round(DERIVED_OVER / float(np.median(np.diff(t))) / 2))
+    padded = np.concatenate([2 * pos[:1] - pos[half:0:-1], pos, 2 * pos[-1:] - pos[-2 : -half - 2 : -1]])
+    times = np.concatenate([2 * t[:1] - t[half:0:-1], t, 2 * t[-1:] - t[-2 : -half - 2 : -1]])
+    weights = np.arange(-half, half + 1)[::-1].astype(float)
+    rate = np.stack([np.convolve(x, weights, "valid") for x in padded.T], axis=-1)
+    return rate / np.convolve(times, weights, "valid")[:, None]
+
+
+def ang_vel_of(t: NDArray, quat: NDArray) -> NDArray:
+    """Return the angular velocity that follows from attitudes, means over ``DERIVED_OVER``, rad/s. (n, 3)"""
+    rates = body_rates(t, quat)
+    rates = np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
+    half = max(1, round(DERIVED_OVER / float(np.median(np.diff(t))) / 4))
+    kernel = np.ones(2 * half + 1) / (2 * half + 1)
+    padded = np.pad(rates, ((half, half), (0, 0)), mode="edge")
+    return np.stack([np.convolve(x, kernel, "valid") for x in padded.T], axis=-1)
+
+
+def integral(x: NDArray, t: NDArray) -> NDArray:
+    """Return the integral over time from the first sample (trapezoidal rule). (n, ...)"""
+    steps = (x[1:] + x[:-1]) / 2 * np.diff(t).reshape(-1, *[1] * (x.ndim - 1))
+    return np.concatenate([np.zeros_like(x[:1]), np.cumsum(steps, axis=0)])

@@ -1,0 +1,136 @@
+"""Motors: rotor speeds that were not measured, from commands and voltage; and the lag of those that were."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.drones import Airframe
+from crazysim.dynamics.rotor import rotor_acceleration
+from crazysim.dynamics.utils.identification import lagged
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.logs import Log
+from crazysim.lab.identify.repairs import REPAIRABLE
+
+SMOOTH = 1.0
+"""Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
+GROUND = 1.0
+"""Duration after the rotors first carry the drone, and before they last do, that is left out, s."""
+SLOWEST, FASTEST = 2.0, 200.0
+"""Rates between which the lag of motors is sought, 1/s."""
+LATEST = 0.04
+"""Largest delay between commands and measured speeds, s."""
+
+
+def with_speeds(log: Log, airframe: Airframe) -> Log:
+    """Return the log with rotor speeds, modelled where they were not measured.
+
+    The voltage at a motor is its command times that of the battery. The airframe's ``battery.thrust_over_voltage``
+    gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays that. Motors and propellers differ by some
+    percent, which would be a torque larger than that of most manoeuvres: each rotor's thrusts are scaled so that all
+    rotors pull equally on average over the flight. So these logs show no centre of mass and no constant torque.
+    What precedes take-off and follows landing is left out.
+
+    Args:
+        log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.
+        airframe: Airframe; without ``battery.thrust_over_voltage`` the log comes back unchanged.
+
+    Raises:
+        ConfigError: If commands are not from 0 to 1.
+    """
+    command, voltage = log.command, log.voltage
+    if log.rotor_vel.shape[1] or command is None or voltage is None or command.shape[1] != airframe.n_rotors:
+        return log
+    if "battery.thrust_over_voltage" not in airframe.values:
+        return log
+    good = (command >= 0) & (command <= 1)
+    if np.sum(~good) > REPAIRABLE * good.size:
+        raise ConfigError(
+            f"{log.name}: expected commands from 0 to 1, shares of the battery's voltage, got {command.min():.4g} to "
+            f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535."
+        )
+    command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, good.T, strict=True)], axis=-1)
+    half = max(1, round(SMOOTH / log.dt / 2))
+    window = np.hanning(2 * half + 3)[1:-1]
+    volts = np.convolve(np.pad(voltage, half, mode="edge"), window / window.sum(), "valid")[:, None] * command
+    thrust = np.maximum(np.polynomial.polynomial.polyval(volts, airframe.value("battery.thrust_over_voltage")), 0.0)
+    total = thrust.sum(axis=1)
+    means = thrust[total > np.median(total) / 2].mean(axis=0)
+    wanted = np.asarray(airframe.rotor_vel(thrust * means.mean() / means), np.float64)
+    repairs = [*log.repairs, "modelled the rotor speeds from commands and voltage"]
+    if not np.all(good):
+        repairs.append(f"interpolated {np.sum(~good)} commands that were not from 0 to 1")
+    speeds = _behind(wanted, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
+    flying, margin = np.flatnonzero(total > 0.75 * np.median(total)), round(GROUND / log.dt)
+    air = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
+    repairs.append(f"left out {air.start} samples at the start and {len(log.t) - air.stop} at the end, near the ground")
+    data = {key: x[air] for key, x in vars(log).items() if isinstance(x, np.ndarray) and key != "gaps"}
+    data |= {"command": command[air], "rotor_vel": speeds[air]}
+    gaps = log.gaps[(log.gaps > air.start) & (log.gaps < air.stop)] - air.start
+    return replace(log, **data, modelled=True, gaps=gaps, repairs=tuple(repairs))
+
+
+def _behind(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
+    """Return the speeds of rotors behind held commands, rpm. (n, n_rotors)"""
+
+    def step(speed: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        cmd, duration = x
+        gap = cmd - speed
+        rate = rotor_acceleration(cmd, speed, jnp.asarray(lag)) / jnp.where(gap == 0, 1.0, gap)
+        new = speed - gap * jnp.expm1(-rate * duration)
+        return new, new
+
+    first = jnp.asarray(wanted[0])
+    _, path = jax.jit(lambda *x: jax.lax.scan(step, first, x))(jnp.asarray(wanted[:-1]), jnp.asarray(dt))
+    return np.concatenate([wanted[:1], np.asarray(path, np.float64)])
+
+
+def motor_lag(logs: Sequence[Log]) -> NDArray:
+    """Return the rate of a lag of first order between commands and measured speeds of each rotor, 1/s.
+
+    A speed is a quadratic function of the lagged command and its lagged square, later by a delay of the telemetry. Rate
+    and delay are those that leave the least squares, so that noise of the speeds does not bias them.
+
+    Args:
+        logs: Logs with commands and measured speeds; others, and modelled speeds, are left out.
+
+    Returns:
+        Rates, NaN where no rate from 2 to 200 1/s is best. (n_logs with both, n_rotors)
+    """
+    found = []
+    for log in logs:
+        if log.modelled or log.command is None or not log.rotor_vel.shape[1]:
+            continue
+        if log.command.shape != log.rotor_vel.shape:
+            continue
+        t = np.arange(log.t[0], log.t[-1], log.dt)
+        at = [[np.interp(t, log.t, c) for c in x.T] for x in (log.command, log.rotor_vel)]
+        found.append([_rate(u, r, log.dt) for u, r in zip(*at, strict=True)])
+    return np.array(found)
+
+
+def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
+    """Return the rate of one rotor: a grid over rates and delays that is refined about its best point."""
+    terms = np.c_[command, command**2] / max(np.max(np.abs(command)), 1e-30) ** [1, 2]
+    rates, delays = np.geomspace(SLOWEST, FASTEST, 15), np.linspace(-LATEST, LATEST, 9)
+    index, inner = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)
+    rate = delay = 0.0
+    for _ in range(5):
+        responses = lagged(terms[:, None], dt, rates[:, None])
+        best = np.inf
+        for d in delays:
+            for k, r in enumerate(rates):
+                # The response is shifted, not the speed, whose noise an interpolation would make smaller.
+                late = [np.interp(index - d / dt, index, c)[inner] for c in responses[:, k].T]
+                x = np.c_[late[0], late[1], np.ones(len(late[0]))]
+                rest = speed[inner] - x @ np.linalg.lstsq(x, speed[inner], rcond=None)[0]
+                if (cost := float(rest @ rest)) < best:
+                    best, rate, delay = cost, float(r), float(d)
+        ratio, width = rates[1] / rates[0], delays[1] - delays[0]
+        rates, delays = np.geomspace(rate / ratio, rate * ratio, 9), np.linspace(delay - width, delay + width, 7)
+    return rate if 1.05 * SLOWEST < rate < FASTEST / 1.05 else np.nan

@@ -1,0 +1,257 @@
+"""Open-loop prediction of logged flights from rotor speeds or attitude commands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.drones import Airframe
+from crazysim.dynamics import first_principles
+from crazysim.dynamics.rotor import reaction_torque
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.logs import Log
+from crazysim.plugins.effects.residual import N_INPUTS, ResidualData, residual_inputs, residual_wrench
+from crazysim.pytree import PyTree
+
+HORIZONS = (0.1, 0.25, 0.5)
+"""Horizons of the tables of errors, s."""
+
+
+class Windows(PyTree):
+    """Pieces of logs of equal length, from which predictions start."""
+
+    pos: Array
+    """Position, world frame, m. (n_windows, n, 3)"""
+    quat: Array
+    """Attitude, body to world, unit, xyzw. (n_windows, n, 4)"""
+    vel: Array
+    """Velocity, world frame, m/s. (n_windows, n, 3)"""
+    ang_vel: Array
+    """Angular velocity, body frame, rad/s. (n_windows, n, 3)"""
+    rotor_vel: Array
+    """Rotor speeds, rpm, with ``PADDING`` samples before and after; for fitted models the collective thrust, N.
+    (n_windows, n + 2 PADDING, n_rotors)"""
+    attitude_command: Array | None = None
+    """Commanded roll, pitch, yaw, rad, and collective thrust, N; None if a log has none. (n_windows, n, 4)"""
+
+
+PADDING = 1
+"""Samples of rotor speeds before and after a window, for their accelerations at its ends."""
+
+
+State = tuple[Array, Array, Array, Array, Array]
+"""Position, attitude, velocity and angular velocity as in ``Windows``, and further states of a model."""
+
+
+class Predictor(Protocol):
+    """Model that predicts logged flights: ``Model`` or ``FittedModel``."""
+
+    def prepared(self, log: Log) -> Log:
+        """Return the log as the model describes it."""
+        ...
+
+    def start(self, window: Windows) -> Array:
+        """Return the further states at the first sample of a window. (k,)"""
+        ...
+
+    def inputs(self, window: Windows, dt: float) -> Array:
+        """Return the inputs at start, middle and end of each interval between samples. (n - 1, 3, ...)"""
+        ...
+
+    def derivative(self, state: State, inputs: Array) -> State:
+        """Return the time derivatives of a state under inputs, (...); that of the attitude is the angular velocity."""
+        ...
+
+
+class Model(PyTree):
+    """Everything that predicts a flight from its rotor speeds."""
+
+    params: first_principles.Params
+    """Parameters of the first-principles model."""
+    residual: ResidualData
+    """Forces and torques beside it."""
+
+    @staticmethod
+    def create(airframe: Airframe, mass: float | None = None) -> Model:
+        """Return the model of an airframe, with its table ``[residual]`` if it has one.
+
+        Args:
+            airframe: Airframe.
+            mass: Mass, kg; None for that of the airframe.
+        """
+        params = first_principles.Params.create(airframe)
+        if mass is not None:
+            params = params.replace(mass=jnp.asarray([mass], jnp.float32))
+        known = "residual.linear" in airframe.values
+        residual = ResidualData.create(airframe) if known else ResidualData(jnp.zeros((6, N_INPUTS)), None, None)
+        return Model(params=params, residual=residual)
+
+    def prepared(self, log: Log) -> Log:
+        """Return the log."""
+        return log
+
+    def start(self, window: Windows) -> Array:
+        """Return no further states. (0,)"""
+        return window.pos[0, :0]
+
+    def inputs(self, window: Windows, dt: float) -> Array:
+        """Return rotor speeds, interpolated linearly, rpm, and accelerations, rpm/s. (n - 1, 3, 2, n_rotors)"""
+        n = window.pos.shape[0]
+        at = jnp.arange(2 * n - 1) / 2 + PADDING
+        index = jnp.arange(n + 2 * PADDING, dtype=at.dtype)
+        speeds = jax.vmap(lambda x: jnp.interp(at, index, x), 1, 1)(window.rotor_vel)
+        accelerations = jnp.asarray(jnp.gradient(speeds, axis=0)) / (dt / 2)
+        both = jnp.stack([speeds, accelerations], axis=1)
+        return jnp.stack([both[:-1:2], both[1::2], both[2::2]], axis=1)
+
+    def derivative(self, state: State, inputs: Array) -> State:
+        """Return the time derivatives of a state under rotor speeds and their accelerations."""
+        (pos, quat, vel, ang_vel, none), (speed, acceleration), p = state, inputs, self.params
+        force, torque = residual_wrench(residual_inputs(quat, vel, ang_vel, speed, p), self.residual)
+        torque = torque + reaction_torque(acceleration, p.mixing_matrix[..., 2, :], p.prop_inertia)
+        force, torque = rotation.rotate(quat, force), rotation.rotate(quat, torque)
+        _, acc, ang_acc, _ = first_principles.dynamics(pos, quat, vel, ang_vel, speed, speed, force, torque, params=p)
+        return vel, ang_vel, acc, ang_acc, none
+
+
+def windows(logs: Sequence[Log], duration: float, stride: float) -> Windows:
+    """Return the windows of logs of equal sample times that do not cross a gap.
+
+    Args:
+        logs: Logs.
+        duration: Duration of a window, s.
+        stride: Time between the starts of two windows, s.
+
+    Raises:
+        ConfigError: If no log is long enough for a window.
+    """
+    names = ["pos", "quat", "vel", "ang_vel", "rotor_vel"]
+    if all(log.attitude_command is not None for log in logs):
+        names.append("attitude_command")
+    pieces: dict[str, list[NDArray]] = {key: [] for key in names}
+    for log in logs:
+        n, step = round(duration / log.dt) + 1, max(1, round(stride / log.dt))
+        for start in range(PADDING, len(log.t) - n - PADDING, step):
+            if np.any((log.gaps > start - PADDING) & (log.gaps < start + n + PADDING)):
+                continue
+            for key, values in pieces.items():
+                extra = PADDING if key == "rotor_vel" else 0
+                values.append(getattr(log, key)[start - extra : start + n + extra])
+    if not pieces["pos"]:
+        raise ConfigError(
+            f"expected a log without gaps for longer than {duration:g} s and {2 * PADDING + 1} samples, got none. "
+            "Use longer logs."
+        )
+    return Windows(**{key: jnp.asarray(np.stack(x), jnp.float32) for key, x in pieces.items()})
+
+
+def predict(
+    model: Predictor, window: Windows, dt: float, constant_rates: bool = False
+) -> tuple[Array, Array, Array, Array]:
+    """Return the predicted states of one window, which begin at its first sample: pos, quat, vel, ang_vel.
+
+    Each sample is one Runge-Kutta step of order 4.
+
+    Args:
+        model: Model.
+        window: Window.
+        dt: Time between two samples, s.
+        constant_rates: True to keep the angular velocity of the first sample, so that only forces are modelled.
+    """
+
+    def derivative(state: State, inputs: Array) -> State:
+        vel, ang_vel, acc, ang_acc, more = model.derivative(state, inputs)
+        return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc, more
+
+    def moved(state: State, rates: State, duration: float) -> State:
+        pos, quat, vel, ang_vel, more = state
+        return (
+            pos + duration * rates[0],
+            rotation.turn(quat, rates[1], duration, normalize=True),
+            vel + duration * rates[2],
+            ang_vel + duration * rates[3],
+            more + duration * rates[4],
+        )
+
+    def step(state: State, inputs: Array) -> tuple[State, State]:
+        k1 = derivative(state, inputs[0])
+        k2 = derivative(moved(state, k1, dt / 2), inputs[1])
+        k3 = derivative(moved(state, k2, dt / 2), inputs[1])
+        k4 = derivative(moved(state, k3, dt), inputs[2])
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+        new = moved(state, mean, dt)
+        return new, new
+
+    start = (window.pos[0], window.quat[0], window.vel[0], window.ang_vel[0], model.start(window))
+    _, path = jax.lax.scan(step, start, model.inputs(window, dt))
+    pos, quat, vel, ang_vel, _ = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, path)
+    return pos, quat, vel, ang_vel
+
+
+def attitude_error(quat: Array, reference: Array) -> Array:
+    """Return the rotation from a reference attitude to another, body frame. (..., 3)
+
+    Its length is ``2 sin(angle / 2)``: for small angles the angle in rad, and at most 2.
+    """
+    error = rotation.multiply(reference * jnp.array([-1.0, -1.0, -1.0, 1.0]), quat)
+    return 2 * jnp.where(error[..., 3:] < 0, -error[..., :3], error[..., :3])
+
+
+def prediction_errors(
+    logs: Sequence[Log], model: Predictor, horizons: Sequence[float] = HORIZONS
+) -> dict[str, NDArray]:
+    """Return errors of open-loop predictions that start every 0.05 s.
+
+    Args:
+        logs: Logs of the same sample time.
+        model: Model.
+        horizons: Horizons, s.
+
+    Returns:
+        RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
+        name: ``position``, ``attitude``, both ``... at constant body rates`` (forces of the model alone),
+        ``position at constant velocity``, ``attitude unchanged``; and the mean distances and angles between
+        predicted and measured state, m and degrees, which end in ``(mean)``. (len(horizons),) each
+    """
+    batch, dt = windows([model.prepared(log) for log in logs], max(horizons), 0.05), logs[0].dt
+    pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
+    pos_turning, quat_turning, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt, constant_rates=True)))(batch)
+    at = np.asarray([round(h / dt) for h in horizons])
+    times = jnp.asarray(at * dt, jnp.float32)[:, None]
+    truth, turned = batch.pos[:, at], batch.quat[:, at]
+    positions = {
+        "position": pos[:, at],
+        "position at constant body rates": pos_turning[:, at],
+        "position at constant velocity": batch.pos[:, :1] + times * batch.vel[:, :1],
+    }
+    attitudes = {
+        "attitude": quat[:, at],
+        "attitude at constant body rates": quat_turning[:, at],
+        "attitude unchanged": jnp.broadcast_to(batch.quat[:, :1], turned.shape),
+    }
+    errors: dict[str, NDArray] = {}
+    for name, x in positions.items():
+        size = np.linalg.norm(np.asarray(x - truth, np.float64), axis=-1)
+        errors |= {name: np.sqrt(np.mean(size**2, axis=0)), f"{name} (mean)": np.mean(size, axis=0)}
+    for name, x in attitudes.items():
+        size = np.linalg.norm(np.asarray(attitude_error(x, turned), np.float64), axis=-1)
+        angle = 2 * np.arcsin(np.minimum(size / 2, 1.0))
+        rmse, mean = np.sqrt(np.mean(size**2, axis=0)), np.mean(angle, axis=0)
+        errors |= {name: np.degrees(rmse), f"{name} (mean)": np.degrees(mean)}
+    return errors
+
+
+def errors_table(errors: dict[str, NDArray], horizons: Sequence[float] = HORIZONS) -> str:
+    """Return errors as a table of text."""
+    head = f"{'RMSE, or mean error, after':48}" + "".join(f"{f'{h:g} s':>10}" for h in horizons)
+    unit = {"p": "m", "a": "degrees"}
+    return "\n".join(
+        [head, *(f"{f'{k}, {unit[k[0]]}':48}" + "".join(f"{x:10.4g}" for x in v) for k, v in errors.items())]
+    )

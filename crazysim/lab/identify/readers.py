@@ -1,0 +1,218 @@
+"""Streams of messages at equal times, and logs of a Crazyflie's micro-SD card."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.columns import Columns, plain, plausible
+from crazysim.lab.identify.repairs import PERIODS, continuous, unwrapped
+
+LONGEST_HOLD = 3.0
+"""Intervals of a stream, after which its interpolated values count as a gap."""
+VARIABLE = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
+"""Name and type of a variable of a micro-SD log, such as ``gyro.x(f)``."""
+LARGEST_RATE = 250.0
+"""Rate to which faster logs are averaged, Hz: above some 50 Hz nothing is identified."""
+
+
+class Stream(NamedTuple):
+    """Samples of one kind of message."""
+
+    t: NDArray
+    """Time, s. (n,)"""
+    columns: dict[str, NDArray]
+    """Values by name. (n,) each"""
+
+
+def at_equal_times(
+    name: str, streams: Mapping[str, Stream], repairs: list[str], columns: Columns | None = None
+) -> dict[str, NDArray]:
+    """Return the columns of all streams, interpolated linearly at the times of the fastest; ``t`` begins at zero.
+
+    Where a stream pauses for over three of its intervals the samples are left out, which leaves a gap. Streams that are
+    slower than a log may be are left out, too, but for the voltage.
+
+    Args:
+        name: Name of the file, for messages.
+        streams: Streams by name.
+        repairs: List that descriptions of repairs are appended to.
+        columns: Names of the columns, None for the default ones. Attitudes are made continuous first.
+
+    Raises:
+        ConfigError: If no two streams overlap, a stream has fewer than two samples, or position or attitude are too
+            slow.
+    """
+    columns = columns or Columns()
+    quat, angles = ([plain(x) for x in names] for names in (columns.quat, columns.rpy))
+    needed, slowly = {*map(plain, columns.pos), *quat, *angles}, set(map(plain, columns.voltage))
+    sorted_streams = {}
+    for key, stream in streams.items():
+        order = np.unique(stream.t, return_index=True)[1]
+        order = order[np.isfinite(stream.t[order])]
+        if len(order) < len(stream.t) or np.any(np.diff(stream.t) <= 0):
+            repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples have no time of their own")
+        if len(order) < 2:
+            raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
+        values = {c: plausible(x[order]) for c, x in stream.columns.items()}
+        step = float(np.median(np.diff(stream.t[order])))
+        if step > PERIODS[1] and not set(values) <= slowly:
+            wanted = f"{key} every {PERIODS[1]:g} s or more often, got every {step:.2g} s"
+            if needed & set(values):
+                raise ConfigError(f"{name}: expected {wanted}. Log it faster.")
+            repairs.append(f"left out a slow stream: expected {wanted}")
+            continue
+        if quat and all(c in values for c in quat):
+            turned = continuous(np.stack([values[c] for c in quat], axis=-1))
+            values |= dict(zip(quat, turned.T, strict=True))
+        turn = 2 * np.pi / abs(columns.rad_per_angle)
+        values |= {c: unwrapped(values[c], turn) for c in angles if c in values}
+        sorted_streams[key] = Stream(stream.t[order], values)
+    if not sorted_streams:
+        raise ConfigError(f"{name}: expected messages every {PERIODS[1]:g} s or more often, got none. Log them faster.")
+    steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
+    start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
+    dt = min(steps.values())
+    if end - start < dt:
+        raise ConfigError(f"{name}: expected messages at the same times, got none. Log all of them in one flight.")
+    if end - start > 100 * dt * max(len(s.t) for s in sorted_streams.values()):
+        raise ConfigError(f"{name}: expected one flight, got {end - start:.3g} s of pauses. Cut the log into flights.")
+    t = start + dt * np.arange(int((end - start) / dt) + 1)
+    keep = np.ones(len(t), bool)
+    for key, s in sorted_streams.items():
+        before = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
+        keep &= s.t[before + 1] - s.t[before] <= LONGEST_HOLD * steps[key]
+    t = t[keep]
+    columns_at = {c: np.interp(t, s.t, x) for s in sorted_streams.values() for c, x in s.columns.items()}
+    return {"t": t - start} | columns_at
+
+
+def decimated(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
+    """Return the table with means over as many samples as bring it to ``LARGEST_RATE`` or just below.
+
+    Args:
+        table: Columns by name, with the time ``t``, s.
+        repairs: List that descriptions of repairs are appended to.
+    """
+    step = float(np.median(np.diff(table["t"]))) if len(table["t"]) > 1 else 0.0
+    if not step > 0 or (size := int(np.ceil(1 / (LARGEST_RATE * step) - 1e-6))) < 2:
+        return table
+    n = len(table["t"]) // size * size
+    repairs.append(f"averaged {size} samples each of a log at {1 / step:.0f} Hz")
+    return {key: plausible(x[:n]).reshape(-1, size).mean(axis=1) for key, x in table.items()}
+
+
+def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
+    """Return the columns of a log of the Crazyflie's micro-SD card, by the names of its log variables.
+
+    The format is that of Bitcraze's crazyflie-firmware, tools/usdlog/cfusdlog.py at commit 34c90e75: versions 1 and 2.
+    Compressed attitudes, such as ``stateEstimateZ.quat``, become four columns, such as ``stateEstimateZ.qx`` to ``qw``
+    (src/modules/interface/quatcompress.h). Variables that two events share get the name of the event in front.
+
+    Args:
+        path: File.
+        repairs: List that descriptions of repairs are appended to.
+        wanted: Names of the columns. Events that have none of them are left out, unless all have none.
+
+    Raises:
+        ConfigError: If the file is no such log.
+    """
+    data = path.read_bytes()
+    if len(data) < 9 or data[0] != 0xBC:
+        raise ConfigError(
+            f"{path.name}: expected a log of a Crazyflie's micro-SD card, which begins with 0xBC, got another file. "
+            "Tables need the ending .csv or .npz."
+        )
+    version, n_kinds = struct.unpack_from("<HH", data, 1)
+    if version not in (1, 2):
+        raise ConfigError(
+            f"{path.name}: expected version 1 or 2 of the format, got {version}. Convert the log to CSV with the "
+            "firmware's tools/usdlog."
+        )
+    end = len(data) - 4
+    if crc32(data[:end]) != struct.unpack_from("<I", data, end)[0]:
+        repairs.append("the checksum does not match: read up to the last whole record")
+        end = len(data)
+    try:
+        kinds, at = _kinds(data, n_kinds)
+    except (struct.error, ValueError) as error:
+        raise ConfigError(
+            f"{path.name}: expected names of log variables in the header, got {error}. Copy the file again."
+        ) from error
+    head = struct.Struct("<HI" if version == 1 else "<HQ")
+    unit = 1e-3 if version == 1 else 1e-6
+    rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in kinds}
+    while at + head.size <= end:
+        kind, time = head.unpack_from(data, at)
+        if kind not in kinds or at + head.size + kinds[kind][2].size > end:
+            break
+        rows[kind].append((time * unit, *kinds[kind][2].unpack_from(data, at + head.size)))
+        at += head.size + kinds[kind][2].size
+    if at < end and not repairs:
+        repairs.append(f"left out {end - at} bytes at the end that are no record")
+    times = Counter(variable for key, (_, variables, _) in kinds.items() if rows[key] for variable in variables)
+    streams = {}
+    for key, (name, variables, _) in kinds.items():
+        if rows[key]:
+            table = np.array(rows[key], np.float64)
+            names = [x if times[x] == 1 else f"{name}.{x}" for x in variables]
+            values = dict(zip(names, table.T[1:], strict=True))
+            for x in [x for x in names if x.endswith(".quat") and np.all(values[x] == values[x].astype(np.uint32))]:
+                attitude = decompressed(values[x].astype(np.uint32))
+                values |= {f"{x[:-4]}q{axis}": c for axis, c in zip("xyzw", attitude.T, strict=True)}
+            streams[name] = Stream(table[:, 0], values)
+    if not streams:
+        raise ConfigError(f"{path.name}: expected records, got none. Start the log before the flight.")
+    if wanted is not None:
+        streams = {key: x for key, x in streams.items() if set(wanted.names) & set(x.columns)} or streams
+    return at_equal_times(path.name, streams, repairs, wanted)
+
+
+def decompressed(packed: NDArray) -> NDArray:
+    """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
+
+    From the lowest bits up: magnitudes of nine bits, in units of 1 / (511 sqrt(2)), each below a bit that is set for
+    negative ones, of the components but the largest, from the last to the first; then the index of the largest.
+    """
+    largest, quat = packed >> 30, np.zeros((len(packed), 4))
+    for k in (3, 2, 1, 0):
+        other = largest != k
+        size = (packed & 511) / 511 * np.sqrt(0.5)
+        quat[:, k] = np.where(other, np.where(packed & 512, -size, size), 0.0)
+        packed = np.where(other, packed >> 10, packed)
+    rest = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
+    quat[np.arange(len(quat)), largest] = rest
+    return quat
+
+
+def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
+    """Return name, variables and layout of each kind of record, and the place of the first record."""
+    kinds, at = {}, 5
+
+    def text(at: int) -> tuple[str, int]:
+        stop = data.index(0, at)
+        return data[at:stop].decode(), stop + 1
+
+    for _ in range(n_kinds):
+        (key,) = struct.unpack_from("<H", data, at)
+        name, at = text(at + 2)
+        (count,) = struct.unpack_from("<H", data, at)
+        at += 2
+        variables, layout = [], "<"
+        for _ in range(count):
+            entry, at = text(at)
+            if (found := VARIABLE.fullmatch(entry)) is None:
+                raise struct.error(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
+            variables.append(found[1])
+            layout += found[2]
+        kinds[key] = (name, variables, struct.Struct(layout))
+    return kinds, at

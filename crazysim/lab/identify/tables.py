@@ -1,0 +1,89 @@
+"""Files of logs as tables of columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.bags import is_bag, read_bag
+from crazysim.lab.identify.blackbox import header_of, read_blackbox
+from crazysim.lab.identify.columns import KNOWN, Columns, plain, stacked
+from crazysim.lab.identify.delimited import read_delimited
+from crazysim.lab.identify.readers import read_crazyflie
+from crazysim.lab.identify.repairs import check_period
+from crazysim.lab.identify.ulog import read_ulog
+from crazysim.storage import read_arrays, reading
+
+MAX_LOG = 2**31
+"""Largest file of a log, bytes, but for ROS bags, which are not read into memory as a whole."""
+
+
+def read_table(
+    source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
+) -> tuple[str, Mapping[str, NDArray]]:
+    """Return the name of a log and its columns, with the time in s, and a quaternion where it has angles.
+
+    Args:
+        source: File, or columns by name.
+        repairs: List that descriptions of repairs are appended to.
+        columns: Names of the columns, None for the default ones.
+
+    Raises:
+        ConfigError: If the file cannot be read, or the interval of its samples is none of a flight.
+    """
+    name, table = _read(source, repairs, columns)
+    if columns is None or not columns.rpy or any(plain(x) not in table for x in columns.rpy):
+        return name, table
+    angles = stacked(name, table, columns.rpy, columns.rad_per_angle)
+    if (most := np.nanmax(np.abs(angles[:, 1]), initial=0.0)) > 1.01 * np.pi / 2:
+        raise ConfigError(
+            f"{name}: expected a pitch of at most pi/2 rad, got {most:.3g}. Name roll, pitch and yaw in this order, "
+            f"and give rad_per_angle={np.pi / 180:.6g} for degrees."
+        )
+    quat = np.asarray(rotation.from_rpy(jnp.asarray(angles)))
+    return name, {**table, **dict(zip(columns.quat, quat.T.astype(np.float64), strict=True))}
+
+
+def _read(
+    source: str | Path | Mapping[str, NDArray], repairs: list[str], columns: Columns | None
+) -> tuple[str, Mapping[str, NDArray]]:
+    """Return the name of a log and its columns, with the time in s and the attitude as the source has it."""
+    if isinstance(source, Mapping):
+        return "log", _in_seconds("log", source, columns)
+    path = Path(source)
+    if is_bag(path) and path.exists():
+        with reading(path.name, "a ROS bag", "Record it again, or run ros2 bag reindex."):
+            return path.stem, read_bag(path, repairs, columns)
+    if not path.is_file():
+        raise ConfigError(f"expected an existing file, or the folder of a ROS bag, got {str(path)!r}")
+    if (size := path.stat().st_size) > MAX_LOG:
+        raise ConfigError(f"{path.name}: expected a log of at most {MAX_LOG} bytes, got {size}. Cut it into flights.")
+    with reading(path.name, "a log of a flight", "Copy or export it again."):
+        if path.suffix == ".ulg":
+            return path.stem, read_ulog(path, repairs)
+        if path.suffix == ".npz":
+            with path.open("rb") as file:
+                table = read_arrays(file, path.name)
+        elif path.suffix != ".csv":
+            return path.stem, read_crazyflie(path, repairs, columns)
+        elif header_of(path) is not None:
+            return path.stem, read_blackbox(path, repairs)
+        else:
+            table = read_delimited(path, repairs)
+    return path.stem, _in_seconds(path.stem, table, columns)
+
+
+def _in_seconds(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:
+    """Return the table with its time in s."""
+    names = columns or KNOWN["crazysim"]
+    if names.time not in table:
+        return table
+    t = stacked(name, table, [names.time], names.seconds_per_unit)[:, 0]
+    check_period(name, t)
+    return {**table, names.time: t}

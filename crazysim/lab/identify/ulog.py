@@ -1,0 +1,218 @@
+"""Logs of PX4, in its format ULog.
+
+The format is that of https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data, which PX4 writes after a
+crash, follow the others without a mark of their own.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.errors import ConfigError, DamagedFileError
+from crazysim.lab.identify.columns import plausible
+from crazysim.lab.identify.readers import Stream, at_equal_times
+from crazysim.lab.identify.repairs import unwrapped
+
+TOPICS = (
+    "vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity", "esc_status", "actuator_motors",
+    "actuator_outputs", "vehicle_attitude_setpoint", "battery_status",
+)  # fmt: skip
+"""Topics that are read; the first two are needed."""
+MAGIC = b"ULog\x01\x12\x35"
+"""First bytes of a file."""
+SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
+"""Content of a message ``S``, after which a damaged file is read again."""
+HEADER = 16
+"""Bytes before the first message."""
+KINDS = b"ABCDFILMOPQRS"
+"""Letters of the messages."""
+SCALARS = {
+    "int8_t": "<i1", "uint8_t": "<u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
+    "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "<i1", "char": "<i1",
+}  # fmt: skip
+"""Types of fields, as NumPy names them."""
+MAX_MESSAGE = 2**16 - 1
+"""Largest message, bytes, which its 16 bits of length can state."""
+MAX_DEPTH = 8
+"""Most formats within each other; PX4 has two."""
+FIELD = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
+
+
+def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
+    """Return the columns of a PX4 ULog in the names of crazysim's logs.
+
+    World axes are north, west, up, and body axes forward, left, up: PX4's, turned half about the first axis. Rotor
+    speeds are those of ``esc_status`` and commands those of ``actuator_motors``, or else of ``actuator_outputs``, in
+    PX4's order. Commanded attitudes are those of ``vehicle_attitude_setpoint``, with its thrust as a share from 0 to 1.
+    Logs before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
+
+    Args:
+        path: File.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        ConfigError: If the log lacks position or attitude, or is damaged.
+    """
+    found = _topics(path, TOPICS, repairs)
+    if missing := [key for key in TOPICS[:2] if key not in found]:
+        others = ", ".join(found) or "none"
+        raise ConfigError(
+            f"{path.name}: expected messages {' and '.join(missing)}, got {others}. Add them to PX4's logged topics."
+        )
+    place, turn = found["vehicle_local_position"], found["vehicle_attitude"]
+    # PX4's quaternions are wxyz.
+    columns = {
+        "vehicle_local_position": {
+            "x": place["x"], "y": -place["y"], "z": -place["z"],
+            "vx": place["vx"], "vy": -place["vy"], "vz": -place["vz"],
+        },
+        "vehicle_attitude": {"qw": turn["q[0]"], "qx": turn["q[1]"], "qy": -turn["q[2]"], "qz": -turn["q[3]"]},
+    }  # fmt: skip
+    if "vehicle_angular_velocity" in found:
+        rates = [found["vehicle_angular_velocity"][f"xyz[{k}]"] for k in range(3)]
+        columns["vehicle_angular_velocity"] = {"wx": rates[0], "wy": -rates[1], "wz": -rates[2]}
+    elif "rollspeed" in turn:
+        columns["vehicle_attitude"] |= {"wx": turn["rollspeed"], "wy": -turn["pitchspeed"], "wz": -turn["yawspeed"]}
+    escs = found.get("esc_status", {})
+    n_rotors = int(np.max(escs["esc_count"])) if escs else 0
+    if n_rotors:
+        speeds = [np.abs(escs[f"esc[{k}].esc_rpm"]) for k in range(n_rotors)]
+        columns["esc_status"] = {f"rpm{k + 1}": x for k, x in enumerate(speeds)}
+    if "actuator_motors" in found:
+        outputs = [found["actuator_motors"][f"control[{k}]"] for k in range(12)]
+        used = [x for x in outputs if np.any(np.isfinite(x))]
+        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(used)}
+    elif "actuator_outputs" in found and n_rotors:
+        outputs = [found["actuator_outputs"][f"output[{k}]"] for k in range(n_rotors)]
+        columns["actuator_outputs"] = {f"command{k + 1}": x for k, x in enumerate(outputs)}
+    wanted = found.get("vehicle_attitude_setpoint", {})
+    if "q_d[0]" in wanted and "thrust_body[2]" in wanted:
+        aim = np.stack([wanted[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
+        angles = np.asarray(jax.jit(rotation.to_rpy)(aim), np.float64)
+        names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
+        values = [*map(unwrapped, angles.T), -wanted["thrust_body[2]"]]
+        columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
+    if "battery_status" in found:
+        columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}
+    streams = {key: Stream(found[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}
+    return at_equal_times(path.name, streams, repairs)
+
+
+class Topic(dict[str, NDArray]):
+    """Fields of a topic by name; those that are missing are errors that name the file."""
+
+    def __init__(self, place: str, fields: Mapping[str, NDArray]):
+        """Keep the fields, and the file and the topic for messages."""
+        super().__init__(fields)
+        self.place = place
+
+    def __missing__(self, name: str) -> NDArray:
+        """Raise the error of a missing field."""
+        raise ConfigError(
+            f"{self.place}: expected a field {name}, got {', '.join(self)[:200]}. Take a log of PX4 1.9 or newer."
+        )
+
+
+def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str, Topic]:
+    """Return the first instances of topics, their fields by name, such as ``q[0]`` or ``esc[2].esc_rpm``.
+
+    Where a file is damaged the messages until the next mark of synchronisation are left out.
+
+    Args:
+        path: File.
+        topics: Names of the topics; those without messages are left out.
+        repairs: List that descriptions of repairs are appended to.
+
+    Raises:
+        DamagedFileError: If it is no ULog, or a topic has no format.
+    """
+    data = path.read_bytes()
+    if len(data) < HEADER or not data.startswith(MAGIC):
+        raise DamagedFileError(
+            f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again."
+        )
+    head, formats, ids, parts = struct.Struct("<HB"), {}, {}, {}
+    at, skipped, dropouts = HEADER, 0, 0
+    while at + head.size <= len(data):
+        size, kind = head.unpack_from(data, at)
+        start, end = at + head.size, at + head.size + size
+        if kind not in KINDS or end > len(data):
+            found = data.find(SYNC, at + 1)
+            skipped += (len(data) if found < 0 else found) - at
+            if found < 0:
+                break
+            at = found + len(SYNC)
+            continue
+        at = end
+        if kind == ord("D") and size > 2:
+            key = data[start] | data[start + 1] << 8
+            if key in parts:
+                parts[key].append(data[start + 2 : end])
+        elif kind == ord("F"):
+            name, _, fields = data[start:end].decode(errors="replace").partition(":")
+            formats[name] = fields
+        elif kind == ord("A") and size > 3:
+            number, key = struct.unpack_from("<BH", data, start)
+            name = data[start + 3 : end].decode(errors="replace")
+            if number == 0 and name in topics and name not in ids:
+                ids[name], parts[key] = key, []
+        elif kind == ord("O"):
+            dropouts += 1
+    if skipped:
+        repairs.append(f"left out {skipped} damaged bytes")
+    if dropouts:
+        repairs.append(f"{dropouts} dropouts of the logger")
+    found = {}
+    for name, key in ids.items():
+        layout = np.dtype(_layout(path.name, formats, name))
+        whole = [part[: layout.itemsize] for part in parts[key] if len(part) >= layout.itemsize]
+        if len(whole) < len(parts[key]):
+            repairs.append(f"left out {len(parts[key]) - len(whole)} messages {name}, which are too short")
+        if whole:
+            table = np.frombuffer(b"".join(whole), layout)
+            columns = {field: plausible(table[field].astype(np.float64)) for field in layout.names or ()}
+            found[name] = Topic(f"{path.name}: {name}", columns)
+    return found
+
+
+def _layout(
+    file: str, formats: Mapping[str, str], name: str, prefix: str = "", depth: int = 0
+) -> list[tuple[str, str]]:
+    """Return names and types of the fields of a format, those of nested formats unrolled.
+
+    Padding at the end, which PX4 does not log, is left out.
+
+    Raises:
+        DamagedFileError: If a format is missing, malformed, without an end, or larger than a message.
+    """
+    shown, remedy = repr(name[:60]), "Copy the file again."
+    if name not in formats or depth > MAX_DEPTH:
+        got = f"over {MAX_DEPTH} within each other" if name in formats else "none"
+        raise DamagedFileError(f"{file}: expected a format of {shown}, got {got}. {remedy}")
+    fields = []
+    for text in filter(None, formats[name].split(";")):
+        found = FIELD.fullmatch(text)
+        if found is None:
+            raise DamagedFileError(f"{file}: expected a field such as 'float[4] q', got {text[:60]!r}. {remedy}")
+        kind, count, field = found.groups()
+        for index in [""] if count is None else [f"[{k}]" for k in range(int(count))]:
+            path = f"{prefix}{field}{index}"
+            own = [(path, SCALARS[kind])] if kind in SCALARS else _layout(file, formats, kind, f"{path}.", depth + 1)
+            fields += own
+            if not own or len(fields) > MAX_MESSAGE:
+                raise DamagedFileError(
+                    f"{file}: expected a format of 1 to {MAX_MESSAGE} bytes, got another of {shown}. {remedy}"
+                )
+    while not depth and fields and fields[-1][0].startswith("_padding"):
+        fields.pop()
+    if len({field for field, _ in fields}) < len(fields):
+        raise DamagedFileError(f"{file}: expected fields of different names in {shown}, got some twice. {remedy}")
+    return fields

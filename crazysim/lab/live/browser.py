@@ -1,0 +1,191 @@
+"""A live simulation in the browser: the scene, and a panel to command it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import socket
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from crazysim.errors import ConfigError, RenderError
+from crazysim.lab.live.browser_panel import BrowserPanel
+from crazysim.lab.live.browser_scene import BrowserScene
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.picture import PictureSource
+from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.lab.live.viewer import Viewer
+from crazysim.media.access import LOCAL, Access, guarded_server
+from crazysim.media.web import FOV, free_port, import_viser
+from crazysim.media.worlds import world_indices
+from crazysim.scene.visual_geoms import visual_geoms
+
+MAX_WORLDS = 64
+"""Most worlds that are shown unless they are listed."""
+MARGIN = 1.0
+"""Free space between neighbouring worlds, m."""
+STOP = 0.5
+"""Longest time for which ``close`` waits, s."""
+
+log = logging.getLogger(__name__)
+
+
+class Browser(Viewer[Live]):
+    """Viewer in any number of browsers, by viser, which runs in threads of its own.
+
+        browser = live.show(Browser(port=8080))
+        print(browser.url)
+
+    A click on a drone selects it, and one on a vehicle, load or object follows that. The panel plots any array of the
+    data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
+
+    The address has a new token every time. Whoever has it can watch and command the simulation; others are refused, and
+    so are pages of other sites.
+    """
+
+    def __init__(
+        self,
+        port: int = 8080,
+        host: str = "127.0.0.1",
+        worlds: Sequence[int] | None = None,
+        spacing: float | None = None,
+        trail: float = 2.0,
+        contacts: bool = False,
+        wind: bool = True,
+        follow: bool = False,
+        plot: str = "states.pos",
+    ):
+        """Choose what to show; ``live.show`` starts the server.
+
+        Args:
+            port: Port; 0 for any free one.
+            host: Address to listen at: this machine's alone by default, ``0.0.0.0`` for every network.
+            worlds: Indices of the worlds, shown side by side; None for all, up to ``MAX_WORLDS``.
+            spacing: Distance between their origins, m; None for the size of the first picture and a margin.
+            trail: Duration of trails, s; 0 for none.
+            contacts: True to mark drones that touch something, which is computed for every picture.
+            wind: True to draw the wind at every drone.
+            follow: True to keep the followed body in the middle at first.
+            plot: Quantity plotted at first.
+
+        Raises:
+            ConfigError: If a number is invalid.
+        """
+        for name, value in (("trail", trail), ("spacing", 1.0 if spacing is None else spacing)):
+            if not np.isfinite(value) or value < 0:
+                raise ConfigError(f"expected a {name} of 0 or more, got {value!r}")
+        self._access = Access(host, port)
+        self._worlds, self._spacing = worlds, spacing
+        self._trail, self._contacts, self._wind = float(trail), contacts, wind
+        self._follow, self._plot = follow, plot
+        self._server: Any = None
+
+    @property
+    def url(self) -> str:
+        """Address for a browser, with the token."""
+        return self._access.url
+
+    @property
+    def is_open(self) -> bool:
+        """True while the server runs."""
+        return self._server is not None
+
+    @property
+    def n_clients(self) -> int:
+        """Number of browsers that are connected."""
+        return 0 if self._server is None else len(self._server.get_clients())
+
+    def open(self, live: Live) -> None:
+        """Start the server.
+
+        Raises:
+            ConfigError: If a world does not exist.
+            ImportError: If viser is not installed.
+            RenderError: If the port is in use.
+        """
+        viser, sim = import_viser(), live.sim
+        worlds = world_indices(sim, range(min(sim.n_worlds, MAX_WORLDS)) if self._worlds is None else self._worlds)
+        access = self._access
+        access.port = _require_free(access.host, access.port)
+        if access.host not in LOCAL:
+            log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
+                        "watch and command the simulation", access.host, access.port)  # fmt: skip
+        sim.scene.compile_if_edited()
+        sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), int(worlds[0]))
+        shapes = visual_geoms(sim.mj_model, sim.mj_data)
+        bodies = SceneBodies(sim, shapes)
+        self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)
+        self._picture = self._source.take(live)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+            self._server = guarded_server(viser, access, label="crazysim")
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        drones = self._picture.drones
+        extent = float(np.nanmax(np.ptp(drones, axis=1)[..., :2])) + 2 * MARGIN
+        spacing = extent if self._spacing is None else self._spacing
+        self._scene = BrowserScene(self._server, shapes, bodies, self._picture, spacing, self._trail)
+        camera = self._server.initial_camera
+        size = max(np.ptp(self._scene.offsets[:, :2], axis=0).max() + extent, 2.0)
+        camera.fov, camera.look_at = np.deg2rad(FOV), (0.0, 0.0, 0.5)
+        camera.position = (0.0, -0.9 * size, 0.6 * size + 0.5)
+        self._panel = BrowserPanel(self._server, live, self._scene, bodies, self._follow, self._plot)
+
+        @self._server.on_client_connect
+        def _(client: Any) -> None:
+            log.info("browser %d connected at %.2f s", client.client_id, live.time)
+
+        @self._server.on_client_disconnect
+        def _(client: Any) -> None:
+            if self.is_open:
+                log.warning("browser %d disconnected at %.2f s", client.client_id, live.time)
+
+        @scene.on_click()
+        def _(event: Any) -> None:
+            world, body, point = self._scene.pick(self._picture, event.ray_origin, event.ray_direction)
+            number = int(self._picture.worlds[world])
+            if body is not None:
+                live.post(lambda live: live.follow(number, body.kind, body.index))
+            elif point is not None:
+                live.post(lambda live: live.click(number, point))
+
+    def update(self, live: Live) -> None:
+        """Send the poses to all browsers."""
+        if not self._server.get_clients():
+            return
+        self._picture = picture = self._source.take(live, self._panel.plot)
+        with self._server.atomic():
+            self._scene.update(picture, self._panel.follow)
+        self._panel.update(picture, time.perf_counter())
+
+    def close(self) -> None:
+        """Stop the server, which disconnects all browsers."""
+        if self._server is not None:
+            server, self._server = self._server, None
+            with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops
+                # viser waits for 6 s for connections that a browser has opened in advance and not used.
+                stop = threading.Thread(target=server.stop, daemon=True)
+                stop.start()
+                stop.join(STOP)
+
+
+def _require_free(host: str, port: int) -> int:
+    """Return a port that is free, or any free one for 0; viser itself would silently take another.
+
+    Raises:
+        RenderError: If it is in use or does not exist.
+    """
+    if port == 0:
+        return free_port()
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+            probe.listen()
+    except (OSError, OverflowError) as error:
+        raise RenderError(f"expected a free address, got {host}:{port}: {error}. Choose another port.") from error
+    return port

@@ -1,0 +1,226 @@
+"""The panel beside a live simulation in the browser: time, selection, layers, plots, buttons and sliders."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from crazysim.lab.live.browser_scene import BrowserScene
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.pace import Speed
+from crazysim.lab.live.picture import Picture, quantities
+from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
+from crazysim.lab.live.viewer import Control, Slider
+
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
+"""Speeds to choose from."""
+TEXT_PERIOD, PLOT_PERIOD = 0.2, 0.1
+"""Time between updates of the text and of the plot, s."""
+PLOT_SAMPLE = 0.02
+"""Least simulated time between two samples of a plot, s."""
+PLOT_LENGTH = 500
+"""Number of samples of a plot."""
+COLORS = ("#d6452f", "#2a7fd9", "#37a35a", "#d99a1c", "#8a4fbf", "#444444")
+"""Colours of the lines of a plot, repeated in this order."""
+MAX_LINES = 16
+"""Most lines of a plot."""
+KEY_TIME = 0.25
+"""Time for which a button or key of the browser holds a key of the loop, s: browsers report presses only."""
+KEYS = {
+    "forward": ("up", "arrowup"), "back": ("down", "arrowdown"), "left": ("left", "arrowleft"),
+    "right": ("right", "arrowright"), "climb": ("w", "W"), "sink": ("s", "S"), "turn left": ("a", "A"),
+    "turn right": ("d", "D"),
+}  # fmt: skip
+"""Keys of the loop and hotkeys of viser of each movement."""
+
+
+class BrowserPanel:
+    """Panel of one server, which all its browsers share."""
+
+    follow: bool
+    """True to keep the followed body in the middle."""
+    plot: str
+    """Quantity that is plotted; empty for none."""
+
+    def __init__(self, server: Any, live: Live, scene: BrowserScene, bodies: SceneBodies, follow: bool, plot: str):
+        """Add the elements.
+
+        Args:
+            server: Server of viser.
+            live: Loop, whose buttons and sliders the panel shows.
+            scene: Scene, whose layers the panel switches.
+            bodies: Bodies that can be followed.
+            follow: Initial value.
+            plot: Initial value.
+        """
+        self._gui = gui = server.gui
+        self._scene, self._live = scene, live
+        names = list(dict.fromkeys(["", *live.quantities, *quantities(live.sim)]))
+        self.follow, self.plot = follow, plot if plot in names else ""
+        gui.configure_theme(control_width="medium")
+        self._text = gui.add_markdown("")
+        self._text_at = self._plot_at = -np.inf
+        self._samples: deque[tuple[float, np.ndarray]] = deque(maxlen=PLOT_LENGTH)
+        self._chart: Any = None
+        self._plotted: tuple[Any, ...] = ()
+        with gui.add_folder("Time"):
+            self._add_time(gui, live)
+        with gui.add_folder("Drone"):
+            self._add_drone(gui, live, bodies)
+        if live.controls:
+            with gui.add_folder("Controls"):
+                for control in live.controls:
+                    self._add_control(gui, live, control)
+        with gui.add_folder("Layers", expand_by_default=False):
+            for layer in scene.visible:
+                self._add_layer(gui, layer)
+        self._plots = gui.add_folder("Plot")
+        with self._plots:
+            choice = gui.add_dropdown("quantity", names, initial_value=self.plot)
+
+            @choice.on_update
+            def _(_: Any) -> None:
+                if choice.value in names:  # a browser may send any text
+                    self.plot = choice.value
+
+    def update(self, picture: Picture, now: float) -> None:
+        """Show text and plot, at rates of their own.
+
+        Args:
+            picture: Picture that is shown.
+            now: Present time, s.
+        """
+        if now - self._text_at >= TEXT_PERIOD:
+            self._text_at = now
+            self._text.content = f"**{picture.status}**"
+            if picture.selected is not None and self._drone.value != picture.selected[1]:
+                self._drone.value = picture.selected[1]
+            if picture.followed is not None and self._world.value != picture.followed[0]:
+                self._world.value = picture.followed[0]
+            if self._body is not None and self._body.value != picture.name:
+                self._body.value = picture.name
+        plotted = (self.plot, picture.selected, len(picture.plot))
+        if plotted != self._plotted or (self._samples and picture.time < self._samples[-1][0]):
+            self._plotted = plotted
+            self._samples.clear()
+            self._remove_chart()
+        if not len(picture.plot):
+            return
+        if not self._samples or picture.time - self._samples[-1][0] >= PLOT_SAMPLE:
+            self._samples.append((picture.time, picture.plot[:MAX_LINES]))
+        if len(self._samples) > 1 and now - self._plot_at >= PLOT_PERIOD:
+            self._plot_at = now
+            self._draw_chart()
+
+    def _draw_chart(self) -> None:
+        times = np.array([time for time, _ in self._samples])
+        values = np.stack([value for _, value in self._samples])
+        data = (times, *np.where(np.isfinite(values), values, 0.0).T)
+        if self._chart is not None:
+            self._chart.data = data
+            return
+        lines = [{"label": str(k), "stroke": COLORS[k % len(COLORS)], "width": 1.5} for k in range(values.shape[1])]
+        with self._plots:
+            self._chart = self._gui.add_uplot(
+                data, ({"label": "s"}, *lines), title=self.plot, scales={"x": {"time": False}}, aspect=1.3
+            )
+
+    def _remove_chart(self) -> None:
+        if self._chart is not None:
+            self._chart.remove()
+            self._chart = None
+
+    def _add_time(self, gui: Any, live: Live) -> None:
+        calls = {
+            "pause": Live.toggle_pause, "step": Live.advance, "reset": Live.reset, "record": Live.toggle_recording,
+        }  # fmt: skip
+        buttons = gui.add_button_group("", tuple(calls))
+        buttons.on_click(lambda _: live.post(calls[buttons.value]))
+        speed = gui.add_dropdown("speed", SPEEDS, initial_value=_nearest(live.speed))
+
+        @speed.on_update
+        def _(_: Any) -> None:
+            value = speed.value
+            live.post(lambda live: setattr(live, "speed", "max" if value == "max" else float(value)))
+
+        to = gui.add_number("go to, s", 0.0, min=0.0, step=0.1)
+        _post(gui.add_button("Go"), live, lambda live: live.go_to(float(to.value)))
+
+    def _add_drone(self, gui: Any, live: Live, bodies: SceneBodies) -> None:
+        sim = live.sim
+        world, drone = live.selected or (0, 0)
+        self._world = worlds = gui.add_number(
+            "world", world, min=0, max=sim.n_worlds - 1, step=1, visible=sim.n_worlds > 1
+        )
+        self._drone = gui.add_number("drone", drone, min=0, max=sim.n_drones - 1, step=1)
+        for number in (worlds, self._drone):
+
+            @number.on_update
+            def _(event: Any) -> None:
+                if event.client is not None:  # a change by a user
+                    chosen = int(worlds.value), int(self._drone.value)
+                    live.post(lambda live: live.select(*chosen))
+
+        self._body = None
+        if any(body.kind != DRONE for body in bodies.items):
+            self._add_body(gui, live, worlds, bodies)
+        follow = gui.add_checkbox("follow", self.follow)
+
+        @follow.on_update
+        def _(_: Any) -> None:
+            self.follow = follow.value
+
+        for name, (key, hotkey) in KEYS.items():
+            self._add_key(gui, live, name, key, hotkey)
+
+    def _add_body(self, gui: Any, live: Live, worlds: Any, bodies: SceneBodies) -> None:
+        """Add the choice of the followed body, which may be a vehicle, a load or an object."""
+        named = {body.name: body for body in bodies.items}
+        self._body = choice = gui.add_dropdown("body", ("", *named))
+
+        @choice.on_update
+        def _(event: Any) -> None:
+            body = named.get(choice.value)
+            if event.client is not None and body is not None:  # a change by a user
+                world = int(worlds.value)
+                live.post(lambda live: live.follow(world, body.kind, body.index))
+
+    def _add_key(self, gui: Any, live: Live, name: str, key: str, hotkey: str) -> None:
+        """Add a hotkey that holds a key of the loop for a moment."""
+        command = gui.add_command(f"Fly: {name}", hotkey=hotkey)
+        command.on_trigger(lambda _: live.keyboard.hold(key, KEY_TIME))
+
+    def _add_layer(self, gui: Any, layer: str) -> None:
+        box = gui.add_checkbox(layer, True)
+
+        @box.on_update
+        def _(_: Any) -> None:
+            self._scene.visible[layer] = box.value
+
+    @staticmethod
+    def _add_control(gui: Any, live: Live, control: Control) -> None:
+        if not isinstance(control, Slider):
+            _post(gui.add_button(control.name), live, lambda _: control.call())
+            return
+        step = (control.high - control.low) / 200
+        slider = gui.add_slider(control.name, control.low, control.high, step, control.value)
+
+        @slider.on_update
+        def _(_: Any) -> None:
+            value = float(slider.value)
+            live.post(lambda live: live.set_value(control.name, value))
+
+
+def _post(button: Any, live: Live, call: Callable[[Live], object]) -> None:
+    """Let a button post a function to the loop."""
+    button.on_click(lambda _: live.post(call))
+
+
+def _nearest(speed: Speed) -> str:
+    """Return the choice that is nearest to a speed."""
+    if speed == "max":
+        return "max"
+    return min(SPEEDS[:-1], key=lambda choice: abs(np.log(float(choice) / speed)))

@@ -1,0 +1,268 @@
+"""The scene of a live simulation in a browser: batches of meshes whose poses are sent once per picture."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.lab.live.attitude import rotate
+from crazysim.lab.live.browser_trails import Trails, finite_rows
+from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
+from crazysim.lab.live.scene_bodies import DRONE, MARK_RADIUS, SceneBodies, SceneBody
+from crazysim.media.trail import colors_of
+from crazysim.media.web import add_static, mesh_of, rgb
+from crazysim.scene.visual_geoms import VisualGeom
+
+SETPOINT_RADIUS = 0.025
+"""Radius of a setpoint's sphere, m."""
+CLICK_SIZE = 0.02
+"""Smallest half size of what a click picks, as a multiple of the distance from the camera."""
+HIDDEN = 1e-6
+"""Scale of a mark that is not shown."""
+CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
+"""Colours of marks, rgb, 0 to 255."""
+
+
+class BrowserScene:
+    """Nodes of one viser server that show some worlds, side by side in a grid."""
+
+    def __init__(
+        self,
+        server: Any,
+        shapes: list[VisualGeom],
+        bodies: SceneBodies,
+        picture: Picture,
+        spacing: float,
+        trail: float,
+    ):
+        """Add all nodes.
+
+        Args:
+            server: Server of viser.
+            shapes: Visible geoms of the scene.
+            bodies: Bodies that can be picked.
+            picture: First picture.
+            spacing: Distance between the origins of neighbouring worlds, m.
+            trail: Duration of trails, s; 0 for none.
+        """
+        self._scene, self._bodies = server.scene, bodies
+        scene = server.scene
+        n_worlds, n_drones = picture.drones.shape[:2]
+        self.offsets = grid_offsets(n_worlds, spacing)
+        self._root = scene.add_frame("/world", show_axes=False)
+        by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
+        by_body: dict[int, list[VisualGeom]] = defaultdict(list)
+        for shape in shapes:
+            if shape.mocap < 0:
+                by_color[tuple(np.round(shape.rgba, 3))].append(shape)
+            elif shape.kind != "plane":
+                by_body[shape.mocap].append(shape)
+        for k, (rgba, fixed) in enumerate(by_color.items()):
+            infinite = [s for s in fixed if s.kind == "plane" and not s.size[:2].any()]
+            others = [s for s in fixed if not any(s is plane for plane in infinite)]
+            if infinite:
+                add_static(scene, f"/world/floor/{k}", infinite, rgba)
+            for w, offset in enumerate(self.offsets if others else []):
+                node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
+                add_static(scene, node.name, others, rgba)
+        self._batches: list[tuple[Any, NDArray]] = []
+        for alike in _alike(by_body):
+            self._add_bodies(np.array(alike), by_body[alike[0]], picture)
+
+        colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
+        drones = self._moved(picture.drones).reshape(-1, 3)
+        self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
+        self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drones, CONTACT_COLOR, 0.45)
+        self._contacts.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drones, rgb_of(0 * colors), 0.7)
+        self._lights.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lit = np.zeros_like(colors)
+        self._followed = scene.add_icosphere(
+            "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
+        )
+        self._label = scene.add_label("/world/followed/name", "", position=(0, 0, MARK_RADIUS), anchor="bottom-center")
+        self._wind = None
+        self._tracked = bodies.tracked
+        tracked = self._moved(picture.pos[:, self._tracked]).reshape(-1, 3)
+        trail_colors = np.tile(colors_of(len(self._tracked), None)[:, :3], (n_worlds, 1))
+        self._trail = Trails(scene, tracked, trail_colors, trail) if trail > 0 else None
+        self.visible: dict[str, bool] = dict.fromkeys(("trails", "setpoints", "contacts", "wind", "lights"), True)
+
+    def update(self, picture: Picture, follow: bool) -> None:
+        """Show a picture.
+
+        Args:
+            picture: Picture.
+            follow: True to keep the followed body in the middle: the worlds move, and the camera stays.
+        """
+        pos, show = self._moved(picture.pos), self.visible
+        for handle, bodies in self._batches:
+            handle.batched_positions = finite_rows(pos[:, bodies].reshape(-1, 3))
+            handle.batched_wxyzs = finite_rows(
+                np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4), (1, 0, 0, 0)
+            )
+        drones = self._moved(picture.drones)
+        if self._setpoints is not None:
+            self._setpoints.visible = show["setpoints"]
+            self._setpoints.batched_positions = finite_rows(self._moved(picture.setpoint).reshape(-1, 3))
+        touching = picture.touching.ravel() & show["contacts"]
+        self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN).astype(np.float32)
+        if touching.any():
+            self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
+        self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
+        self._show_wind(drones, picture)
+        if self._trail is not None:
+            self._trail.update(picture.time, finite_rows(pos[:, self._tracked].reshape(-1, 3)), show["trails"])
+        self._show_followed(pos, picture, follow)
+
+    def pick(
+        self, picture: Picture, origin: ArrayLike, direction: ArrayLike
+    ) -> tuple[int, SceneBody | None, NDArray | None]:
+        """Return index of the world, body or None, and point of the floor, m, or None, that a ray from the camera hits.
+
+        Args:
+            picture: Picture that the user has seen.
+            origin: Origin of the ray in the browser's scene, m. (3,)
+            direction: Direction of the ray. (3,)
+        """
+        origin = np.asarray(origin, float) - np.asarray(self._root.position, float)
+        direction = np.asarray(direction, float) / np.linalg.norm(direction)
+        beside = self._hits(picture, origin, direction)
+        if np.isfinite(beside).any():
+            world, mocap = np.unravel_index(beside.argmin(), beside.shape)
+            return int(world), self._bodies.items[self._bodies.owner[mocap]], None
+        if direction[2] > -1e-6:
+            return 0, None, None
+        point = origin - direction * origin[2] / direction[2]
+        world = int(np.linalg.norm(self.offsets - point, axis=-1).argmin())
+        return world, None, point - self.offsets[world]
+
+    def _hits(self, picture: Picture, origin: NDArray, direction: NDArray) -> NDArray:
+        """Return the distance between a ray and the origin of each body whose box it enters, m. (n, n_mocap)
+
+        The distance is infinite for other bodies. Boxes of small and distant bodies are enlarged, so that they are easy
+        to click.
+
+        Args:
+            picture: Picture that the user has seen.
+            origin: Start of the ray, frame of the grid of worlds, m. (3,)
+            direction: Unit vector. (3,)
+        """
+        start = origin - self._moved(picture.pos)
+        away = np.linalg.norm(start, axis=-1, keepdims=True)
+        low, high = self._bodies.low, self._bodies.high
+        drones = np.array([self._bodies.items[k].kind == DRONE for k in self._bodies.owner])
+        least = np.maximum(np.where(drones, MARK_RADIUS, 0.0)[:, None], CLICK_SIZE * away)
+        to_body = picture.quat * (-1, -1, -1, 1)
+        begin, ray = rotate(to_body, start), rotate(to_body, np.broadcast_to(direction, start.shape))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (np.minimum(low, -least) - begin) / ray, (np.maximum(high, least) - begin) / ray
+        enter, leave = np.fmin(a, b).max(-1), np.fmax(a, b).min(-1)
+        hit = (enter > 0) & (enter <= leave) & (high > low).any(-1)
+        beside = np.linalg.norm(start - (start @ direction)[..., None] * direction, axis=-1)
+        return np.where(hit, beside, np.inf)
+
+    def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
+        """Add bodies of equal geoms, one batch for each colour."""
+        by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
+        for shape in shapes:
+            by_color[tuple(np.round(shape.rgba, 3))].append(shape)
+        pos = self._moved(picture.pos)[:, bodies].reshape(-1, 3)
+        quat = np.roll(picture.quat[:, bodies], 1, axis=-1).reshape(-1, 4)
+        for k, (rgba, same) in enumerate(by_color.items()):
+            mesh = mesh_of(same)
+            handle = self._scene.add_batched_meshes_simple(
+                f"/world/bodies/{bodies[0]}/{k}", np.asarray(mesh.vertices, np.float32),
+                np.asarray(mesh.faces, np.uint32), finite_rows(quat, (1, 0, 0, 0)), finite_rows(pos),
+                batched_colors=rgb(rgba), opacity=None if rgba[3] >= 1 else float(rgba[3]), lod="off",
+                flat_shading=True, side="double",
+            )  # fmt: skip
+            self._batches.append((handle, bodies))
+
+    def _add_balls(self, name: str, radius: float, pos: NDArray, colors: Any, opacity: float) -> Any:
+        """Add a sphere for each point of all worlds, or None if there are none."""
+        if not pos.size:
+            return None
+        import trimesh
+
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+        points = finite_rows(self._moved(pos).reshape(-1, 3))
+        return self._scene.add_batched_meshes_simple(
+            f"/world/{name}", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32),
+            np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=colors, opacity=opacity, lod="off",
+        )  # fmt: skip
+
+    def _show_wind(self, drones: NDArray, picture: Picture) -> None:
+        if not picture.wind.size:
+            return
+        begin = finite_rows(drones.reshape(-1, 3))
+        ends = np.stack([begin, begin + WIND_SCALE * finite_rows(picture.wind.reshape(-1, 3))], axis=1)
+        ends = ends.astype(np.float32)
+        if self._wind is None:
+            self._wind = self._scene.add_arrows(
+                "/world/wind", ends, WIND_COLOR, shaft_radius=0.006, head_radius=0.015, head_length=0.04
+            )
+        self._wind.visible = self.visible["wind"]
+        self._wind.points = ends
+
+    def _show_lights(self, drones: NDArray, colors: NDArray) -> None:
+        """Show the LEDs of all drones; colours are sent only when they change.
+
+        Args:
+            drones: Positions, m. (n, 3)
+            colors: Colours, 0 to 1; zero for off. (n, 3)
+        """
+        if not np.array_equal(colors, self._lit):
+            self._lit = colors
+            self._lights.batched_colors = rgb_of(colors)
+            self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN).astype(np.float32)
+        if colors.any():
+            self._lights.batched_positions = finite_rows(drones)
+
+    def _show_followed(self, bodies: NDArray, picture: Picture, follow: bool) -> None:
+        k = None
+        if picture.followed is not None:
+            k = next((i for i, world in enumerate(picture.worlds) if world == picture.followed[0]), None)
+        self._followed.visible = k is not None
+        if k is None or picture.followed is None:
+            self._root.position = (0.0, 0.0, 0.0)
+            return
+        pos = finite_rows(bodies[k, picture.followed[1]])
+        radius = self._bodies.radius(picture.followed[1])
+        self._followed.position = pos
+        if radius != self._followed.radius:  # browsers build the sphere again for it
+            self._followed.radius, self._label.position = radius, (0.0, 0.0, radius)
+        self._label.text = picture.name
+        self._root.position = -pos if follow else (0.0, 0.0, 0.0)
+
+    def _moved(self, pos: NDArray) -> NDArray:
+        """Return positions of every world at the world's place in the grid."""
+        return pos + self.offsets[:, None]
+
+
+def grid_offsets(n: int, spacing: float) -> NDArray:
+    """Return the places of n worlds in a square grid around the origin, m. (n, 3)"""
+    columns = int(np.ceil(np.sqrt(n)))
+    row, column = np.divmod(np.arange(n), columns)
+    rows = -(-n // columns)
+    return spacing * np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row, np.zeros(n)], axis=-1)
+
+
+def rgb_of(colors: NDArray) -> NDArray:
+    """Return colours, 0 to 1, as whole numbers from 0 to 255. (n, 3)"""
+    return np.round(255 * colors[:, :3]).astype(np.uint8)
+
+
+def _alike(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
+    """Return the bodies in groups of equal geoms."""
+    groups: dict[tuple, list[int]] = defaultdict(list)
+    for body, shapes in by_body.items():
+        key = tuple(
+            (s.kind, *(np.round(x, 6).tobytes() for x in (s.size, s.rgba, s.pos, s.quat)), s.vertices.tobytes())
+            for s in shapes
+        )
+        groups[key].append(body)
+    return list(groups.values())

@@ -1,0 +1,65 @@
+"""A plot over time in a corner of a window, by MuJoCo's figures."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from crazysim.lab.live.picture import Picture
+from crazysim.media.trail import COLORS
+
+LENGTH = 400
+"""Number of samples of a line."""
+MAX_LINES = 6
+"""Most lines."""
+PART = 0.3
+"""Size of the plot, as a part of the window."""
+
+
+class Chart:
+    """Lines of the values of one quantity."""
+
+    def __init__(self, name: str):
+        """Begin empty.
+
+        Args:
+            name: Title; empty for no plot.
+        """
+        self._name, self._selected = name, None
+        self._times: list[float] = []
+        self._values: list[np.ndarray] = []
+        self._figure = figure = mujoco.MjvFigure()
+        mujoco.mjv_defaultFigure(figure)
+        figure.title, figure.flg_extend, figure.gridsize[:] = name, 1, (4, 4)
+        figure.figurergba[3] = 0.5
+        for k in range(MAX_LINES):
+            figure.linergb[k] = COLORS[k % len(COLORS), :3]
+
+    def add(self, picture: Picture) -> None:
+        """Add the values of a picture; another drone, or a jump back in time, begins again."""
+        values = picture.plot[:MAX_LINES]
+        restarts = self._times and (picture.time < self._times[-1] or len(values) != len(self._values[-1]))
+        if restarts or picture.selected != self._selected:
+            self._times.clear()
+            self._values.clear()
+        self._selected = picture.selected
+        if len(values) and np.isfinite(values).all() and (not self._times or picture.time > self._times[-1]):
+            self._times.append(picture.time)
+            self._values.append(values)
+            del self._times[:-LENGTH], self._values[:-LENGTH]
+
+    def draw(self, window: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
+        """Draw the lines into the lower right corner of a window."""
+        n = len(self._times)
+        if n < 2:
+            return
+        lines = np.stack(self._values).T
+        for k, line in enumerate(lines):
+            self._figure.linepnt[k] = n
+            self._figure.linedata[k, : 2 * n] = np.stack([self._times, line], axis=-1).ravel()
+        low, high = float(lines.min()), float(lines.max())
+        margin = max(0.05 * (high - low), 1e-3)
+        self._figure.range[:] = (self._times[0], self._times[-1]), (low - margin, high + margin)
+        width, height = int(PART * window.width), int(PART * window.height)
+        corner = mujoco.MjrRect(window.left + window.width - width, window.bottom, width, height)
+        mujoco.mjr_figure(corner, self._figure, context)

@@ -1,0 +1,60 @@
+"""Drones that circle: the flight of ``crazysim live`` without a pilot."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.lab.live.loop import Live
+
+HEIGHT = 1.0
+"""Height of the circles, m."""
+RADIUS = 0.3
+"""Radius of the circles, m."""
+PERIOD = 4.0
+"""Time of a circle, s."""
+CLIMB = 2.0
+"""Time in which the drones rise to their circles, s."""
+
+
+class Circles:
+    """Process that lets drones rise and fly circles around where they stood."""
+
+    def __init__(self, live: Live, piloted: bool):
+        """Take the places of the drones.
+
+        Args:
+            live: Loop.
+            piloted: True to let the first drone of the first world hover, for a pilot.
+        """
+        self._places = np.asarray(live.sim.data.states.pos, float).copy()
+        self._piloted = piloted
+
+    def __call__(self, live: Live) -> None:
+        """Write the setpoints of this control step."""
+        command = circling(self._places, live.time)
+        if self._piloted:
+            if live.time > CLIMB:
+                command[0, 0] = live.command[0, 0]
+            else:
+                command[0, 0, :2], command[0, 0, 3:9] = self._places[0, 0, :2], 0.0
+        live.command[:] = command
+
+
+def circling(places: NDArray, time: float) -> NDArray:
+    """Return state commands of drones that rise above places, and circle. (n_worlds, n_drones, 16)
+
+    Args:
+        places: Positions, m. (n_worlds, n_drones, 3)
+        time: Time since the start, s.
+    """
+    rise = np.clip(time / CLIMB, 0.0, 1.0)
+    part = rise**2 * (3 - 2 * rise)
+    omega = 2 * np.pi / PERIOD
+    c, s = np.cos(omega * time), np.sin(omega * time)
+    command = np.zeros((*places.shape[:2], 16))
+    command[..., :3] = places + part * np.array([RADIUS * (c - 1), RADIUS * s, HEIGHT])
+    command[..., 3:6] = part * RADIUS * omega * np.array([-s, c, 0.0])
+    command[..., 6:9] = part * RADIUS * omega**2 * np.array([-c, -s, 0.0])
+    command[..., 12] = 1.0
+    return command

@@ -1,0 +1,141 @@
+"""Commands to drones: immutable records, and what messages mean."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.framing import Message, ShowFile
+from crazysim.lab.show_files import Show
+from crazysim.lab.show_files.show_trajectory import parse_trajectory
+from crazysim.lab.show_files.skyc import parse_show
+from crazysim.trajectories import Trajectory
+from crazysim.trajectories.files import checks
+
+MAX_HEIGHT = 100.0
+"""Greatest height of a take-off, m."""
+
+
+@dataclass(frozen=True)
+class TakeOff:
+    """Take off to a height, m, above the floor."""
+
+    drone: int | None
+    """ID of the drone; None for all."""
+    height: float
+    """Height, m."""
+
+
+@dataclass(frozen=True)
+class Land:
+    """Land below the present position."""
+
+    drone: int | None
+    """ID of the drone; None for all."""
+
+
+@dataclass(frozen=True)
+class Hover:
+    """Stay at the present setpoint."""
+
+    drone: int | None
+    """ID of the drone; None for all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Upload:
+    """Receive a trajectory, to be started later."""
+
+    drone: int | None
+    """ID of the drone; None for all."""
+    trajectory: Trajectory
+    """Trajectory."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Start the trajectory that was received last."""
+
+    drone: int | None
+    """ID of the drone; None for all."""
+    relative: bool = False
+    """True where the trajectory is moved so that it begins at the present setpoint."""
+
+
+@dataclass(frozen=True)
+class SetParameter:
+    """Change a parameter of the drone's firmware."""
+
+    drone: int | None
+    """ID of the drone; None for all."""
+    name: str
+    """Name."""
+    value: float
+    """Value."""
+
+
+@dataclass(frozen=True)
+class StartShow:
+    """Start the trajectories of all drones that have received one."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadShow:
+    """Receive the trajectories of a show, the first for the first drone."""
+
+    show: Show
+    """Show."""
+
+
+Command = TakeOff | Land | Hover | Upload | Start | SetParameter | StartShow | LoadShow
+
+
+def command_of(frame: Message | ShowFile, drone: int | None = None) -> Command:
+    """Return the command in a message.
+
+    Args:
+        frame: Message.
+        drone: ID of the drone if the message has none; None for all.
+
+    Raises:
+        ConfigError: If there is no such command, or its argument is invalid.
+    """
+    if isinstance(frame, ShowFile):
+        return LoadShow(parse_show(frame.content, "a received show"))
+    drone = drone if frame.drone is None else frame.drone or None  # 00 is all
+    name, argument = frame.command, frame.argument
+    if name in ("upload", "traj"):
+        if frame.payload is None:
+            raise ConfigError(f"expected a trajectory in JSON after {name!r}, got none")
+        value = checks.parse_json(frame.payload, "a received trajectory")
+        return Upload(drone, parse_trajectory(value, "a received trajectory")[0])
+    if frame.payload is not None:
+        raise ConfigError(f"expected no JSON after {name!r}, got one")
+    if name == "takeoff":
+        return TakeOff(drone, _number(argument, 0.0, MAX_HEIGHT))
+    if name == "start":
+        if argument.lower() not in ("absolute", "abs", "relative", "rel", ""):
+            raise ConfigError(f"expected start_absolute or start_relative, got {argument!r}")
+        return Start(drone, argument.lower().startswith("rel"))
+    if name == "param":
+        parameter, equals, value = argument.partition("=")
+        if not equals or not parameter:
+            raise ConfigError(f"expected param_NAME=VALUE, got {argument!r}")
+        return SetParameter(drone, parameter, _number(value, -math.inf, math.inf))
+    plain = {"land": Land, "hover": Hover}
+    if name in plain:
+        return plain[name](drone)
+    if name == "show":
+        return StartShow()
+    raise ConfigError(f"expected takeoff, land, hover, upload, start, param or show, got {name!r}")
+
+
+def _number(text: str, low: float, high: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise ConfigError(f"expected a number, got {text[:40]!r}") from None
+    if not math.isfinite(value) or not low < value <= high:
+        raise ConfigError(f"expected a number above {low:g} and up to {high:g}, got {value!r}")
+    return value

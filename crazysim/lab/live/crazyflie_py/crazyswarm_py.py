@@ -1,0 +1,84 @@
+"""Entry of Crazyswarm2 scripts: the swarm, its clock and its drones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.crazyflie_py.crazyflie import CrazyflieServer, TimeHelper
+from crazysim.lab.live.swarm import Swarm
+from crazysim.sim.sim import Sim
+
+CONFIGURATION = Path("crazyflies.yaml")
+"""File with the drones of ``Crazyswarm()``, where there is one in the working directory."""
+
+_chosen: Swarm | None = None
+
+
+def use(swarm: Swarm | None) -> None:
+    """Let the next ``Crazyswarm()`` of a script fly this swarm; None for one of its own."""
+    global _chosen
+    _chosen = swarm
+
+
+class Crazyswarm:
+    """The swarm of a script: ``allcfs`` with the drones, and ``timeHelper`` with the clock.
+
+    Without an argument it flies the swarm of ``use``, or the drones of ``crazyflies.yaml`` in the working directory, or
+    one drone.
+    """
+
+    allcfs: CrazyflieServer
+    """All drones."""
+    timeHelper: TimeHelper
+    """Clock."""
+
+    def __init__(self, swarm: Swarm | str | Path | Mapping[str, Any] | None = None):
+        """Connect to simulated drones.
+
+        Args:
+            swarm: Swarm to fly, or path or contents of a ``crazyflies.yaml``; None for the default.
+
+        Raises:
+            ConfigError: If the configuration is invalid.
+        """
+        global _chosen
+        if swarm is None:
+            swarm, _chosen = _chosen, None
+        if swarm is None:
+            swarm = CONFIGURATION if CONFIGURATION.is_file() else {}
+        self.swarm = swarm if isinstance(swarm, Swarm) else Swarm(*_simulation(swarm))
+        self.allcfs = CrazyflieServer(self.swarm)
+        self.timeHelper = TimeHelper(self.swarm)
+
+
+def _simulation(configuration: str | Path | Mapping[str, Any]) -> tuple[Sim, list[str]]:
+    """Return the simulation and the names of a configuration's enabled robots."""
+    if isinstance(configuration, (str, Path)):
+        try:
+            import yaml
+        except ImportError as error:
+            raise ConfigError(
+                "crazyflies.yaml needs PyYAML, which is not installed. Run pip install pyyaml."
+            ) from error
+        try:
+            configuration = yaml.safe_load(Path(configuration).read_text())
+        except (OSError, yaml.YAMLError) as error:
+            raise ConfigError(f"expected a crazyflies.yaml, got {str(configuration)!r}: {error}") from error
+    robots = (configuration or {}).get("robots", {"cf1": {"initial_position": [0.0, 0.0, 0.0]}})  # type: ignore[union-attr]
+    enabled = {name: robot for name, robot in robots.items() if robot.get("enabled", True)}
+    try:
+        home = np.array([robot["initial_position"] for robot in enabled.values()], float).reshape(len(enabled), 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"expected initial_position of three numbers for every robot, got {error!r}") from error
+    if not enabled or not np.isfinite(home).all():
+        raise ConfigError(f"expected at least one enabled robot at finite positions, got {home.tolist()}")
+    sim = Sim(n_drones=len(enabled), control="state")
+    states = sim.data.states
+    sim.data = sim.data.replace(states=states.replace(pos=states.pos.at[0].set(home)))
+    sim.build_default_data()
+    return sim, list(enabled)

@@ -1,0 +1,114 @@
+"""Piecewise polynomial trajectories of Crazyswarm2 scripts, and their CSV files."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.paths import Path
+
+
+class Polynomial:
+    """Polynomial of time."""
+
+    def __init__(self, p: ArrayLike):
+        """Take coefficients, constant term first."""
+        self.p = np.asarray(p, float)
+
+    def eval(self, t: float) -> float:
+        """Return the value at a time, s."""
+        return float(polyval(float(t), self.p))
+
+    def derivative(self) -> Polynomial:
+        """Return the derivative."""
+        return Polynomial(self.p[1:] * np.arange(1, len(self.p)) if len(self.p) > 1 else [0.0])
+
+
+class Polynomial4D(NamedTuple):
+    """Polynomials of position and yaw on one piece."""
+
+    duration: float
+    """Duration, s."""
+    px: Polynomial
+    """x, m."""
+    py: Polynomial
+    """y, m."""
+    pz: Polynomial
+    """z, m."""
+    pyaw: Polynomial
+    """Yaw, rad."""
+
+
+class TrajectoryOutput(NamedTuple):
+    """Point of a trajectory."""
+
+    pos: NDArray
+    """Position, m. (3,)"""
+    vel: NDArray
+    """Velocity, m/s. (3,)"""
+    acc: NDArray
+    """Acceleration, m/s^2. (3,)"""
+    omega: NDArray
+    """Body rates of a level drone: (0, 0, yaw rate), rad/s. (3,)"""
+    yaw: float
+    """Yaw, rad."""
+
+
+class Trajectory:
+    """Trajectory of several pieces."""
+
+    def __init__(self) -> None:
+        """Begin without pieces."""
+        self.polynomials: list[Polynomial4D] = []
+        self.duration = 0.0
+
+    def loadcsv(self, filename: str | FilePath, skip_first_row: bool = True) -> None:
+        """Read pieces: in each row the duration and eight coefficients each of x, y, z and yaw.
+
+        Raises:
+            ConfigError: If the file is none of these.
+        """
+        try:
+            rows = np.loadtxt(filename, delimiter=",", skiprows=int(skip_first_row), usecols=range(33), ndmin=2)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"expected rows of 33 numbers in {str(filename)!r}, got: {error}") from error
+        if not len(rows) or not np.isfinite(rows).all() or not (rows[:, 0] > 0).all():
+            raise ConfigError(f"expected finite numbers and positive durations in {str(filename)!r}")
+        parts = [[Polynomial(row[1 + 8 * k : 9 + 8 * k]) for k in range(4)] for row in rows]
+        self.polynomials = [Polynomial4D(float(row[0]), *of_piece) for row, of_piece in zip(rows, parts, strict=True)]
+        self.duration = float(rows[:, 0].sum())
+
+    def n_pieces(self) -> int:
+        """Return the number of pieces."""
+        return len(self.polynomials)
+
+    def eval(self, t: float) -> TrajectoryOutput:
+        """Return the point at a time, s; beyond the ends it is that of the end."""
+        path = self.path()
+        found = path.derivatives(t, 2)
+        return TrajectoryOutput(found[0, :3], found[1, :3], found[2, :3], np.array([0, 0, found[1, 3]]), found[0, 3])
+
+    def path(self) -> Path:
+        """Return the trajectory for ``Commander.upload``.
+
+        Raises:
+            ConfigError: If there are no pieces, or they have different degrees or a wrong duration.
+        """
+        axes = [[p.px.p, p.py.p, p.pz.p, p.pyaw.p] for p in self.polynomials]
+        durations = np.array([p.duration for p in self.polynomials], float)
+        n = max((len(c) for piece in axes for c in piece), default=0)
+        coefficients = np.array([[np.pad(c, (0, n - len(c))) for c in piece] for piece in axes], float)
+        if (
+            not n
+            or not np.isfinite(coefficients).all()
+            or not (durations > 0).all()
+            or not np.isfinite(durations).all()
+        ):
+            raise ConfigError(f"expected pieces of finite coefficients and positive durations, got {len(axes)} pieces")
+        scaled = coefficients * durations[:, None, None] ** np.arange(n)
+        return Path(np.cumsum(durations), scaled, False)

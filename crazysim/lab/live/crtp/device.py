@@ -1,0 +1,367 @@
+"""A simulated Crazyflie at the other end of CRTP: answers to packets, and packets of its own.
+
+Ports, channels and layouts are those of cflib 0.1.34 and of crazyflie-firmware, protocol version 12. A packet is a byte
+with port and channel, and up to 30 more. Packets of another form are reported and ignored.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from crazysim.control import Control
+from crazysim.errors import ConfigError
+from crazysim.lab.live.crtp.setpoints import high_level, streamed
+from crazysim.lab.live.crtp.tables import (
+    LOG_TYPES,
+    PARAM_TYPES,
+    Reading,
+    Table,
+    Variable,
+    log_of,
+    pack,
+    supervisor_bits,
+)
+from crazysim.lab.live.swarm import Swarm
+
+PROTOCOL = 12
+"""Version of the protocol."""
+MAX_DATA = 30
+"""Largest number of bytes behind the header."""
+MAX_BLOCKS, MAX_VARIABLES = 16, 128
+"""Largest numbers of log blocks and of their variables (``Log`` of cflib)."""
+MAX_LOG = 26
+"""Largest number of bytes of the values of a log block."""
+MEMORY_SIZE = 4096
+"""Size of the memory of trajectories, bytes."""
+TRAJECTORY_MEMORY, LED_MEMORY, DECK_MEMORY = 0x12, 0x10, 0x19
+"""Types of the memories of trajectories, of the LED ring and of decks (``MemoryElement`` of cflib)."""
+DECKS = bytes([3]) + bytes(8 * 32)
+"""Memory of decks: its version, and eight descriptions, none of which is valid, as no deck has a memory of its own."""
+MAX_LINES = 256
+"""Most packets of console text that wait for a client."""
+
+CONSOLE, PARAM, COMMANDER, MEM, LOGGING, LOCALIZATION, GENERIC, HIGH_LEVEL, SUPERVISOR, PLATFORM, LINK = (
+    0, 2, 3, 4, 5, 6, 7, 8, 9, 13, 15,
+)  # fmt: skip
+"""Ports."""
+
+Packet = tuple[int, int, bytes]
+"""Port, channel and data."""
+
+
+@dataclass
+class LogBlock:
+    """Variables that are sent together."""
+
+    variables: list[tuple[int, str]]
+    """Number in the table and format of each."""
+    period: float | None = None
+    """Time between two packets, s; None while it is stopped."""
+    due: float = 0.0
+    """Time of the next packet, s."""
+
+
+class CrtpDevice:
+    """One drone of a swarm, for one client."""
+
+    def __init__(self, swarm: Swarm, drone: int | str, log: dict[str, tuple[str, Reading]] | None = None):
+        """Prepare tables and memory.
+
+        Args:
+            swarm: Swarm.
+            drone: Index or name of the drone.
+            log: Further log variables by ``group.name``: their type in C, and functions of the drone's state and its
+                commander.
+
+        Raises:
+            ConfigError: If the drone or a type does not exist.
+        """
+        self.swarm = swarm
+        self.drone = swarm.index(drone) if isinstance(drone, str) else drone
+        self.name, self.commander = swarm.names[self.drone], swarm.commanders[self.drone]
+        self.readings = log_of(swarm, self.drone) | (log or {})
+        self.log = Table([Variable(name, kind) for name, (kind, _) in self.readings.items()], LOG_TYPES)
+        self.values = swarm.parameters[self.drone]
+        kinds = self.values.kinds.items()
+        self.params = Table([Variable(name, kind.ctype, kind.read_only) for name, kind in kinds], PARAM_TYPES)
+        self.memory = bytearray(MEMORY_SIZE)
+        self.memories = [(TRAJECTORY_MEMORY, self.memory), (LED_MEMORY, bytearray(24)), (DECK_MEMORY, DECKS)]
+        self._console: deque[bytes] = deque(maxlen=MAX_LINES)
+        self.blocks: dict[int, LogBlock] = {}
+        self._ports: dict[int, Callable[[int, bytes], list[Packet]]] = {
+            PARAM: self._param, COMMANDER: self._setpoint, MEM: self._mem, LOGGING: self._logging,
+            LOCALIZATION: self._localization, GENERIC: self._generic, HIGH_LEVEL: self._high_level,
+            SUPERVISOR: self._supervisor, PLATFORM: self._platform, LINK: self._link,
+        }  # fmt: skip
+
+    # Packets --------------------------------------------------------------------------------------------------------
+
+    def handle(self, packet: bytes) -> list[bytes]:
+        """Return the answers to a packet, whatever it is."""
+        if not packet:
+            return []
+        if packet == b"\xff":  # probe of a scan
+            return [b"\xff"]
+        port, channel, data = packet[0] >> 4, packet[0] & 3, bytes(packet[1:])
+        handler = self._ports.get(port)
+        with self.swarm.lock:
+            if handler is None or len(data) > MAX_DATA:
+                self._report(f"packet to port {port} with {len(data)} bytes")
+                return []
+            try:
+                return [bytes([p << 4 | 0x0C | c]) + d for p, c, d in handler(channel, data)]
+            except ConfigError as error:
+                self._report(str(error))
+            except (struct.error, IndexError, ValueError):
+                self._report(f"packet of a wrong form to port {port}, channel {channel}: {data.hex()}")
+            return []
+
+    def due(self) -> list[bytes]:
+        """Return the packets that have become due at the swarm's time: lines of the console, and logs."""
+        now, found = self.swarm.time, []
+        with self.swarm.lock:
+            while self._console:
+                found.append(bytes([CONSOLE << 4 | 0x0C]) + self._console.popleft())
+            state = self.commander.estimate(self.swarm.state(self.drone))
+            for identity, block in self.blocks.items():
+                if block.period is None or now < block.due - 1e-9:
+                    if block.period is not None and block.due - now > block.period:  # after a reset
+                        block.due = now
+                    continue
+                block.due = max(block.due + block.period, now)
+                stamp = struct.pack("<I", round(now * 1000) & 0xFFFFFF)[:3]
+                values = b"".join(self._value(k, layout, state) for k, layout in block.variables)
+                found.append(bytes([LOGGING << 4 | 0x0C | 2, identity]) + stamp + values)
+        return found
+
+    def _value(self, k: int, layout: str, state: object) -> bytes:
+        name = self.log.variables[k].name
+        try:
+            value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
+        except Exception as error:  # of a reading that a user has added
+            self.swarm.reports.add("refused", self.name, self.swarm.time, f"log variable {name} failed: {error}")
+            value = math.nan
+        return pack(layout, value)
+
+    def _report(self, text: str) -> None:
+        """Report what was refused, on the drone's console too."""
+        self.swarm.reports.add("refused", self.name, self.swarm.time, text)
+        line = f"{text}\n".encode("ascii", "replace")
+        self._console.extend(line[k : k + MAX_DATA] for k in range(0, len(line), MAX_DATA))
+
+    # Connection -----------------------------------------------------------------------------------------------------
+
+    def _link(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 0:
+            return [(LINK, 0, data)]
+        return [(LINK, 1, b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0"))] if channel == 1 else []
+
+    def _platform(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 1 and data[0] == 0:
+            return [(PLATFORM, 1, bytes([0, PROTOCOL]))]
+        if channel == 1 and data[0] == 1:
+            return [(PLATFORM, 1, b"\x01crazysim\0")]
+        if channel == 0 and data[0] == 1:
+            self.commander.arm(bool(data[1]))
+            return [(PLATFORM, 0, bytes([1, 1, self.commander.armed]))]
+        return []
+
+    def _supervisor(self, channel: int, data: bytes) -> list[Packet]:
+        command = data[0]
+        if channel == 0 and command == 0x0C:
+            return [(SUPERVISOR, 0, bytes([0x8C]) + struct.pack("<H", supervisor_bits(self.commander)))]
+        if channel == 1 and command == 1:
+            self.commander.arm(bool(data[1]))
+            return [(SUPERVISOR, 1, bytes([0x81, 1, self.commander.armed]))]
+        if channel == 1 and command == 2:
+            return [(SUPERVISOR, 1, bytes([0x82, 0, not self.commander.locked]))]
+        if channel == 1 and command == 3:
+            self.commander.emergency()
+        return []
+
+    def _localization(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 1 and data[0] == 3:
+            self.commander.emergency()
+        return []  # positions from outside are not needed: the simulation has its own
+
+    # Setpoints ------------------------------------------------------------------------------------------------------
+
+    def _setpoint(self, channel: int, data: bytes) -> list[Packet]:
+        """Take roll, pitch, yaw and thrust in the modes of ``flightmode``; no thrust stops the motors.
+
+        crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with that of the world.
+        """
+        roll, pitch, yaw, thrust = struct.unpack("<fffH", data)
+        if thrust == 0:
+            self.commander.stop()
+        elif any(self.values[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch")):
+            self.commander.command(Control.body_rate, [*_radians(roll, -pitch, -yaw), self._force(thrust)])
+        elif self.values["flightmode.stabModeYaw"]:
+            self.commander.command(Control.attitude, [*_radians(roll, -pitch, yaw), self._force(thrust)])
+        else:
+            self.commander.attitude(*_radians(roll, -pitch, -yaw), self._force(thrust))
+        return []
+
+    def _force(self, thrust: int) -> float:
+        """Return the collective thrust, N, of 16 bits: full scale is the largest thrust of all rotors."""
+        airframe = self.swarm.sim.airframes[self.drone]
+        return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
+
+    def _generic(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 1 and data[0] == 0:
+            self.commander.notify_setpoints_stop(struct.unpack("<I", data[1:5])[0] / 1000)
+        elif channel == 0 and data[0] == 11:
+            roll, pitch, yaw_rate, thrust, rates = struct.unpack("<fffHB", data[1:])
+            angles = _radians(roll, -pitch, yaw_rate)
+            if rates:
+                self.commander.command(Control.body_rate, [*angles, self._force(thrust)])
+            else:
+                self.commander.attitude(*angles, self._force(thrust))
+        elif channel == 0:
+            streamed(self.commander, data)
+        return []
+
+    def _high_level(self, channel: int, data: bytes) -> list[Packet]:
+        try:
+            high_level(self.commander, data, bytes(self.memory))
+            code = 0
+        except ConfigError as error:
+            self._report(str(error))
+            code = errno.ENOEXEC
+        return [(HIGH_LEVEL, 0, (data[:3]).ljust(3, b"\0") + bytes([code]))]
+
+    # Tables ---------------------------------------------------------------------------------------------------------
+
+    def _contents(self, port: int, table: Table, data: bytes) -> list[Packet]:
+        """Answer requests of a table of contents, of version 2."""
+        if data[0] == 3:
+            head = struct.pack("<BHI", 3, len(table.variables), table.checksum)
+            return [(port, 0, head + (bytes([MAX_BLOCKS, MAX_VARIABLES]) if port == LOGGING else b""))]
+        (k,) = struct.unpack("<H", data[1:3])
+        return [(port, 0, data[:3] + table.item(k))] if data[0] == 2 and k < len(table.variables) else []
+
+    def _logging(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 0:
+            return self._contents(LOGGING, self.log, data)
+        if channel != 1:
+            return []
+        command, identity = data[0], data[1] if len(data) > 1 else 0
+        if command == 5:
+            self.blocks.clear()
+            return [(LOGGING, 1, bytes([5, 0, 0]))]
+        if command in (6, 7):
+            code = self._define(command, identity, data[2:])
+        elif identity not in self.blocks:
+            code = errno.ENOENT
+        elif command == 2:
+            del self.blocks[identity]
+            code = 0
+        elif command in (3, 8):
+            tens = 10 * data[2] if command == 3 else struct.unpack("<H", data[2:4])[0]
+            block = self.blocks[identity]
+            code = 0 if tens > 0 else errno.ENOEXEC
+            if tens > 0:
+                block.period, block.due = tens / 1000, self.swarm.time + tens / 1000
+        elif command == 4:
+            self.blocks[identity].period, code = None, 0
+        else:
+            code = errno.ENOEXEC
+        return [(LOGGING, 1, bytes([command, identity, code]))]
+
+    def _define(self, command: int, identity: int, data: bytes) -> int:
+        """Create a log block or append to it, and return the code of an error or 0."""
+        if command == 6 and identity in self.blocks:
+            return errno.EEXIST
+        if command == 7 and identity not in self.blocks:
+            return errno.ENOENT
+        formats = {number: layout for number, layout in LOG_TYPES.values()}
+        new = []
+        for kind, k in struct.iter_unpack("<BH", data):
+            if k >= len(self.log.variables) or kind & 15 not in formats:
+                return errno.ENOENT
+            new.append((k, formats[kind & 15]))
+        block = self.blocks.get(identity, LogBlock([]))
+        variables = block.variables + new
+        if sum(struct.calcsize(layout) for _, layout in variables) > MAX_LOG:
+            return errno.E2BIG
+        n_others = sum(len(other.variables) for i, other in self.blocks.items() if i != identity)
+        if len(self.blocks | {identity: block}) > MAX_BLOCKS or n_others + len(variables) > MAX_VARIABLES:
+            return errno.ENOMEM
+        block.variables = variables
+        self.blocks[identity] = block
+        return 0
+
+    def _param(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 0:
+            return self._contents(PARAM, self.params, data)
+        if channel == 3:
+            return self._param_misc(data)
+        (k,) = struct.unpack("<H", data[:2])
+        if k >= len(self.params.variables):
+            return [(PARAM, channel, data[:2] + bytes([errno.ENOENT]))]
+        name, layout = self.params.variables[k].name, self.params.format(k)
+        if channel == 1:
+            return [(PARAM, 1, data[:2] + b"\0" + pack(layout, self.values[name]))]
+        self._set(name, struct.unpack(layout, data[2:])[0])
+        return [(PARAM, 2, data[:2] + pack(layout, self.values[name]))]
+
+    def _param_misc(self, data: bytes) -> list[Packet]:
+        command = data[0]
+        if command == 0:
+            group, name, rest = data[1:].split(b"\0", 2)
+            full = f"{group.decode()}.{name.decode()}"
+            code = errno.ENOENT
+            formats = {number: layout for number, layout in PARAM_TYPES.values()}
+            if full in self.values and rest[0] in formats:
+                self._set(full, struct.unpack(formats[rest[0]], rest[1:])[0])
+                code = 0
+            return [(PARAM, 3, data[: len(data) - len(rest)] + bytes([code]))]
+        (k,) = struct.unpack("<H", data[1:3])
+        if command == 8 and k < len(self.params.variables):
+            value = self.values.kinds[self.params.variables[k].name].value
+            return [(PARAM, 3, data[:3] + b"\0" + pack(self.params.format(k), value))]
+        return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
+
+    def _set(self, name: str, value: float) -> None:
+        """Set a parameter; one that is refused keeps its value, which is the answer."""
+        try:
+            self.swarm.set_parameter(self.drone, name, value)
+        except ConfigError as error:
+            self._report(str(error))
+
+    def _mem(self, channel: int, data: bytes) -> list[Packet]:
+        if channel == 0:
+            if data[0] == 1:
+                return [(MEM, 0, bytes([1, len(self.memories)]))]
+            if data[0] == 2 and data[1] < len(self.memories):
+                kind, content = self.memories[data[1]]
+                return [(MEM, 0, data[:2] + struct.pack("<BI8x", kind, len(content)))]
+            return [(MEM, 0, data[:2])]
+        identity, address = struct.unpack("<BI", data[:5])
+        kind, memory = self.memories[identity] if identity < len(self.memories) else (0, b"")
+        content = data[5:]
+        length = content[0] if channel == 1 else len(content)
+        ok = address + length <= len(memory) and length <= 24
+        if channel == 1:
+            found = bytes(memory[address : address + length]) if ok else b""
+            return [(MEM, 1, data[:5] + bytes([0 if ok else errno.EIO]) + found)]
+        if channel != 2:
+            return []
+        if not isinstance(memory, bytearray):
+            ok = False
+        elif ok:
+            memory[address : address + length] = content
+            if kind == LED_MEMORY:
+                self.swarm.set_leds(self.drone, np.frombuffer(memory, ">u2"))
+        return [(MEM, 2, data[:5] + bytes([0 if ok else errno.EIO]))]
+
+
+def _radians(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
+    return math.radians(roll), math.radians(pitch), math.radians(yaw)

@@ -1,0 +1,106 @@
+"""``sim://`` for cflib: a link to a swarm in this process."""
+
+from __future__ import annotations
+
+import queue
+from typing import Any
+from urllib.parse import urlparse
+
+from crazysim.errors import ConfigError, not_installed
+from crazysim.lab.live.crtp.device import CrtpDevice
+from crazysim.lab.live.swarm import Swarm
+
+_drivers: dict[int, type] = {}
+
+
+def add_cflib_driver(swarm: Swarm) -> list[str]:
+    """Let ``cflib`` connect to the drones of a swarm in this process, and return their URIs, ``sim://cf1`` and so on.
+
+    It may be called before or after ``cflib.crtp.init_drivers()``. A later swarm hides an earlier one with its names.
+
+    Raises:
+        ConfigError: If cflib is not installed.
+    """
+    try:
+        import cflib.crtp
+    except ImportError as error:
+        raise ConfigError(not_installed("links of cflib need", "cflib", "radio")) from error
+    remove_cflib_driver(swarm)
+    _drivers[id(swarm)] = _driver(swarm)
+    cflib.crtp.CLASSES.insert(0, _drivers[id(swarm)])
+    return [f"sim://{name}" for name in swarm.names]
+
+
+def remove_cflib_driver(swarm: Swarm) -> None:
+    """Remove a swarm from ``cflib``."""
+    import cflib.crtp
+
+    driver = _drivers.pop(id(swarm), None)
+    if driver in cflib.crtp.CLASSES:
+        cflib.crtp.CLASSES.remove(driver)
+
+
+def _driver(swarm: Swarm) -> type:
+    """Return the class of links to a swarm, as cflib makes them."""
+    from cflib.crtp.crtpdriver import CRTPDriver
+    from cflib.crtp.crtpstack import CRTPPacket
+    from cflib.crtp.exceptions import WrongUriType
+
+    class SimDriver(CRTPDriver):
+        """Link to one drone of a swarm."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.needs_resending = False
+            self._device: CrtpDevice | None = None
+            self._queue: queue.Queue[CRTPPacket] = queue.Queue()
+
+        def connect(self, uri: str, *callbacks: Any) -> None:
+            """Connect to ``sim://NAME``."""
+            parts = urlparse(uri)
+            if parts.scheme != "sim" or parts.netloc not in swarm.names:
+                raise WrongUriType(f"expected one of {[f'sim://{name}' for name in swarm.names]}, got {uri!r}")
+            self._device = CrtpDevice(swarm, parts.netloc)
+            swarm.listeners.append(self._send_due)
+
+        def send_packet(self, pk: CRTPPacket) -> None:
+            """Hand a packet to the drone, and queue its answers."""
+            if self._device is not None:
+                for answer in self._device.handle(bytes([pk.header, *pk.data])):
+                    self._put(answer)
+
+        def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
+            """Return the next packet; None if there is none within a time, s."""
+            try:
+                return self._queue.get(wait != 0, None if wait < 0 else wait)
+            except queue.Empty:
+                return None
+
+        def get_status(self) -> str:
+            """Return a description."""
+            return "simulated"
+
+        def get_name(self) -> str:
+            """Return the name of the kind of link."""
+            return "sim"
+
+        def scan_interface(self, address: Any = None) -> list[list[str]]:
+            """Return the URIs of all drones."""
+            return [[f"sim://{name}", ""] for name in swarm.names]
+
+        def close(self) -> None:
+            """Disconnect."""
+            if self._device is not None:
+                self._device = None
+                swarm.listeners.remove(self._send_due)
+
+        def _send_due(self) -> None:
+            device = self._device
+            if device is not None:
+                for packet in device.due():
+                    self._put(packet)
+
+        def _put(self, packet: bytes) -> None:
+            self._queue.put(CRTPPacket(packet[0], packet[1:]))
+
+    return SimDriver

@@ -1,0 +1,105 @@
+"""CRTP over UDP: one port for each drone, which ``cflib`` reaches by ``udp://127.0.0.1:19850`` and the ports after it.
+
+The protocol has no passwords, so the server binds to this machine only unless another address is given.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import selectors
+import socket
+import threading
+
+from crazysim.closing import Closing
+from crazysim.errors import ConfigError
+from crazysim.lab.live.crtp.device import CrtpDevice
+from crazysim.lab.live.swarm import Swarm
+
+PORT = 19850
+"""First port; cflib scans ten from here on."""
+POLL = 0.1
+"""Longest time until the thread notices that the server is closed, s."""
+
+log = logging.getLogger(__name__)
+
+
+class CrtpServer(Closing):
+    """Drones of a swarm on UDP, answered by a thread."""
+
+    def __init__(self, swarm: Swarm, host: str = "127.0.0.1", port: int = PORT):
+        """Compile a step of the swarm, since clients wait for less time than that takes, and listen.
+
+        Args:
+            swarm: Swarm, which something else advances, such as ``swarm.start()``.
+            host: Address to listen at; this machine's alone by default, ``0.0.0.0`` for every network.
+            port: Port of the first drone; 0 for any free ones.
+
+        Raises:
+            ConfigError: If it cannot listen there.
+        """
+        if host not in ("127.0.0.1", "localhost"):
+            log.warning("listening at %s: every machine of that network can fly the drones", host)
+        swarm.compile_step()
+        self.swarm = swarm
+        self.devices = [CrtpDevice(swarm, k) for k in range(len(swarm.names))]
+        self._clients: list[tuple[str, int] | None] = [None] * len(self.devices)
+        self._sockets: list[socket.socket] = []
+        self._selector = selectors.DefaultSelector()
+        self._stopped = threading.Event()
+        for k in range(len(self.devices)):
+            peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._sockets.append(peer)
+            try:
+                peer.bind((host, port + k if port else 0))
+            except (OSError, OverflowError) as error:
+                self._close_sockets()
+                raise ConfigError(
+                    f"expected a free address, got {host}:{port + k}: {error}. Use another port."
+                ) from error
+            peer.setblocking(False)
+            self._selector.register(peer, selectors.EVENT_READ, k)
+        swarm.listeners.append(self._send_due)
+        self._thread = threading.Thread(target=self._serve, name="crtp", daemon=True)
+        self._thread.start()
+
+    @property
+    def uris(self) -> list[str]:
+        """URIs of the drones for cflib."""
+        addresses = [peer.getsockname() for peer in self._sockets]
+        return [f"udp://{host if host != '0.0.0.0' else '127.0.0.1'}:{port}" for host, port in addresses]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._stopped.set()
+        self._thread.join()
+        self.swarm.listeners.remove(self._send_due)
+        self._close_sockets()
+
+    def _close_sockets(self) -> None:
+        for peer in self._sockets:
+            peer.close()
+        self._selector.close()
+
+    def _serve(self) -> None:
+        while not self._stopped.is_set():
+            for key, _ in self._selector.select(POLL):
+                k = key.data
+                try:
+                    packet, address = self._sockets[k].recvfrom(2048)
+                    if packet != b"\xff":
+                        self._clients[k] = address
+                    for answer in self.devices[k].handle(packet):
+                        self._sockets[k].sendto(answer, address)
+                except OSError:  # of a client that is gone
+                    continue
+                except Exception:  # the other drones are answered nevertheless
+                    log.exception("%s: a packet was not answered", self.swarm.names[k])
+
+    def _send_due(self) -> None:
+        """Send the log packets that are due; the swarm calls it after every control step."""
+        for device, peer, client in zip(self.devices, self._sockets, self._clients, strict=True):
+            if client is not None:
+                for packet in device.due():
+                    with contextlib.suppress(OSError):
+                        peer.sendto(packet, client)

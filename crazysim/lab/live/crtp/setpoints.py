@@ -1,0 +1,160 @@
+"""Contents of CRTP packets with commands: streamed setpoints, high-level commands, trajectories in memory."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.paths import Path
+from crazysim.lab.live.swarm.commander import Commander
+from crazysim.trajectories.bezier import power_of
+
+PIECE = 132
+"""Size of an uncompressed piece, bytes: 8 coefficients each of x, y, z and yaw, and the duration."""
+N_POINTS = (0, 1, 3, 7)
+"""Number of further control points of each type of a compressed coordinate (``CompressedSegment`` of cflib)."""
+
+
+def streamed(commander: Commander, data: bytes) -> None:
+    """Carry out a packet of the generic commander: its type, then numbers (crtp_commander_generic.c).
+
+    Raises:
+        ConfigError: If the commander refuses it, or the type is not supported.
+        struct.error: If it has a wrong length.
+    """
+    kind, content = data[0], data[1:]
+    if kind == 0:
+        commander.stop()
+    elif kind in (1, 8):
+        x, y, z, rate = struct.unpack("<ffff", content)
+        commander.velocity([x, y, z], math.radians(-rate if kind == 1 else rate))
+    elif kind in (5, 10):
+        x, y, rate, height = struct.unpack("<ffff", content)
+        commander.hover(x, y, math.radians(-rate if kind == 5 else rate), height)
+    elif kind == 6:
+        *numbers, packed, wx, wy, wz = struct.unpack("<9hI3h", content)
+        pos, vel, acc = np.reshape(numbers, (3, 3)) / 1000
+        # The firmware reads mrad/s, although the docstring of cflib 0.1.34 states degrees/s.
+        commander.full_state(pos, vel, acc, unpack_quat(packed), np.array([wx, wy, wz]) / 1000)
+    elif kind == 7:
+        x, y, z, yaw = struct.unpack("<ffff", content)
+        commander.position([x, y, z], math.radians(yaw))
+    else:
+        raise ConfigError(f"expected a setpoint of type 0, 1, 5, 6, 7, 8, 10 or 11, got {kind}")
+
+
+def unpack_quat(packed: int) -> NDArray:
+    """Return the quaternion, xyzw, of 32 bits: the index of the largest component, then the others, 10 bits each."""
+    largest, quat = packed >> 30, np.zeros(4)
+    for i in (i for i in (3, 2, 1, 0) if i != largest):
+        size = (packed & 0x1FF) / 0x1FF / math.sqrt(2)
+        quat[i] = -size if packed >> 9 & 1 else size
+        packed >>= 10
+    quat[largest] = math.sqrt(max(1 - float((quat**2).sum()), 0.0))
+    return quat
+
+
+def high_level(commander: Commander, data: bytes, memory: bytes) -> None:
+    """Carry out a packet of the high-level commander: its type, then numbers (crtp_commander_high_level.c).
+
+    Raises:
+        ConfigError: If the commander refuses it, or the type is not supported.
+        struct.error: If it has a wrong length.
+    """
+    kind, content = data[0], data[1:]
+    if kind == 0:
+        (commander.group,) = struct.unpack("<B", content)
+        return
+    if kind == 6:
+        identity, location, encoding, offset, n = struct.unpack("<BBBIB", content)
+        if location != 1 or encoding not in (0, 1):
+            raise ConfigError(
+                f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}"
+            )
+        path = _compressed(memory, offset) if encoding else _uncompressed(memory, offset, n)
+        commander.upload(identity, path, compressed=bool(encoding))
+        return
+    if not commander.in_group(content[0]):
+        return
+    content = content[1:]
+    if kind in (1, 2):
+        height, duration = struct.unpack("<ff", content)
+        (commander.take_off if kind == 1 else commander.land)(height, duration, 0.0)
+    elif kind in (7, 8):
+        height, yaw, current, duration = struct.unpack("<ff?f", content)
+        (commander.take_off if kind == 7 else commander.land)(height, duration, None if current else yaw)
+    elif kind == 3:
+        commander.stop()
+    elif kind == 4:
+        relative, x, y, z, yaw, duration = struct.unpack("<?fffff", content)
+        commander.go_to([x, y, z], yaw, duration, relative)
+    elif kind == 12:
+        relative, linear, x, y, z, yaw, duration = struct.unpack("<??fffff", content)
+        commander.go_to([x, y, z], yaw, duration, relative, linear)
+    elif kind == 5:
+        relative, backwards, identity, scale = struct.unpack("<??Bf", content)
+        commander.start_trajectory(identity, scale, relative, backwards)
+    elif kind == 13:
+        relative, relative_yaw, backwards, identity, scale = struct.unpack("<???Bf", content)
+        commander.start_trajectory(identity, scale, relative, backwards, relative_yaw)
+    else:
+        raise ConfigError(f"expected a high-level command of type 0 to 8, 12 or 13, got {kind}")
+
+
+def _uncompressed(memory: bytes, offset: int, n: int) -> Path:
+    """Return the trajectory of polynomials in memory."""
+    if not n or offset + PIECE * n > len(memory):
+        raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n} from {offset} on")
+    with np.errstate(invalid="ignore"):  # of NaN, which is refused below
+        numbers = np.frombuffer(memory, "<f4", 33 * n, offset).astype(float).reshape(n, 33)
+    durations, c = numbers[:, 32], numbers[:, :32].reshape(n, 4, 8)
+    _require_durations(durations)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _checked(durations, c * durations[:, None, None] ** np.arange(8))
+
+
+def _compressed(memory: bytes, offset: int) -> Path:
+    """Return the trajectory of Bezier curves in memory: a start, then segments of control points.
+
+    A segment without duration ends it, whatever number of pieces was sent with its definition (pptraj_compressed.c).
+    Positions are in mm, yaw in tenths of degrees, durations in ms.
+    """
+    units = np.array([0.001, 0.001, 0.001, math.radians(0.1)])
+    durations, pieces = [], []
+    try:
+        last, at = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
+        while (head := struct.unpack_from("<BH", memory, at))[1] > 0:
+            kinds, ms = head
+            at += 3
+            rows = []
+            for axis in range(4):
+                n_points = N_POINTS[kinds >> (2 * axis) & 3]
+                points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, at)) * units[axis]]
+                at += 2 * n_points
+                c = power_of(np.array(points)[:, None])[0]
+                rows.append(np.pad(c, (0, 8 - len(c))))
+                last[axis] = points[-1]
+            durations.append(ms / 1000)
+            pieces.append(rows)
+    except struct.error:
+        raise ConfigError(
+            f"expected a compressed trajectory that a segment of duration 0 ends within {len(memory)} bytes, got none"
+        ) from None
+    if not pieces:  # the firmware stays at the start
+        durations, pieces = [0.001], [[[x] + [0.0] * 7 for x in last]]
+    return _checked(np.array(durations), np.array(pieces))
+
+
+def _require_durations(durations: NDArray) -> None:
+    if not len(durations) or not np.isfinite(durations).all() or not (durations > 1e-4).all() or durations.sum() > 1e5:
+        raise ConfigError(f"expected pieces of positive durations, got {durations.tolist()} s")
+
+
+def _checked(durations: NDArray, coefficients: NDArray) -> Path:
+    if not np.isfinite(coefficients).all() or np.abs(coefficients).max() > 1e6:
+        raise ConfigError("expected a trajectory of finite coefficients, got others")
+    return Path(np.cumsum(durations), coefficients, False)

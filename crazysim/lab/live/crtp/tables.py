@@ -1,0 +1,164 @@
+"""Tables of contents: log variables and parameters of a simulated Crazyflie, by name and type."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.errors import ConfigError
+from crazysim.lab.live.swarm import Commander, DroneState, Swarm
+from crazysim.lab.live.swarm.sensors import battery_of, ranges_of
+
+LOG_TYPES = {
+    "uint8_t": (1, "<B"), "uint16_t": (2, "<H"), "uint32_t": (3, "<I"), "int8_t": (4, "<b"), "int16_t": (5, "<h"),
+    "int32_t": (6, "<i"), "float": (7, "<f"), "FP16": (8, "<e"),
+}  # fmt: skip
+"""Number and format of the types of log variables (``LogTocElement`` of cflib)."""
+PARAM_TYPES = {
+    "int8_t": (0, "<b"), "int16_t": (1, "<h"), "int32_t": (2, "<i"), "FP16": (5, "<e"), "float": (6, "<f"),
+    "uint8_t": (8, "<B"), "uint16_t": (9, "<H"), "uint32_t": (10, "<I"),
+}  # fmt: skip
+"""Number and format of the types of parameters (``ParamTocElement`` of cflib)."""
+READ_ONLY = 0x40
+"""Bit of the type of a parameter that cannot be written."""
+OUT_OF_RANGE = 32767
+"""Distance where nothing is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
+RANGES = {"down": "zrange"}
+"""Log variables of directions that have another name."""
+
+Reading = Callable[[DroneState, Commander], float]
+"""Value of a log variable of a drone."""
+
+
+class Variable(NamedTuple):
+    """One log variable or parameter."""
+
+    name: str
+    """Group and name, ``group.name``."""
+    ctype: str
+    """Type in C."""
+    read_only: bool = False
+    """True where it cannot be written."""
+
+
+class Table:
+    """Variables with consecutive numbers, as the protocol transfers them."""
+
+    def __init__(self, variables: list[Variable], types: Mapping[str, tuple[int, str]]):
+        """Number the variables.
+
+        Raises:
+            ConfigError: If a name has no group, is there twice or is too long for a packet, or a type does not exist.
+        """
+        self.variables, self.types = variables, types
+        self.ids = {variable.name: k for k, variable in enumerate(variables)}
+        for variable in variables:
+            if variable.name.count(".") != 1 or len(variable.name) > 24 or variable.ctype not in types:
+                raise ConfigError(f"expected group.name of up to 24 letters and one of {list(types)}, got {variable}")
+        if len(self.ids) < len(variables):
+            raise ConfigError("expected different names of variables, got one twice")
+        self.checksum = zlib.crc32(b"".join(self.item(k) for k in range(len(variables))))
+
+    def item(self, k: int) -> bytes:
+        """Return the description of a variable: type, group and name."""
+        variable = self.variables[k]
+        group, name = variable.name.split(".")
+        kind = self.types[variable.ctype][0] | (READ_ONLY if variable.read_only else 0)
+        return bytes([kind]) + group.encode() + b"\0" + name.encode() + b"\0"
+
+    def format(self, k: int) -> str:
+        """Return the format of a variable for ``struct``."""
+        return self.types[self.variables[k].ctype][1]
+
+
+def pack(layout: str, value: float) -> bytes:
+    """Return a number in a format; integers are rounded, and all are limited to what the format holds."""
+    if layout in ("<f", "<e"):
+        largest = 3.4e38 if layout == "<f" else 65504.0
+        return struct.pack(layout, value if math.isnan(value) else min(max(value, -largest), largest))
+    bits = 8 * struct.calcsize(layout)
+    signed = layout[1].islower()
+    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+    return struct.pack(layout, min(max(round(value) if math.isfinite(value) else 0, low), high))
+
+
+def _axes(group: str, names: str, field: str, scale: float = 1.0) -> dict[str, tuple[str, Reading]]:
+    """Return log variables of the components of a field of the state."""
+
+    def reading(k: int) -> Reading:
+        return lambda state, _c: scale * float(getattr(state, field)[k])
+
+    return {f"{group}.{name}": ("float", reading(k)) for k, name in enumerate(names.split())}
+
+
+def _angles(group: str) -> dict[str, tuple[str, Reading]]:
+    """Return log variables of roll, pitch and yaw in degrees; the firmware's pitch has the opposite sign."""
+    signs = {"roll": (0, 1), "pitch": (1, -1), "yaw": (2, 1)}
+
+    def reading(k: int, sign: int) -> Reading:
+        return lambda state, _c: sign * math.degrees(float(state.rpy[k]))
+
+    return {f"{group}.{name}": ("float", reading(*which)) for name, which in signs.items()}
+
+
+def _goal(row: int, k: int) -> Reading:
+    return lambda _s, commander: float(commander.goal()[row, k])
+
+
+LOG: dict[str, tuple[str, Reading]] = {
+    **_axes("stateEstimate", "x y z", "pos"),
+    **_axes("stateEstimate", "vx vy vz", "vel"),
+    **_axes("stateEstimate", "ax ay az", "acc", 1 / GRAVITY_MAGNITUDE),
+    **_axes("stateEstimate", "qx qy qz qw", "quat"),
+    **_angles("stateEstimate"),
+    **_angles("stabilizer"),
+    **_axes("kalman", "stateX stateY stateZ", "pos"),
+    **{f"kalman.varP{axis}": ("float", lambda _s, _c: 1e-6) for axis in "XYZ"},
+    **_axes("gyro", "x y z", "ang_vel", 180 / math.pi),
+    **_axes("acc", "x y z", "acc", 1 / GRAVITY_MAGNITUDE),
+    **{f"ctrltarget.{axis}": ("float", _goal(0, k)) for k, axis in enumerate("xyz")},
+    **{f"ctrltarget.v{axis}": ("float", _goal(1, k)) for k, axis in enumerate("xyz")},
+    "ctrltarget.yaw": ("float", lambda _s, commander: math.degrees(commander.goal()[0, 3])),
+    "radio.rssi": ("uint8_t", lambda _s, _c: 0),
+    "colorLedBot.deckTemp": ("uint8_t", lambda _s, _c: 25),
+    "colorLedBot.throttlePct": ("uint8_t", lambda _s, _c: 0),
+    "sys.canfly": ("uint8_t", lambda _s, commander: commander.armed and not commander.locked),
+    "sys.isFlying": ("uint8_t", lambda _s, commander: commander.motors_on),
+    "sys.isTumbled": ("uint8_t", lambda state, _c: np.cos(state.rpy[0]) * np.cos(state.rpy[1]) < 0),
+    "supervisor.info": ("uint16_t", lambda _s, commander: supervisor_bits(commander)),
+}
+"""Log variables that every simulated drone has, with their types and readings."""
+
+
+def log_of(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
+    """Return the log variables of a drone: those of every one, of its battery, and of its range finder."""
+    sim = swarm.sim
+
+    def distance(name: str) -> Reading:
+        def millimetres(_state: DroneState, _commander: Commander) -> float:
+            value = 1000 * ranges_of(sim, drone)[name]
+            return value if math.isfinite(value) else OUT_OF_RANGE
+
+        return millimetres
+
+    ranges = {f"range.{RANGES.get(name, name)}": ("uint16_t", distance(name)) for name in ranges_of(sim, drone)}
+    battery: dict[str, tuple[str, Reading]] = {
+        "pm.vbat": ("float", lambda _s, _c: battery_of(sim, drone).voltage),
+        "pm.state": ("uint8_t", lambda _s, _c: battery_of(sim, drone).state),
+        "pm.batteryLevel": ("uint8_t", lambda _s, _c: 100 * battery_of(sim, drone).charge),
+    }
+    return LOG | battery | ranges
+
+
+def supervisor_bits(commander: Commander) -> int:
+    """Return the state of the supervisor: bits as in ``Supervisor.STATES`` of cflib."""
+    free, flies = not commander.locked, commander.motors_on
+    bits = [free, commander.armed, True, commander.armed and free, flies, False, commander.locked, False]
+    bits += [flies, commander.finished, False]
+    return sum(int(bit) << k for k, bit in enumerate(bits))

@@ -1,0 +1,237 @@
+"""Fleets: the drones of a running simulation, which commands move."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import from_yaw
+from crazysim.lab.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
+from crazysim.lab.live.paths import Path
+from crazysim.lab.show_files.lights import Lights
+from crazysim.plugins.follow import Follow
+from crazysim.sim.sim import Sim
+from crazysim.trajectories import Trajectory, hover, line
+
+SPEED = 0.5
+"""Mean speed of take-off and landing, m/s."""
+MIN_TIME = 1.0
+"""Least time of take-off and landing, s."""
+MAX_PIECES = 256
+"""Most pieces of a trajectory, by default."""
+DEGREE = 7
+"""Highest degree of a trajectory."""
+
+log = logging.getLogger(__name__)
+
+
+class Fleet:
+    """The drones of a simulation of one world, each with a trajectory of its own that commands exchange.
+
+        sim = Sim(n_drones=3, control="state")
+        fleet = Fleet(sim)
+        fleet.apply([TakeOff(None, 0.5)])
+        sim.step(500)
+
+    Commands take effect between two steps; nothing is compiled again. One that cannot be carried out is logged, and the
+    drone continues what it was doing. IDs of drones that are not yet in use go to the next free drone.
+    """
+
+    parameters: list[dict[str, float]]
+    """Parameters of each drone's firmware that commands have set, by name."""
+
+    def __init__(
+        self,
+        sim: Sim,
+        ids: Mapping[int, int] | None = None,
+        max_pieces: int = MAX_PIECES,
+        teleport: bool = True,
+        name: str = "fleet",
+    ):
+        """Let every drone hover where it is.
+
+        Args:
+            sim: Simulation of one world with state commands.
+            ids: Drone of each ID that is in use; None for none.
+            max_pieces: Most pieces of a trajectory.
+            teleport: True to move a drone to the start of the first trajectory that it receives before any other
+                command, as the lab's simulator does.
+            name: Name of the plugin that follows the trajectories.
+
+        Raises:
+            ConfigError: If the simulation has several worlds or other commands, or an ID has no drone.
+        """
+        if sim.n_worlds != 1:
+            raise ConfigError(f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories of many.")
+        self.sim, self.teleport = sim, teleport
+        self.ids = dict(ids or {})
+        if len(set(self.ids.values())) < len(self.ids) or not all(0 <= i < sim.n_drones for i in self.ids.values()):
+            raise ConfigError(f"expected one drone of {sim.n_drones} for each ID, got {self.ids}")
+        pos = np.asarray(sim.data.states.pos[0], float)
+        self._active = [_hover(np.append(p, 0.0)) for p in pos]
+        self._starts = np.zeros(sim.n_drones)
+        self._uploaded: dict[int, Trajectory] = {}
+        self._untouched = [True] * sim.n_drones
+        self.parameters = [{} for _ in range(sim.n_drones)]
+        self._lights: Lights | None = None
+        self._show_start: float | None = None
+        drones = np.arange(sim.n_drones)[None]
+        self.follow = Follow(
+            self._active, index=drones, start=np.zeros((1, sim.n_drones)), n_slots=sim.n_drones,
+            max_pieces=max_pieces, visible=False, name=name,
+        )  # fmt: skip
+        sim.add(self.follow)
+        sim.build_default_data()
+
+    def apply(self, commands: Iterable[Command]) -> int:
+        """Carry out commands between two steps, and return the number of those that could be.
+
+        Args:
+            commands: Commands, in their order; one that cannot be carried out is logged.
+        """
+        n = 0
+        for command in commands:
+            try:
+                self._apply(command)
+                n += 1
+            except ConfigError as error:
+                log.warning("%s refused: %s", type(command).__name__, error)
+        return n
+
+    def reset(self) -> None:
+        """Let every drone hover where it is again, as after ``sim.reset()``; trajectories that it received stay."""
+        self._untouched = [True] * self.sim.n_drones
+        self._show_start = None
+        for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
+            self._fly(drone, _hover(np.append(pos, 0.0)))
+            self._untouched[drone] = drone not in self._uploaded
+
+    def colors(self) -> NDArray:
+        """Return the present colours of the LEDs, those of the received show once it has started. (n_drones, 3)"""
+        found = np.zeros((self.sim.n_drones, 3))
+        if self._lights is not None and self._show_start is not None:
+            shown = self._lights.colors([self._now() - self._show_start])[0]
+            found[: len(shown)] = shown
+        return found
+
+    def setpoint(self, drone: int) -> NDArray:
+        """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
+        return Path.of(self._active[drone]).at(self._now() - self._starts[drone])
+
+    def _now(self) -> float:
+        return float(self.sim.time[0, 0])
+
+    def _apply(self, command: Command) -> None:
+        if isinstance(command, LoadShow):
+            show = command.show
+            if show.n_drones > self.sim.n_drones:
+                raise ConfigError(f"expected a show of at most {self.sim.n_drones} drones, got {show.n_drones}")
+            received = [_without_padding(show.trajectory(i)) for i in range(show.n_drones)]
+            for trajectory in received:
+                self._check(trajectory)
+            for drone, trajectory in enumerate(received):
+                self._receive(drone, trajectory)
+            self._lights, self._show_start = show.lights, None
+        elif isinstance(command, StartShow):
+            if not self._uploaded:
+                raise ConfigError("expected trajectories to start, got none. Upload some first.")
+            for drone in self._uploaded:
+                self._start(drone, relative=False)
+            self._show_start = self._now()
+        else:
+            if isinstance(command, Upload):
+                self._check(command.trajectory)
+            drones = self._drones(command.drone)
+            if isinstance(command, Start) and any(drone not in self._uploaded for drone in drones):
+                raise ConfigError("expected a trajectory to start, got none. Upload one first.")
+            for drone in drones:
+                self._apply_to(command, drone)
+
+    def _apply_to(self, command: Command, drone: int) -> None:
+        """Carry out a command to one drone."""
+        if isinstance(command, Upload):
+            self._receive(drone, command.trajectory)
+            return
+        if isinstance(command, SetParameter):
+            self.parameters[drone][command.name] = command.value
+            log.info("drone %d: %s = %g", drone, command.name, command.value)
+            return
+        here = self.setpoint(drone)
+        if isinstance(command, Start):
+            self._start(drone, command.relative)
+        elif isinstance(command, Hover):
+            self._fly(drone, _hover(here))
+        elif isinstance(command, TakeOff):
+            self._fly(drone, _move(here, command.height))
+        elif isinstance(command, Land):
+            self._fly(drone, _move(here, 0.0))
+
+    def _drones(self, identity: int | None) -> list[int]:
+        """Return the drones of an ID; a new one gets the next free drone."""
+        if identity is None:
+            return list(range(self.sim.n_drones))
+        if identity not in self.ids:
+            free = sorted(set(range(self.sim.n_drones)) - set(self.ids.values()))
+            if not free:
+                raise ConfigError(f"expected one of the IDs {sorted(self.ids)}, got {identity}: no drone is free")
+            self.ids[identity] = free[0]
+            log.info("ID %d is drone %d", identity, free[0])
+        return [self.ids[identity]]
+
+    def _check(self, trajectory: Trajectory) -> None:
+        n_pieces = self.follow.read(self.sim.data).ends.shape[1]
+        if np.ndim(trajectory.ends) != 1 or trajectory.n_pieces > n_pieces or trajectory.degree > DEGREE:
+            raise ConfigError(
+                f"expected a trajectory of one vehicle with at most {n_pieces} pieces of degree {DEGREE}, got ends of "
+                f"shape {np.shape(trajectory.ends)} and degree {trajectory.degree}. Use Fleet(..., max_pieces=...)."
+            )
+
+    def _receive(self, drone: int, trajectory: Trajectory) -> None:
+        self._uploaded[drone] = trajectory
+        if self.teleport and self._untouched[drone]:
+            begin = Path.of(trajectory).at(0.0)
+            states = self.sim.data.states
+            pos = states.pos.at[0, drone].set(jnp.asarray(begin[:3], states.pos.dtype))
+            quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(begin[3]), states.quat.dtype))
+            self.sim.data = self.sim.data.replace(states=states.replace(pos=pos, quat=quat))
+            self._fly(drone, _hover(begin))
+        self._untouched[drone] = False
+
+    def _start(self, drone: int, relative: bool) -> None:
+        trajectory = self._uploaded[drone]
+        if relative:
+            trajectory = trajectory.moved((self.setpoint(drone) - Path.of(trajectory).at(0.0))[:3])
+        self._fly(drone, trajectory)
+
+    def _fly(self, drone: int, trajectory: Trajectory) -> None:
+        """Let a drone follow a trajectory from now on."""
+        data = self.follow.uploaded(self.sim.data, drone, trajectory)
+        record, now = self.follow.read(data), self._now()
+        start = record.start.at[0, drone, 0].set(jnp.asarray(now, record.start.dtype))
+        self.sim.data = self.follow.write(data, record.replace(start=start))
+        self._active[drone], self._starts[drone], self._untouched[drone] = trajectory, now, False
+
+
+def _hover(point: NDArray) -> Trajectory:
+    """Return the trajectory that stays at a position, m, and yaw, rad. (4,)"""
+    return hover(point[:3], float(point[3]))
+
+
+def _move(point: NDArray, height: float) -> Trajectory:
+    """Return the vertical move from a position, m, and yaw, rad, to a height, m, at rest at both ends."""
+    seconds = max(abs(height - float(point[2])) / SPEED, MIN_TIME)
+    return line(point[:3], [point[0], point[1], height], seconds, yaw=float(point[3]))
+
+
+def _without_padding(trajectory: Trajectory) -> Trajectory:
+    """Return one trajectory of a stacked record without the pieces that have no length."""
+    ends = np.asarray(trajectory.ends, float)
+    n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)
+    cut = jax.tree.map(np.asarray, trajectory)
+    return cut.replace(ends=cut.ends[:n], coefficients=cut.coefficients[:n])

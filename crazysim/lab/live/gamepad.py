@@ -1,0 +1,100 @@
+"""Gamepads, read through GLFW, which MuJoCo installs and which has the layouts of all common ones."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.loop import Live
+
+DEADBAND = 0.12
+"""Deflection below which a stick counts as released, 0 to 1."""
+N_JOYSTICKS = 16
+"""Number of joysticks that GLFW distinguishes, GLFW_JOYSTICK_LAST + 1."""
+
+
+class Gamepad:
+    """Sticks of a gamepad, for ``Pilot(sticks=[Gamepad()])``.
+
+    The left stick climbs and turns, the right one flies forwards and sideways: mode 2 of model flying. Buttons call
+    functions of the loop: ``gamepad.bind("a", lambda live: live.reset())``. A gamepad that is pulled out counts as
+    released until it is back.
+    """
+
+    def __init__(self, number: int | None = None, glfw: Any = None):
+        """Open a gamepad.
+
+        Args:
+            number: Number of the gamepad, from 0; None for the first there is.
+            glfw: Module with the functions of GLFW; None for ``glfw``.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        self._glfw = _glfw() if glfw is None else glfw
+        numbers = range(N_JOYSTICKS) if number is None else [number]
+        found = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
+        if not found:
+            raise ConfigError("expected a gamepad, got none. Connect it before the program starts.")
+        self._number = found[0]
+        self._calls: dict[int, Callable[[Live], object]] = {}
+        self._before: list[int] = []
+
+    @property
+    def name(self) -> str:
+        """Name of the gamepad's layout."""
+        name = self._glfw.get_gamepad_name(self._number)
+        return name.decode(errors="replace") if isinstance(name, bytes) else str(name or "disconnected")
+
+    def bind(self, button: str, call: Callable[[Live], object]) -> None:
+        """Let a button call a function of the loop.
+
+        Args:
+            button: ``"a"``, ``"b"``, ``"x"``, ``"y"``, ``"left_bumper"``, ``"right_bumper"``, ``"back"``, ``"start"``,
+                ``"guide"``, ``"dpad_up"``, ...: GLFW's names.
+            call: Function of the loop.
+
+        Raises:
+            ConfigError: If there is no such button.
+        """
+        index = getattr(self._glfw, f"GAMEPAD_BUTTON_{button.upper()}", None)
+        if index is None:
+            raise ConfigError(f"expected the name of a button, such as 'a' or 'start', got {button!r}")
+        self._calls[index] = call
+
+    def __call__(self, live: Live) -> NDArray:
+        """Return forward, left, up and turn left, from -1 to 1, and call the functions of buttons. (4,)"""
+        glfw = self._glfw
+        state = glfw.get_gamepad_state(self._number)
+        if not state:
+            self._before = []
+            return np.zeros(4)
+        buttons, axes = list(state.buttons), state.axes
+        for index, call in self._calls.items():
+            if buttons[index] and not (self._before and self._before[index]):
+                live.post(call)
+        self._before = buttons
+        right_y, right_x = axes[glfw.GAMEPAD_AXIS_RIGHT_Y], axes[glfw.GAMEPAD_AXIS_RIGHT_X]
+        left_y, left_x = axes[glfw.GAMEPAD_AXIS_LEFT_Y], axes[glfw.GAMEPAD_AXIS_LEFT_X]
+        return shaped(-np.array([right_y, right_x, left_y, left_x]))  # GLFW: down and right are positive
+
+
+def shaped(sticks: NDArray) -> NDArray:
+    """Return deflections without their dead band, stretched to -1 to 1 again; non-finite ones count as released."""
+    finite = np.where(np.isfinite(sticks), sticks, 0.0)
+    return np.sign(finite) * np.clip((np.abs(finite) - DEADBAND) / (1 - DEADBAND), 0.0, 1.0)
+
+
+def _glfw() -> Any:
+    import glfw  # comes with mujoco
+
+    with warnings.catch_warnings(action="ignore"):
+        works = glfw.init()
+    if not works:
+        raise ConfigError("expected a screen, without which GLFW has no gamepads, got none")
+    return glfw

@@ -1,0 +1,164 @@
+"""Interaction with a live simulation: keys, buttons, sliders, clicks, the selected drone and the followed body."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.keyboard import Keyboard
+from crazysim.lab.live.scene_bodies import DRONE, SceneBodies
+from crazysim.lab.live.viewer import Button, Control, Slider
+from crazysim.sim.sim import Sim
+
+
+class Interaction:
+    """The part of ``Live`` that viewers and people use."""
+
+    sim: Sim
+    """The simulation."""
+    keyboard: Keyboard[Self]
+    """Keys that are held in a viewer."""
+    controls: list[Control]
+    """Buttons and sliders that viewers show."""
+    values: dict[str, float]
+    """Present values of the sliders, by name."""
+    selected: tuple[int, int] | None
+    """World and drone that are plotted and piloted, and followed unless ``follow`` chose another; None for none."""
+    lights: NDArray
+    """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
+    (n_worlds, n_drones, 3)"""
+    quantities: dict[str, Callable[[Self], ArrayLike]]
+    """Further quantities that viewers can plot: by name, functions of the loop that return numbers. (k,)"""
+    on_click: Callable[[Self, int, NDArray], object] | None
+    """Function that is called with the loop, a world and a point of its ground, m, that was clicked in a viewer."""
+
+    def __init__(self, sim: Sim):
+        """Begin with the first drone selected."""
+        self.sim = sim
+        self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
+        self.selected, self.on_click = (0, 0), None
+        self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
+        self._followed: tuple[int, str, int] | None = None
+        self._slider = 0
+        self._posted: deque[Callable[[Self], object]] = deque()
+
+    def button(self, name: str, call: Callable[[Self], object], key: str | None = None) -> None:
+        """Add a button to viewers that are shown from now on, and a key that does the same."""
+        self.controls.append(Button(name, partial(call, self), key))
+        if key is not None:
+            self.keyboard.bind(key, call)
+
+    def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Self, float], object]) -> None:
+        """Add a slider to viewers that are shown from now on; the function is called with the loop and the value.
+
+        Raises:
+            ConfigError: If the limits are not ``low <= value <= high`` with ``low < high``.
+        """
+        if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
+            raise ConfigError(f"expected low <= value <= high of slider {name!r}, got {low!r}, {value!r}, {high!r}")
+        if name in self.values:
+            raise ConfigError(f"expected a new name of a slider, got {name!r} twice. Use another name.")
+        self.controls.append(Slider(name, low, high, value, partial(call, self)))
+        self.values[name] = float(value)
+
+    def set_value(self, name: str, value: float) -> None:
+        """Move a slider, clipped to its limits, and call its function.
+
+        Raises:
+            ConfigError: If there is no such slider, or the value is not finite.
+        """
+        found = next((slider for slider in self._sliders if slider.name == name), None)
+        if found is None or not np.isfinite(value):
+            raise ConfigError(f"expected a slider of {list(self.values)} and a finite value, got {name!r}, {value!r}")
+        self.values[name] = float(np.clip(value, found.low, found.high))
+        found.call(self.values[name])
+
+    @property
+    def control_lines(self) -> tuple[str, ...]:
+        """Buttons with their keys, and sliders with their values, for viewers without a panel."""
+        chosen = self._sliders[self._slider].name if self._sliders else None
+        return tuple(
+            f"{c.name}: {self.values[c.name]:.3g}" + ("  [ ]" if c.name == chosen else "")
+            if isinstance(c, Slider)
+            else f"{c.name}  {c.key or ''}".rstrip()
+            for c in self.controls
+        )
+
+    @property
+    def _sliders(self) -> list[Slider]:
+        return [control for control in self.controls if isinstance(control, Slider)]
+
+    def turn(self, parts: float) -> None:
+        """Move the chosen slider by some parts of its range, as keys do."""
+        if self._sliders:
+            slider = self._sliders[self._slider]
+            self.set_value(slider.name, self.values[slider.name] + parts * (slider.high - slider.low))
+
+    def choose_next_slider(self) -> None:
+        """Choose the next slider for ``turn``."""
+        self._slider = (self._slider + 1) % max(len(self._sliders), 1)
+
+    def select(self, world: int, drone: int) -> None:
+        """Select a drone to follow, plot and pilot.
+
+        Raises:
+            ConfigError: If it does not exist.
+        """
+        if world not in range(self.sim.n_worlds) or drone not in range(self.sim.n_drones):
+            raise ConfigError(
+                f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
+                f"{world!r} and {drone!r}"
+            )
+        self.selected, self._followed = (int(world), int(drone)), None
+
+    def select_next(self) -> None:
+        """Select the next drone of the selected world."""
+        world, drone = self.selected or (0, -1)
+        self.select(world, (drone + 1) % self.sim.n_drones)
+
+    @property
+    def followed(self) -> tuple[int, str, int] | None:
+        """World, kind and index of the body that viewers mark and follow: the selected drone, or that of ``follow``."""
+        if self._followed is not None or self.selected is None:
+            return self._followed
+        return self.selected[0], DRONE, self.selected[1]
+
+    def follow(self, world: int, kind: str, index: int) -> None:
+        """Let viewers mark and follow a body, as a click on it does. A drone becomes the selected drone as well.
+
+        Args:
+            world: Index of the world.
+            kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or that of a handle.
+            index: Number among those of its kind.
+
+        Raises:
+            ConfigError: If it does not exist.
+        """
+        if kind == DRONE:
+            self.select(world, index)
+            return
+        if world not in range(self.sim.n_worlds):
+            raise ConfigError(f"expected a world below {self.sim.n_worlds}, got {world!r}")
+        self.sim.scene.compile_if_edited()
+        SceneBodies(self.sim).find(kind, index)
+        self._followed = int(world), kind, int(index)
+
+    def click(self, world: int, point: NDArray) -> None:
+        """Call ``on_click``, if it is set, as viewers do for a click on the ground.
+
+        Args:
+            world: Index of the world.
+            point: Point, world frame, m. (3,)
+        """
+        if self.on_click is not None:
+            self.on_click(self, world, point)
+
+    def post(self, call: Callable[[Self], object]) -> None:
+        """Let the loop call a function between two steps; may be called from any thread."""
+        self._posted.append(call)

@@ -1,0 +1,153 @@
+"""Links to drones, simulated and real, that take the same commands and give the same states."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.control import Control
+from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import rotate
+from crazysim.lab.live.swarm import DroneState, Swarm
+
+
+class Link(Protocol):
+    """Commands to one drone, and its state."""
+
+    name: str
+    """Name of the drone."""
+
+    def command(self, level: Control | str, values: ArrayLike) -> None:
+        """Send a command of one drone: numbers of ``sim.state_control``, ``attitude_control`` and so on. (k,)"""
+        ...
+
+    def state(self) -> DroneState:
+        """Return the latest state."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass, s: simulated for a simulated drone."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the motors."""
+        ...
+
+
+class SimLink:
+    """Link to a drone of a swarm."""
+
+    def __init__(self, swarm: Swarm, drone: int | str = 0):
+        """Take a drone by its index or name."""
+        self.swarm = swarm
+        self.drone = swarm.index(drone) if isinstance(drone, str) else drone
+        self.name = swarm.names[self.drone]
+
+    def command(self, level: Control | str, values: ArrayLike) -> None:
+        """Send a command of one drone.
+
+        Raises:
+            ConfigError: If the simulation has another command level, or a number is not finite.
+        """
+        with self.swarm.lock:
+            self.swarm.commanders[self.drone].command(level, values)
+
+    def state(self) -> DroneState:
+        """Return the state after the last control step."""
+        return self.swarm.state(self.drone)
+
+    def sleep(self, seconds: float) -> None:
+        """Let simulated time pass, s."""
+        self.swarm.sleep(seconds)
+
+    def stop(self) -> None:
+        """Stop the motors."""
+        with self.swarm.lock:
+            self.swarm.commanders[self.drone].stop()
+
+
+def fly_policy(
+    link: Link,
+    policy: Callable[[DroneState], ArrayLike],
+    seconds: float,
+    freq: float,
+    level: Control | str = Control.attitude,
+) -> list[DroneState]:
+    """Fly a policy over a link, and return the states that it acted on.
+
+    Args:
+        link: Link to a simulated or a real drone.
+        policy: Function of the state that returns a command of the level. (k,)
+        seconds: Duration, s.
+        freq: Commands per second, Hz.
+        level: Command level.
+
+    Raises:
+        ConfigError: If the link refuses a command, after which the motors are stopped.
+    """
+    states = []
+    try:
+        for _ in range(round(seconds * freq)):
+            began = time.perf_counter()
+            states.append(link.state())
+            link.command(level, policy(states[-1]))
+            passed = 0.0 if isinstance(link, SimLink) else time.perf_counter() - began
+            link.sleep(max(1 / freq - passed, 0.0))
+    except BaseException:
+        link.stop()
+        raise
+    return states
+
+
+class TrainedPolicy:
+    """A trained policy as a function of the state of a drone, for ``fly_policy``.
+
+    ``crazysim.train.load_policy`` returns the policy and its ``meta``, whose actions name the level of its commands.
+    """
+
+    def __init__(
+        self, policy: Callable[[dict[str, NDArray]], ArrayLike], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)
+    ):
+        """Check that the observations follow from a drone's state.
+
+        Args:
+            policy: Function of the observations that returns an action from -1 to 1.
+            meta: Description of its inputs and outputs (``crazysim.train.export.describe``).
+            goal: Position to fly to, m. (3,)
+
+        Raises:
+            ConfigError: If it needs other observations.
+        """
+        self.policy, self.goal = policy, np.asarray(goal, float)
+        self._names = list(meta["observations"])
+        self._centre, self._scale = (np.asarray(meta["actions"][key], float) for key in ("centre", "scale"))
+        unknown = sorted(set(self._names) - set(self._observations(_at_rest())))
+        if unknown:
+            raise ConfigError(
+                f"expected observations of a drone's state, got {', '.join(unknown)}. Use a policy without them."
+            )
+
+    def __call__(self, state: DroneState) -> NDArray:
+        """Return the command for a state. (k,)"""
+        found = self._observations(state)
+        action = np.asarray(self.policy({name: found[name].astype(np.float32) for name in self._names}), float)
+        return self._centre + self._scale * np.clip(action, -1.0, 1.0)
+
+    def _observations(self, state: DroneState) -> dict[str, NDArray]:
+        rows = rotate(np.tile(state.quat, (3, 1)), np.eye(3)).T  # columns are the body's axes
+        return {
+            "pos": state.pos,
+            "rot": rows.reshape(9),
+            "quat": state.quat,
+            "vel": state.vel,
+            "ang_vel": state.ang_vel,
+            "difference_to_goal": self.goal - state.pos,
+        }
+
+
+def _at_rest() -> DroneState:
+    return DroneState(0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))

@@ -1,0 +1,418 @@
+"""The live loop: control steps, pictures and recordings at their own rates, at a chosen speed of time."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from time import perf_counter, sleep
+from typing import TypeVar
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.closing import Closing
+from crazysim.core.settings import positive
+from crazysim.errors import ConfigError
+from crazysim.lab.live.history import History, Snapshot
+from crazysim.lab.live.interaction import Interaction
+from crazysim.lab.live.pace import LiveReport, Pace, Speed, undisturbed
+from crazysim.lab.live.process import Event, OnError, Process, RateLimit, period_of
+from crazysim.lab.live.recordings import Recordings
+from crazysim.lab.live.staging import StagedCommands, compile_step
+from crazysim.lab.live.viewer import Viewer
+from crazysim.lab.live.viewers import Viewers
+from crazysim.sim.sim import Sim
+
+SLICE = 0.01
+"""Longest sleep, s: the time after which a click or a key is noticed."""
+ALARM = 0.02
+"""Lateness of a control step that is logged, s."""
+ALARM_PERIOD = 10.0
+"""Time from one such warning to the next, s."""
+
+V = TypeVar("V", bound="Viewer[Live]")
+log = logging.getLogger(__name__)
+
+
+class Live(Interaction, Closing):
+    """A simulation that advances in real time, or at any other speed, and can be watched and commanded.
+
+        with Live(sim, control_freq=100) as live:
+            live.show(Browser())
+            live.record("flight.journal")
+            print(live.run(seconds=20))
+
+    The loop calls processes, timed events and whatever viewers have requested between two steps, in one thread, so
+    that they may read and write ``live.sim``. Other threads use ``post``.
+    """
+
+    step: int
+    """Control steps since the last reset."""
+    flown: int
+    """Control steps since the beginning, which resets do not set back."""
+
+    def __init__(
+        self,
+        sim: Sim,
+        control_freq: int = 100,
+        speed: Speed = 1.0,
+        fps: float = 50.0,
+        snapshot_s: float = 1.0,
+        n_snapshots: int = 60,
+    ):
+        """Prepare; ``run`` starts.
+
+        Args:
+            sim: Simulation, which continues from where it is.
+            control_freq: Rate of control steps, Hz; a divisor of ``sim.freq``.
+            speed: Simulated seconds per second, or ``"max"`` for as fast as possible.
+            fps: Pictures per second, at any speed.
+            snapshot_s: Simulated time between snapshots for ``go_to``, s.
+            n_snapshots: Most snapshots to keep.
+
+        Raises:
+            ConfigError: If a setting is invalid.
+        """
+        control_freq = positive("control_freq", control_freq)
+        if sim.freq % control_freq:
+            raise ConfigError(f"expected a control_freq that divides freq={sim.freq} Hz, got {control_freq!r} Hz")
+        for name, value in (("fps", fps), ("snapshot_s", snapshot_s)):
+            if not np.isfinite(value) or value <= 0:
+                raise ConfigError(f"expected a positive {name}, got {value!r}")
+        super().__init__(sim)
+        self.control_freq = control_freq
+        self.n_substeps = sim.freq // control_freq
+        self.step = round(float(sim.time[0, 0]) * control_freq)
+        self.flown = 0
+        self._dt = 1.0 / control_freq
+        self._pace = Pace(self._dt, speed)
+        self._commands = StagedCommands(sim)
+        self._history = History(positive("n_snapshots", n_snapshots))
+        self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
+        self._processes: list[Process] = []
+        self._events: dict[int, list[Event]] = defaultdict(list)
+        self._viewers = Viewers[Live](fps, self.stop)
+        self._recordings = Recordings(sim, control_freq)
+        self._paused = self._stopped = self._in_step = False
+        self._refused = 0
+        self._factor = (perf_counter(), 0, 0.0)
+        self._may_warn = RateLimit(ALARM_PERIOD)
+        for key, call in KEYS.items():
+            self.keyboard.bind(key, call)
+
+    # Time -----------------------------------------------------------------------------------------------------------
+
+    @property
+    def time(self) -> float:
+        """Simulated time since the last reset, s."""
+        return self.step / self.control_freq
+
+    @property
+    def speed(self) -> Speed:
+        """Simulated seconds per second, or ``"max"``; may be assigned at any time."""
+        return self._pace.speed
+
+    @speed.setter
+    def speed(self, speed: Speed) -> None:
+        self._pace.speed = speed
+
+    @property
+    def paused(self) -> bool:
+        """True while the simulation does not advance; may be assigned at any time."""
+        return self._paused
+
+    @paused.setter
+    def paused(self, paused: bool) -> None:
+        self._paused = bool(paused)
+        self._pace.restart()
+
+    def toggle_pause(self) -> None:
+        """Pause, or continue."""
+        self.paused = not self.paused
+
+    def advance(self, n_steps: int = 1) -> None:
+        """Advance by control steps as fast as possible, even while paused: the single step of a paused simulation."""
+        n_steps = positive("n_steps", n_steps)
+        self._between_steps(lambda _: self._advance(n_steps))
+
+    def reset(self) -> None:
+        """Return to the default data; timed events become due again."""
+        self._between_steps(lambda _: self._reset())
+
+    def go_to(self, time: float) -> None:
+        """Go to a time since the last reset, s: forwards as fast as possible, backwards from the snapshot before it.
+
+        Processes and events take part; the method ``reset(live)`` of processes is called after a jump backwards.
+
+        Raises:
+            ConfigError: If the time is negative, not finite, or before the first snapshot.
+        """
+        if not np.isfinite(time) or time < 0:
+            raise ConfigError(f"expected a time of 0 s or more, got {time!r}")
+        self._between_steps(lambda _: self._go_to(round(time * self.control_freq)))
+
+    def stop(self) -> None:
+        """End ``run`` before the next control step."""
+        self._stopped = True
+
+    # Parts ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def command(self) -> NDArray:
+        """Command of every drone, staged at every control step once it has been read. (n_worlds, n_drones, k)"""
+        return self._commands.array
+
+    def add(
+        self,
+        process: Callable[[Live], object],
+        freq: float | None = None,
+        name: str | None = None,
+        on_error: OnError = "raise",
+    ) -> Process:
+        """Add a process: a function of the loop that is called before control steps, in the order of adding.
+
+        Args:
+            process: Function; must not wait. Its method ``reset(live)``, if it has one, is called after resets.
+            freq: Rate of the calls in simulated time, Hz, a divisor of that of control steps; None for every one.
+            name: Name in messages; None for that of the function.
+            on_error: ``"raise"`` to end ``run`` with its errors, ``"report"`` to log them and continue, for sources
+                outside, such as motion capture.
+
+        Raises:
+            ConfigError: If a setting is invalid.
+        """
+        if not callable(process):
+            raise ConfigError(f"expected a function of the loop, got {process!r}")
+        if on_error not in ("raise", "report"):
+            raise ConfigError(f"expected on_error 'raise' or 'report', got {on_error!r}")
+        label = str(name or getattr(process, "__name__", type(process).__name__))
+        period = period_of(freq, self.control_freq, label)
+        reset = getattr(process, "reset", lambda _: None)
+        self._processes.append(Process(label, partial(process, self), partial(reset, self), period, on_error))
+        return self._processes[-1]
+
+    def at(self, time: float, call: Callable[[Live], object], name: str | None = None) -> None:
+        """Call a function of the loop once the simulation reaches a time, again after every reset.
+
+        Raises:
+            ConfigError: If the time is not finite or has passed.
+        """
+        step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
+        if step < self.step:
+            raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
+        self._events[step].append(Event(step, partial(call, self), name or getattr(call, "__name__", "event")))
+
+    def show(self, viewer: V) -> V:
+        """Show the simulation in a viewer, and return that; ``run`` ends when all viewers have been closed.
+
+        Raises:
+            RenderError: If this machine cannot show it, or a port is in use.
+        """
+        self._viewers.open(self, viewer)
+        return viewer
+
+    # Recording ------------------------------------------------------------------------------------------------------
+
+    def record(self, path: str | Path, freq: float = 50.0) -> Path:
+        """Record poses from now on, and return the path of the file: a new one, numbered if ``path`` exists.
+
+        Each sample is written as it comes: the file is complete up to the moment of a crash. Load it with
+        ``crazysim.media.Flight.load``.
+
+        Args:
+            path: Path of the file.
+            freq: Rate of samples in simulated time, Hz; a divisor of that of control steps.
+
+        Raises:
+            ConfigError: If the file cannot be created, or the rate is invalid.
+        """
+        return self._recordings.start(path, period_of(freq, self.control_freq, "recording"))
+
+    @property
+    def is_recording(self) -> bool:
+        """True while a recording is being written."""
+        return self._recordings.is_open
+
+    def stop_recording(self) -> None:
+        """Finish the recording, if there is one."""
+        self._recordings.close()
+
+    def toggle_recording(self) -> None:
+        """Start a recording with the name of the last one, or finish the present one."""
+        if self.is_recording:
+            self.stop_recording()
+        else:
+            self.record(self._recordings.last_path or "flight.journal")
+
+    # Running --------------------------------------------------------------------------------------------------------
+
+    def run(self, seconds: float | None = None) -> LiveReport:
+        """Run for some simulated time, until ``stop``, Ctrl-C, or until all viewers are closed; return the figures.
+
+        Args:
+            seconds: Simulated time, s; None for no end.
+
+        Raises:
+            ConfigError: If the time is not positive.
+        """
+        if seconds is not None and (not np.isfinite(seconds) or seconds <= 0):
+            raise ConfigError(f"expected a positive duration, s, got {seconds!r}")
+        end = None if seconds is None else self.flown + round(seconds * self.control_freq)
+        self._stopped = False
+        self._warm_up()
+        self._pace = Pace(self._dt, self._pace.speed)
+        first, pictures, paused_s, begin = self.flown, self._viewers.n_pictures, 0.0, perf_counter()
+        with undisturbed(), contextlib.suppress(KeyboardInterrupt):
+            while not self._stopped and (end is None or self.flown < end):
+                paused_s += self._turn()
+        jax.block_until_ready(self.sim.data.states.pos)
+        wall = perf_counter() - begin - paused_s
+        simulated = (self.flown - first) * self._dt
+        failures = self._refused + self._viewers.failures + self._recordings.failures
+        drawn = self._viewers.n_pictures - pictures
+        return self._pace.report(self._processes, simulated, wall, drawn, failures)
+
+    def close(self) -> None:
+        """Finish the recording and close the viewers."""
+        self._recordings.close()
+        self._viewers.close()
+
+    @property
+    def status(self) -> str:
+        """State of the loop for viewers: time, speed, pause, recording."""
+        now, (then, flown, factor) = perf_counter(), self._factor
+        if now - then > 0.5:
+            factor = (self.flown - flown) * self._dt / (now - then)
+            self._factor = (now, self.flown, factor)
+        marks = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
+        marks += ["paused"] * self._paused + ["recording"] * self.is_recording
+        return ", ".join(marks)
+
+    def _turn(self) -> float:
+        """Do what is due, or sleep; return the time spent in a pause, s."""
+        viewers = self._viewers
+        self._run_posted()
+        if self._stopped:
+            return 0.0
+        if self._paused:
+            begin = perf_counter()
+            viewers.draw(self, viewers.next_at)
+            sleep(SLICE)
+            return perf_counter() - begin
+        wait = self._pace.due_in()
+        if wait > 0:
+            if not viewers.draw(self, viewers.next_at):
+                until_picture = viewers.next_at - perf_counter() if viewers else SLICE
+                sleep(max(min(wait, until_picture, SLICE), 0.0))
+            return 0.0
+        late = self._pace.begin(self.time)
+        if late > ALARM and self._may_warn():
+            log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * late)
+        self._control_step()
+        # At real-time speeds a picture waits for idle time, but at most until the next picture is due.
+        viewers.draw(self, viewers.next_at + (0.0 if self.speed == "max" else viewers.period))
+        return 0.0
+
+    def _control_step(self) -> None:
+        self._in_step = True
+        try:
+            if self.step % self._snapshot_steps == 0:
+                self._history.add(Snapshot(self.step, self.sim.data, self._commands.copy()))
+            for process in self._processes:
+                if self.step % process.period == 0:
+                    process.run(self.time)
+            for event in self._events.get(self.step, ()):
+                log.info("%s at %.2f s", event.name, self.time)
+                event.call()
+            self._commands.stage()
+            self.sim.step(self.n_substeps)
+        finally:
+            self._in_step = False
+        self.step += 1
+        self.flown += 1
+        self._recordings.add()
+
+    def _run_posted(self) -> None:
+        try:
+            self.keyboard.run(self)
+            while self._posted:
+                self._posted.popleft()(self)
+        except ConfigError as error:
+            self._refused += 1
+            log.warning("refused at %.2f s: %s", self.time, error)
+
+    def _between_steps(self, call: Callable[[Live], object]) -> None:
+        """Call a function now, or after the control step that is under way."""
+        if self._in_step:
+            self.post(call)
+        else:
+            call(self)
+
+    def _advance(self, n_steps: int) -> None:
+        for _ in range(n_steps):
+            self._control_step()
+        self._pace.restart()
+
+    def _reset(self) -> None:
+        self.sim.reset()
+        self.step = 0
+        self._history.clear()
+        self._commands.restore(None)
+        self._jumped()
+
+    def _go_to(self, step: int) -> None:
+        if step < self.step:
+            snapshot = self._history.before(step)
+            if snapshot is None:
+                raise ConfigError(
+                    f"expected a time that was flown in this loop, got {step / self.control_freq:g} s. Use reset() to "
+                    f"return to the start."
+                )
+            self.sim.data, self.step = snapshot.data, snapshot.step
+            self._commands.restore(snapshot.commands)
+            self._jumped()
+        self._advance(step - self.step)
+
+    def _jumped(self) -> None:
+        for process in self._processes:
+            process.reset()
+        self._pace.restart()
+
+    def _warm_up(self) -> None:
+        """Compile what a control step needs, before time begins to run."""
+        self._commands.stage()
+        compile_step(self.sim, self.n_substeps)
+        self._viewers.update(self)
+        self._viewers.next_at = perf_counter()
+
+
+KEY_TURN = 0.05
+"""Part of a slider's range by which a key moves it."""
+
+
+def _scale(factor: float) -> Callable[[Live], None]:
+    def call(live: Live) -> None:
+        live.speed = factor * (1.0 if live.speed == "max" else live.speed)
+
+    return call
+
+
+KEYS: dict[str, Callable[[Live], object]] = {
+    "space": Live.toggle_pause,
+    ".": Live.advance,
+    "backspace": Live.reset,
+    "tab": Live.select_next,
+    "+": _scale(2.0),
+    "-": _scale(0.5),
+    "r": Live.toggle_recording,
+    "[": lambda live: live.turn(-KEY_TURN),
+    "]": lambda live: live.turn(KEY_TURN),
+    "'": Live.choose_next_slider,
+    "escape": Live.stop,
+}
+"""Keys that every live simulation has, and the functions that they call."""

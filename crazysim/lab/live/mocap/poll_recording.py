@@ -1,0 +1,150 @@
+"""Recordings of motion capture, which stay readable after a crash, and their replay.
+
+A file is a journal (``crazysim.media.journal``) of names of bodies (JSON) and of polls with their frames.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from crazysim.closing import Closing
+from crazysim.errors import ConfigError
+from crazysim.lab.live.mocap.frames import Frame
+from crazysim.lab.live.mocap.source import MocapSource, Poll
+from crazysim.media.journal import Journal, read_journal
+from crazysim.storage import reading
+
+NAMES, POLLED = b"NAME", b"POLL"
+"""Kinds of chunks: names of bodies that were not seen before, and a poll."""
+POLL = struct.Struct("<dII")
+"""Time of a poll, s, number of frames, and number of frames lost."""
+FRAME = struct.Struct("<ddI")
+"""Stamp and time of arrival of a frame, s, and number of bodies."""
+
+
+class MocapRecorder(Closing):
+    """Writer of a recording."""
+
+    def __init__(self, path: str | Path):
+        """Create a file, or replace one.
+
+        Raises:
+            ConfigError: If it cannot be written.
+        """
+        self._journal = Journal(path, replace=True)
+        self._ids: dict[str, int] = {}
+
+    def write(self, poll: Poll) -> None:
+        """Append a poll with its frames; nothing of it is kept in memory."""
+        new = [name for frame in poll.frames for name in frame.names if name not in self._ids]
+        if new:
+            new = list(dict.fromkeys(new))
+            self._ids.update({name: k for k, name in enumerate(new, start=len(self._ids))})
+            self._journal.append(NAMES, json.dumps(new).encode())
+        parts = [POLL.pack(poll.now, len(poll.frames), poll.lost)]
+        for frame in poll.frames:
+            ids = np.array([self._ids[name] for name in frame.names], "<u4")
+            poses = np.concatenate([frame.pos, frame.quat], axis=1).astype("<f8")
+            parts += [FRAME.pack(frame.stamp, frame.received, len(ids)), ids.tobytes(), poses.tobytes()]
+        self._journal.append(POLLED, b"".join(parts))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._journal.close()
+
+
+def read_polls(path: str | Path) -> Iterator[Poll]:
+    """Yield the polls of a recording.
+
+    Raises:
+        ConfigError: If the file does not exist.
+        DamagedFileError: If it is no recording.
+    """
+    remedy = "Write a recording with Twins(..., record=path)."
+    names: list[str] = []
+    with reading(path, "a recording of motion capture", remedy):
+        for kind, content in read_journal(path):
+            if kind == NAMES:
+                names += json.loads(content)
+            elif kind == POLLED:
+                yield _poll(content, names)
+            else:
+                raise ValueError(f"expected chunks of kinds {NAMES!r} and {POLLED!r}, got {kind!r}")
+
+
+def _poll(content: bytes, names: list[str]) -> Poll:
+    now, n_frames, lost = POLL.unpack_from(content)
+    at, frames = POLL.size, []
+    for _ in range(n_frames):
+        stamp, received, n = FRAME.unpack_from(content, at)
+        at += FRAME.size
+        ids = np.frombuffer(content, "<u4", n, at)
+        poses = np.frombuffer(content, "<f8", 7 * n, at + 4 * n).reshape(n, 7)
+        at += 60 * n
+        frames.append(Frame(stamp, tuple(names[k] for k in ids), poses[:, :3], poses[:, 3:], received))
+    return Poll(now, frames, lost)
+
+
+class ReplaySource(MocapSource):
+    """Frames of a recording.
+
+    By ``"poll"``, each poll returns those of the recorded poll of the same number: a simulation that is stepped as the
+    recorded one gives the same run, bit for bit. By ``"time"``, each frame comes when as much simulated time has passed
+    since the start as there was between it and the first frame, for a simulation that is stepped in another way.
+    """
+
+    def __init__(self, path: str | Path, by: str = "poll"):
+        """Open a recording.
+
+        Raises:
+            ConfigError: If it does not exist or is none, or ``by`` is neither ``"poll"`` nor ``"time"``.
+        """
+        if by not in ("poll", "time"):
+            raise ConfigError(f"expected by as 'poll' or 'time', got {by!r}")
+        self.name, self.by, self.path = f"replay of {Path(path).name}", by, path
+        self.simulated = by == "time"
+        self._polls = list(read_polls(path))
+        self._frames = [frame for poll in self._polls for frame in poll.frames]
+        self._next, self._step = 0, -1
+        self._offset = self._frames[0].received if self._frames else 0.0
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self._frames)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last frame, s."""
+        return self._frames[-1].received - self._offset if self._frames else 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all bodies."""
+        return tuple(dict.fromkeys(name for frame in self._frames for name in frame.names))
+
+    @property
+    def ended(self) -> str | None:
+        """Reason for which there are no more frames; None while there are."""
+        n = len(self._polls) if self.by == "poll" else len(self._frames)
+        return "the recording ended" if self._next >= n else None
+
+    def poll(self, step: int, freq: int) -> Poll:
+        """Return the frames of the next recorded poll, or those up to the present simulated time."""
+        if self.by == "poll":
+            if self._next < len(self._polls):
+                self._next += 1
+                return self._polls[self._next - 1]
+            return Poll(self._polls[-1].now if self._polls else 0.0, [])
+        if step < self._step:
+            self._next = 0
+        self._step, now = step, step / freq + self._offset
+        first = self._next
+        while self._next < len(self._frames) and self._frames[self._next].received <= now + 1e-9:
+            self._next += 1
+        return Poll(now, self._frames[first : self._next])

@@ -1,0 +1,223 @@
+"""Sources of motion capture frames: threads of their own, functions of time, and trajectories of a show."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crazysim.closing import Closing
+from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import from_yaw
+from crazysim.lab.live.mocap.frames import Convention, Frame
+from crazysim.lab.live.paths import paths_of
+from crazysim.trajectories import Trajectory
+
+log = logging.getLogger(__name__)
+
+CAPACITY = 4096
+"""Number of frames that wait for the reader; the oldest are lost beyond: 17 s at 240 Hz."""
+
+
+class Poll(NamedTuple):
+    """Frames that have arrived since the last poll, and the time of the poll."""
+
+    now: float
+    """Time of the poll, clock of this computer or of the simulation, s; that of ``Frame.received``."""
+    frames: list[Frame]
+    """Frames, in the order of their arrival."""
+    lost: int = 0
+    """Number of frames lost because the reader was too slow."""
+
+
+class MocapSource(Closing):
+    """Interface of motion capture sources. ``poll`` never waits."""
+
+    name: str = "mocap"
+    """Name in reports."""
+    simulated: bool = False
+    """True where the frames follow simulated time, which a reset sets back."""
+
+    def poll(self, step: int, freq: int) -> Poll:
+        """Return the frames that have arrived since the last call.
+
+        Args:
+            step: Number of physics steps of the simulation since its start.
+            freq: Physics steps per second, Hz.
+        """
+        raise NotImplementedError
+
+    @property
+    def ended(self) -> str | None:
+        """Reason for which the source sends no more frames; None while it may."""
+        return None
+
+    def close(self) -> None:
+        """Disconnect."""
+
+
+class FunctionSource(MocapSource):
+    """Poses as a function of simulated time, sampled at a rate of their own; a run can be repeated bit for bit."""
+
+    simulated = True
+
+    def __init__(
+        self,
+        function: Callable[[float], Mapping[str, tuple[ArrayLike, ArrayLike]]],
+        freq: float = 120.0,
+        convention: Convention | None = None,
+        name: str = "function",
+    ):
+        """Sample a function.
+
+        Args:
+            function: Position and attitude of each body by name, as the convention has them, at a time, s.
+            freq: Frames per second, Hz.
+            convention: Convention of the poses; None for that of crazysim.
+            name: Name in reports.
+
+        Raises:
+            ConfigError: If the rate is not positive.
+        """
+        if not 0 < freq < np.inf:
+            raise ConfigError(f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
+        self.name, self.freq = name, float(freq)
+        self._function, self._convention, self._next = function, convention or Convention(), 0
+
+    def poll(self, step: int, freq: int) -> Poll:
+        """Return the frames up to the present simulated time; after a reset, the first frame follows again."""
+        now = step / freq
+        last = int(np.floor(now * self.freq + 1e-9))
+        if last < self._next - 1:
+            self._next = 0
+        first, self._next = max(self._next, last + 1 - CAPACITY), last + 1
+        return Poll(now, [self.frame(k / self.freq) for k in range(first, last + 1)])
+
+    def frame(self, stamp: float) -> Frame:
+        """Return the frame of a time, s."""
+        return self._convention.convert(Frame.of(stamp, dict(self._function(stamp))))
+
+
+def show_source(
+    trajectories: Trajectory | Sequence[Trajectory], names: Sequence[str] | None = None, freq: float = 120.0
+) -> FunctionSource:
+    """Return a source of level bodies that follow trajectories, such as those of ``load_show(path)``.
+
+    Args:
+        trajectories: One trajectory for each body, or one record with a leading axis.
+        names: Names of the bodies; None for ``vcf0``, ``vcf1``, ...
+        freq: Frames per second, Hz.
+
+    Raises:
+        ConfigError: If there is not one name for each trajectory.
+    """
+    given = paths_of(trajectories)
+    names = [f"vcf{k}" for k in range(len(given))] if names is None else list(names)
+    if len(names) != len(given) or len(set(names)) < len(names):
+        raise ConfigError(
+            f"expected {len(given)} different names, one for each trajectory, got {names}. Leave them out for vcf0, "
+            f"vcf1, ..."
+        )
+
+    def bodies(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
+        points = [path.at(stamp) for path in given]
+        return {n: (p[:3], from_yaw(p[3])) for n, p in zip(names, points, strict=True)}
+
+    return FunctionSource(bodies, freq, name="show")
+
+
+class ThreadSource(MocapSource):
+    """Base of sources that wait for frames in a thread of their own, such as those of a network.
+
+    A subclass yields frames from ``stream`` in the convention of its system. An error there ends the source, not the
+    simulation; ``ended`` has the reason.
+    """
+
+    def __init__(self, name: str, convention: Convention | None = None):
+        """Prepare; ``start`` starts the thread.
+
+        Args:
+            name: Name in reports.
+            convention: Convention of the frames; None for that of crazysim.
+        """
+        self.name, self._convention = name, convention or Convention()
+        self._frames: deque[Frame] = deque(maxlen=CAPACITY)
+        self._n_put = self._n_got = 0
+        self._ended: str | None = None
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"mocap-{name}", daemon=True)
+
+    def start(self) -> ThreadSource:
+        """Start the thread, and return the source."""
+        self._thread.start()
+        return self
+
+    def stream(self, stopped: threading.Event) -> Iterator[Frame]:
+        """Yield frames until there are no more, or the event is set."""
+        raise NotImplementedError
+
+    def poll(self, step: int, freq: int) -> Poll:
+        """Return the frames that have arrived since the last call."""
+        frames = []
+        while self._frames:
+            frames.append(self._frames.popleft())
+        n_put = self._n_put  # read last, so that it counts at least the frames above
+        lost = max(n_put - self._n_got - len(frames) - len(self._frames), 0)
+        self._n_got += len(frames) + lost
+        return Poll(time.monotonic(), frames, lost)
+
+    @property
+    def ended(self) -> str | None:
+        """Reason for which the source sends no more frames; None while it may."""
+        return self._ended
+
+    def close(self) -> None:
+        """Stop the thread; a source that does not answer is left behind after a second."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
+
+    def _run(self) -> None:
+        try:
+            for frame in self.stream(self._stopped):
+                self._frames.append(self._convention.convert(frame))
+                self._n_put += 1
+                if self._stopped.is_set():
+                    return
+            self._ended = "the stream ended"
+        except Exception as error:
+            self._ended = f"{type(error).__name__}: {error}"
+            if not self._stopped.is_set():
+                log.warning("%s ended: %s", self.name, self._ended)
+
+
+class RealTimeSource(ThreadSource):
+    """Another source's frames, sent by a thread in real time: a stand-in for a motion capture system."""
+
+    def __init__(self, source: FunctionSource, speed: float = 1.0):
+        """Send the frames of a function of time.
+
+        Args:
+            source: Source, whose time begins with ``start``.
+            speed: Speed of its time, 1.
+        """
+        super().__init__(f"real-time {source.name}")
+        self._source, self._speed = source, speed
+
+    def stream(self, stopped: threading.Event) -> Iterator[Frame]:
+        """Yield the frames at their times."""
+        begin, k = time.monotonic(), 0
+        while not stopped.is_set():
+            stamp = k / self._source.freq
+            wait = begin + stamp / self._speed - time.monotonic()
+            if wait > 0 and stopped.wait(wait):
+                return
+            frame = self._source.frame(stamp)
+            yield Frame(frame.stamp, frame.names, frame.pos, frame.quat, time.monotonic())
+            k += 1

@@ -1,0 +1,252 @@
+"""Tracking of bodies through frames that are late, lost, repeated, wrong or out of order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.core.settings import check_settings, setting
+from crazysim.errors import ConfigError
+from crazysim.lab.live.mocap.frames import Frame
+from crazysim.lab.live.mocap.source_events import Reports
+
+N_INTERVALS = 32
+"""Number of intervals between frames whose median is the period of the source."""
+FARTHEST = 1e6
+"""Coordinates from here on are invalid, m."""
+CLOCK = 10.0
+"""Age of the least delay, s, after which it is forgotten: clocks drift."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Limits beyond which frames or bodies are reported or refused."""
+
+    max_speed: float = setting(default=10.0, low=0.0)
+    """Largest speed of a body, m/s; a body that is faster has jumped."""
+    slack: float = setting(default=0.05, low=0.0)
+    """Distance that is no jump, m."""
+    confirm: int = setting(default=3, low=1)
+    """Number of consecutive frames that agree on a new place after which a jump is accepted."""
+    late: float = setting(default=0.05, low=0.0)
+    """Delay of a frame over the least one seen that is reported, s."""
+    lost: float = setting(default=0.2, low=0.0)
+    """Time without a valid pose after which a body counts as lost, s."""
+    stalled: float = setting(default=0.2, low=0.0)
+    """Time without a frame after which the source counts as stalled, s."""
+    restart: float = setting(default=1.0, low=0.0)
+    """Step back of the source's clock that counts as its restart, s; a smaller one is an old frame."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: If one is not finite, or out of its range.
+        """
+        check_settings(self)
+
+
+class Tracker:
+    """Last valid pose and velocity of every known body.
+
+    | Frame or body | Rule | Report |
+    | --- | --- | --- |
+    | same time as the last frame | frame refused | `repeated` |
+    | older than the last frame | frame refused | `backwards` |
+    | older by more than `restart` | accepted, velocities zero: the source has restarted | `restarted` |
+    | time not finite | frame refused | `invalid` |
+    | gap of more than 1.5 periods | accepted; the number of missing frames is counted | `dropped` |
+    | delayed by more than `late` | accepted | `late` |
+    | pose not finite or beyond 1000 km, quaternion zero | body keeps its pose | `invalid` |
+    | body faster than `max_speed` | body keeps its pose until `confirm` frames agree | `jumped`, `relocated` |
+    | name that is not known | ignored; once for each name | `unknown` |
+    | name twice in a frame | body keeps its pose | `duplicate` |
+    | body missing for `lost` | keeps its pose, velocity zero | `lost`, `found` |
+    | no frame for `stalled` | all keep their poses, velocities zero | `stalled`, `resumed` |
+    | more frames than the reader took | the oldest are lost | `overrun` |
+    | thread or connection ended | as stalled | `ended` |
+    """
+
+    def __init__(self, names: Sequence[str], rules: Rules | None = None, source: str = "mocap"):
+        """Begin without poses.
+
+        Args:
+            names: Names of the bodies in the stream.
+            rules: Limits; None for the defaults.
+            source: Name of the source in reports.
+
+        Raises:
+            ConfigError: If a name is there twice.
+        """
+        if len(set(names)) < len(names):
+            raise ConfigError(f"expected different names, got {list(names)}. List each body once.")
+        n = len(names)
+        self.names, self.rules, self.source = tuple(names), rules or Rules(), source
+        self.reports = Reports()
+        self.pos, self.vel = np.zeros((n, 3)), np.zeros((n, 3))
+        self.quat = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+        self.seen = np.zeros(n, bool)
+        self.n_frames = 0
+        self._rows_of = {name: k for k, name in enumerate(names)}
+        self._maps: dict[tuple[str, ...], tuple[NDArray, NDArray, list[str]]] = {}
+        self._unknown: set[str] = set()
+        self._stamps = np.full(n, -np.inf)
+        self._lost = np.zeros(n, bool)
+        self._suspect, self._n_suspect = np.zeros((n, 3)), np.zeros(n, int)
+        self._stamp: float | None = None
+        self._received: float | None = None
+        self._stalled = self._ended = False
+        self._intervals: list[float] = []
+        self._period: float | None = None
+        self._least_delay, self._least_at = np.inf, -np.inf
+
+    @property
+    def stalled(self) -> bool:
+        """True where the source has sent no frame for too long."""
+        return self._stalled
+
+    def accept(self, frame: Frame) -> bool:
+        """Take a frame, and return True unless it was refused."""
+        now, rules = frame.stamp, self.rules
+        if not np.isfinite(now):
+            self._report("invalid", self.source, frame.received, f"time {now}")
+            return False
+        self._received = frame.received
+        if self._stalled:
+            self._stalled = False
+            self._report("resumed", self.source, now, "frames arrive again")
+        before = self._stamp
+        if before is not None and now <= before:
+            if now == before:
+                self._report("repeated", self.source, now, "frame refused")
+                return False
+            if before - now <= rules.restart:
+                self._report("backwards", self.source, now, f"frame refused: {before - now:.4f} s before the last one")
+                return False
+            self._report("restarted", self.source, now, f"clock stepped back by {before - now:.3f} s")
+            self.restart()
+            before, self._received = None, frame.received
+        if before is not None:
+            self._watch_interval(now, now - before)
+        self._watch_delay(now, frame.received - now)
+        self._stamp = now
+        self.n_frames += 1
+        with np.errstate(over="ignore", invalid="ignore"):  # of numbers that are refused below
+            self._take_bodies(frame, now)
+        missing = self.seen & ~self._lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
+        for k in np.flatnonzero(missing):
+            self._lost[k], self.vel[k] = True, 0.0
+            self._report("lost", self.names[k], now, f"no valid pose for {now - self._stamps[k]:.3f} s; it stays there")
+        return True
+
+    def restart(self) -> None:
+        """Accept the next frame whatever its time; poses stay, and velocities begin again at zero."""
+        self._stamps[self.seen] = -np.inf
+        self._least_delay, self._least_at, self._stamp, self._received = np.inf, -np.inf, None, None
+
+    def advance(self, now: float, lost: int = 0, ended: str | None = None) -> None:
+        """Check at the end of a poll that the source is alive.
+
+        Args:
+            now: Time of the poll, s.
+            lost: Number of frames that the reader lost.
+            ended: Reason for which the source has ended; None if it has not.
+        """
+        if lost:
+            self._report("overrun", self.source, now, f"{lost} frames lost: the reader was too slow")
+        if ended is not None and not self._ended:
+            self._ended = True
+            self._report("ended", self.source, now, ended)
+        if self._received is None:
+            self._received = now
+        quiet = now - self._received
+        if quiet > self.rules.stalled and not self._stalled:
+            self._stalled = True
+            self.vel[:] = 0.0
+            self._report("stalled", self.source, now, f"no frame for {quiet:.3f} s; all bodies stay where they are")
+
+    def _report(self, kind: str, name: str, time: float, text: str) -> None:
+        self.reports.add(kind, name, time, text)
+
+    def _watch_interval(self, now: float, interval: float) -> None:
+        """Find the period of the source, then report gaps."""
+        if self._period is None:
+            self._intervals.append(interval)
+            if len(self._intervals) == N_INTERVALS:
+                self._period = float(np.median(self._intervals))
+        elif interval > 1.5 * self._period:
+            n = round(interval / self._period) - 1
+            self._report("dropped", self.source, now, f"{n} frames missing in {interval:.4f} s")
+
+    def _watch_delay(self, now: float, delay: float) -> None:
+        """Report frames that took longer than the quickest one; the clocks may differ by any constant."""
+        if delay < self._least_delay or now - self._least_at > CLOCK:
+            self._least_delay, self._least_at = delay, now
+        elif delay - self._least_delay > self.rules.late:
+            self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
+
+    def _rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
+        """Return the entries of a frame that are used, and the rows of their bodies."""
+        found = self._maps.get(names)
+        if found is None:
+            twice = sorted({name for name in names if names.count(name) > 1} & set(self._rows_of))
+            entries = [i for i, name in enumerate(names) if name in self._rows_of and name not in twice]
+            rows = np.array([self._rows_of[names[i]] for i in entries], int)
+            found = np.array(entries, int), rows, twice
+            if len(self._maps) > 1000:
+                self._maps.clear()
+            self._maps[names] = found
+            for name in set(names) - set(self._rows_of) - self._unknown:
+                if len(self._unknown) < 1000:
+                    self._unknown.add(name)
+                    self._report("unknown", name, now, "no object of the scene has this name; it is ignored")
+        entries, rows, twice = found
+        for name in twice:
+            self._report("duplicate", name, now, "name twice in a frame; it keeps its pose")
+        return entries, rows
+
+    def _take_bodies(self, frame: Frame, now: float) -> None:
+        entries, rows = self._rows(frame.names, now)
+        pos, quat = frame.pos[entries], frame.quat[entries]
+        norm = np.sqrt((quat * quat).sum(-1))
+        valid = (np.abs(pos) < FARTHEST).all(-1) & (norm > 1e-3) & np.isfinite(norm)
+        if not valid.all():
+            for k in rows[~valid]:
+                self._report("invalid", self.names[k], now, "pose not finite, or quaternion zero; it keeps its pose")
+            rows, pos, quat, norm = rows[valid], pos[valid], quat[valid], norm[valid]
+        dt = now - self._stamps[rows]
+        moved = pos - self.pos[rows]
+        known = self.seen[rows] & np.isfinite(dt)
+        far = np.sqrt((moved * moved).sum(-1))
+        ok = ~known | (far <= self.rules.max_speed * np.where(known, dt, 0.0) + self.rules.slack)
+        relocated = np.zeros(len(rows), bool)
+        if not ok.all():
+            relocated = self._suspects(rows, pos, far, ok, now)
+            ok |= relocated
+        self._n_suspect[rows[ok]] = 0
+        for k in rows[ok & self._lost[rows]]:
+            self._report("found", self.names[k], now, "valid pose again")
+        rows, pos, quat, norm, dt, moved = rows[ok], pos[ok], quat[ok], norm[ok], dt[ok], moved[ok]
+        still = ~known[ok] | relocated[ok] | self._lost[rows]
+        dt = np.where(still, np.inf, np.maximum(dt, far[ok] / self.rules.max_speed))
+        self.vel[rows] = moved / np.where(dt > 0, dt, np.inf)[:, None]
+        self.pos[rows], self.quat[rows] = pos, quat / norm[:, None]
+        self._stamps[rows], self.seen[rows], self._lost[rows] = now, True, False
+
+    def _suspects(self, rows: NDArray, pos: NDArray, far: NDArray, ok: NDArray, now: float) -> NDArray:
+        """Return True where a body that jumped has been at its new place often enough. (n,)"""
+        accepted = np.zeros(len(rows), bool)
+        for i in np.flatnonzero(~ok):
+            k = rows[i]
+            near = np.linalg.norm(pos[i] - self._suspect[k]) <= self.rules.slack
+            self._n_suspect[k] = self._n_suspect[k] + 1 if near and self._n_suspect[k] else 1
+            self._suspect[k] = pos[i]
+            if self._n_suspect[k] >= self.rules.confirm:
+                accepted[i] = True
+                self._report("relocated", self.names[k], now, f"{far[i]:.3f} m away in {self.rules.confirm} frames")
+            else:
+                self._report("jumped", self.names[k], now, f"{far[i]:.3f} m; it keeps its pose")
+        return accepted

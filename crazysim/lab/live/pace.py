@@ -1,0 +1,204 @@
+"""Pace of a live simulation: when each control step is due, and how well that was kept."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.process import Process
+
+Speed = float | Literal["max"]
+"""Simulated seconds per second, or ``"max"`` for as fast as possible."""
+TOLERANCE = 2e-3
+"""Lateness from which a control step counts as late, s."""
+MAX_LAG = 0.25
+"""Lag from which the lost time is given up instead of caught up, s."""
+BIN = 1e-4
+"""Resolution of the statistics of lateness, s."""
+SWITCH_INTERVAL = 5e-4
+"""Time after which another thread of Python gives way to the loop, s."""
+N_BINS = 5000
+"""Number of their bins; the last one holds everything above."""
+LISTED = 3
+"""Most processes that a report lists."""
+
+
+def check_speed(speed: Speed) -> Speed:
+    """Return a speed, checked.
+
+    Raises:
+        ConfigError: If it is neither a positive number nor ``"max"``.
+    """
+    if speed == "max":
+        return "max"
+    if isinstance(speed, (bool, str)) or not np.isfinite(speed) or speed <= 0:
+        raise ConfigError(f"expected a positive speed or 'max', got {speed!r}")
+    return float(speed)
+
+
+@dataclass(frozen=True)
+class LiveReport:
+    """Figures of a live run."""
+
+    simulated_s: float
+    """Simulated time, s."""
+    wall_s: float
+    """Time without pauses, s."""
+    steps: int
+    """Number of control steps."""
+    late: int
+    """Number of control steps that began more than ``TOLERANCE`` late."""
+    lateness_999: float
+    """Lateness that 99.9% of the control steps kept below, s; 0 at ``speed="max"``."""
+    worst: float
+    """Greatest lateness, s."""
+    worst_at: float
+    """Simulated time at which it occurred, s."""
+    lost_s: float
+    """Time that was given up because the simulation could not catch up, s."""
+    pictures: int
+    """Number of pictures sent to viewers."""
+    slowest: str
+    """Processes by their longest call, the longest first; empty without processes."""
+    failures: int
+    """Number of errors that were reported and passed over."""
+
+    @property
+    def factor(self) -> float:
+        """Simulated seconds per second."""
+        return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
+
+    def __str__(self) -> str:
+        """Return the figures for reading."""
+        lines = [f"{self.simulated_s:.2f} s in {self.wall_s:.2f} s: {self.factor:.2f} times real time"]
+        if self.worst > 0:
+            lines.append(
+                f"control steps     {self.steps}, {self.late} more than {1e3 * TOLERANCE:g} ms late; 99.9% within "
+                f"{1e3 * self.lateness_999:.1f} ms, worst {1e3 * self.worst:.1f} ms at {self.worst_at:.2f} s"
+            )
+        if self.lost_s > 0:
+            lines.append(f"real time missed  {self.lost_s:.2f} s were given up; use a lower speed or fewer pictures")
+        if self.pictures:
+            lines.append(f"pictures          {self.pictures}, {self.pictures / self.wall_s:.1f} per second")
+        if self.slowest:
+            lines.append(f"longest calls     {self.slowest}")
+        if self.failures:
+            lines.append(f"failures          {self.failures}, see the log")
+        return "\n".join(lines)
+
+
+class Pace:
+    """Times at which control steps are due, and statistics of their lateness in constant memory."""
+
+    steps: int
+    """Number of control steps so far."""
+    late: int
+    """Number of those that began more than ``TOLERANCE`` late."""
+    worst: float
+    """Greatest lateness, s."""
+    worst_at: float
+    """Simulated time at which it occurred, s."""
+    lost: float
+    """Time given up, s."""
+
+    def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = perf_counter):
+        """Begin now.
+
+        Args:
+            dt: Simulated time between control steps, s.
+            speed: Simulated seconds per second, or ``"max"``.
+            clock: Returns the time, s.
+        """
+        self._dt, self._clock = dt, clock
+        self._speed: Speed = check_speed(speed)
+        self._counts = np.zeros(N_BINS, np.int64)
+        self.steps = self.late = 0
+        self.worst = self.worst_at = self.lost = 0.0
+        self._due = clock()
+
+    @property
+    def speed(self) -> Speed:
+        """Simulated seconds per second, or ``"max"``; assigning to it takes effect at once."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, speed: Speed) -> None:
+        self._speed = check_speed(speed)
+        self.restart()
+
+    def restart(self) -> None:
+        """Make the next control step due now, after a pause or a jump in time."""
+        self._due = self._clock()
+
+    def due_in(self) -> float:
+        """Return the time until the next control step is due, s; not positive if it is."""
+        return 0.0 if self._speed == "max" else self._due - self._clock()
+
+    def begin(self, time: float) -> float:
+        """Note that a control step begins, and return how late, s.
+
+        Args:
+            time: Simulated time, s.
+        """
+        self.steps += 1
+        if self._speed == "max":
+            return 0.0
+        lateness = max(self._clock() - self._due, 0.0)
+        self._counts[min(int(lateness / BIN), N_BINS - 1)] += 1
+        self.late += lateness > TOLERANCE
+        if lateness > self.worst:
+            self.worst, self.worst_at = lateness, time
+        if lateness > MAX_LAG:
+            self.lost += lateness
+            self.restart()
+        self._due += self._dt / float(self._speed)
+        return lateness
+
+    def quantile(self, part: float) -> float:
+        """Return the lateness that a part of the control steps, 0 to 1, kept below, s."""
+        total = self._counts.sum()
+        if not total:
+            return 0.0
+        k = int(np.searchsorted(np.cumsum(self._counts), part * total))
+        return min((k + 1) * BIN, self.worst) if k < N_BINS - 1 else self.worst
+
+    def report(
+        self, processes: Sequence[Process], simulated_s: float, wall_s: float, pictures: int, failures: int
+    ) -> LiveReport:
+        """Return the figures of a run.
+
+        Args:
+            processes: Processes of the loop.
+            simulated_s: Simulated time, s.
+            wall_s: Time without pauses, s.
+            pictures: Number of pictures.
+            failures: Number of errors of viewers and recordings that were passed over.
+        """
+        longest = sorted(processes, key=lambda process: -process.longest)[:LISTED]
+        slowest = ", ".join(f"{p.name} {1e3 * p.longest:.1f} ms at {p.longest_at:.2f} s" for p in longest)
+        failures += sum(process.failures for process in processes)
+        return LiveReport(
+            simulated_s, wall_s, self.steps, self.late, self.quantile(0.999), self.worst, self.worst_at, self.lost,
+            pictures, slowest, failures,
+        )  # fmt: skip
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Keep other threads of Python and the garbage collector from delaying the loop."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    gc.freeze()  # the objects of JAX and MuJoCo are not examined again: that takes 0.1 s and more
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        sys.setswitchinterval(interval)

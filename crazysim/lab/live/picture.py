@@ -1,0 +1,175 @@
+"""Pictures of a live simulation: everything that a viewer draws at one moment, as arrays of the host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.core.data import SimData
+from crazysim.core.stage import over_drones, over_worlds
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.media.poses import mocap_poses
+from crazysim.plugins.effects.wind import WindData
+from crazysim.plugins.effects.wind_field import WindFieldData
+from crazysim.pytree import has_members, scopes
+from crazysim.sim.sim import Sim
+
+LIGHT_RADIUS = 0.06
+"""Radius of the glow around a lit drone, m."""
+WIND_SCALE = 0.1
+"""Length of a wind arrow per speed, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The scene of some worlds at one moment."""
+
+    worlds: NDArray
+    """Indices of the worlds. (n,)"""
+    time: float
+    """Simulated time since the last reset, s."""
+    status: str
+    """State of the loop: time, speed, pause, recording."""
+    pos: NDArray
+    """Positions of all mocap bodies, world frame, m. (n, n_mocap, 3)"""
+    quat: NDArray
+    """Attitudes of all mocap bodies, body to world, xyzw. (n, n_mocap, 4)"""
+    drones: NDArray
+    """Positions of the drones, world frame, m. (n, n_drones, 3)"""
+    setpoint: NDArray
+    """Positions of state commands, world frame, m; empty at other command levels. (n, n_drones or 0, 3)"""
+    touching: NDArray
+    """True where a drone touches something. (n, n_drones)"""
+    wind: NDArray
+    """Velocity of the air at every drone, world frame, m/s; empty without wind. (n, n_drones or 0, 3)"""
+    lights: NDArray
+    """Colours of the drones' LEDs, 0 to 1; zero for off. (n, n_drones, 3)"""
+    selected: tuple[int, int] | None
+    """Selected world and drone; None for none."""
+    followed: tuple[int, int] | None
+    """World and mocap id of the followed body; None for none."""
+    name: str
+    """Name of the followed body; empty for none."""
+    controls: tuple[str, ...]
+    """Buttons and sliders of the loop, for viewers without a panel."""
+    plot: NDArray
+    """Values of the plotted quantity of the selected drone. (k,)"""
+
+
+class PictureSource:
+    """Source of the pictures of one viewer."""
+
+    def __init__(self, sim: Sim, bodies: SceneBodies, worlds: Sequence[int], contacts: bool, wind: bool):
+        """Prepare; functions are compiled at the first picture.
+
+        Args:
+            sim: Simulation.
+            bodies: Bodies that can be followed.
+            worlds: Indices of the worlds to show.
+            contacts: True to compute which drones touch something.
+            wind: True to compute the wind at every drone, where there is wind.
+        """
+        self._sim, self._worlds = sim, np.asarray(worlds)
+        self._bodies = {(body.kind, body.index): body for body in bodies.items}
+        self._contacts, self._wind = contacts, wind
+        self._wind_fn = jax.jit(over_worlds(over_drones(_air)))
+
+    def take(self, live: Live, plot: str = "") -> Picture:
+        """Return a picture of the simulation as it is now.
+
+        Args:
+            live: Loop of the simulation.
+            plot: Path of the quantity to plot, one of ``quantities``; empty for none.
+        """
+        sim, worlds = self._sim, self._worlds
+        data = sim.data
+        pos, quat = mocap_poses(sim, worlds)
+        drones = np.asarray(data.states.pos, float)[worlds]
+        none = np.zeros((len(worlds), 0, 3))
+        state, setpoint, air = data.controls.state, none, none
+        if state is not None:
+            setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
+        if self._wind and _winds(data):
+            air = np.asarray(self._wind_fn(data), float)[worlds]
+        touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
+        values = np.zeros(0)
+        if plot and live.selected is not None:
+            own = live.quantities.get(plot)
+            values = quantity(data, plot, *live.selected) if own is None else np.ravel(np.asarray(own(live), float))
+        followed = live.followed
+        body = None if followed is None else self._bodies.get(followed[1:])
+        return Picture(
+            worlds=worlds,
+            time=live.time,
+            status=live.status,
+            pos=pos,
+            quat=quat,
+            drones=drones,
+            setpoint=setpoint,
+            touching=touching,
+            wind=air,
+            lights=np.clip(live.lights[worlds], 0.0, 1.0),
+            selected=live.selected,
+            followed=None if body is None or followed is None else (followed[0], body.mocap),
+            name="" if body is None else body.name,
+            controls=live.control_lines,
+            plot=values,
+        )
+
+
+def _winds(data: SimData) -> list[WindData | WindFieldData]:
+    """Return the records of all winds."""
+    return [record for record in data.plugins.values() if isinstance(record, (WindData, WindFieldData))]
+
+
+def _air(data: SimData) -> jax.Array:
+    """Return the velocity of the air at a drone, world frame, m/s; of one drone. (3,)"""
+    return sum((record.velocity_at(data.states.pos) for record in _winds(data)), jnp.zeros_like(data.states.pos))
+
+
+def quantities(sim: Sim) -> list[str]:
+    """Return the paths of everything in the data that changes: ``states.vel`` of drones, ``plugins.cars.pos[1]``."""
+    found = []
+    for path, scope, x in _leaves(sim.data):
+        if scope in ("drone", "world"):
+            found.append(path)
+        elif has_members(scope) and scope not in ("shared", "opaque", "batched"):
+            found += [f"{path}[{k}]" for k in range(x.shape[1])]
+    return found
+
+
+def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
+    """Return the present values of a quantity. (k,)
+
+    Args:
+        data: Data of a simulation.
+        path: One of ``quantities``.
+        world: Index of the world.
+        drone: Index of the drone, for quantities of drones.
+
+    Raises:
+        KeyError: If there is no such quantity.
+    """
+    wanted, _, member = path.rstrip("]").partition("[")
+    for found, scope, x in _leaves(data):
+        if found == wanted:
+            index = (world,) if scope == "world" else (world, int(member) if member else drone)
+            return np.asarray(x)[index].ravel().astype(float)
+    raise KeyError(path)
+
+
+def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
+    """Return path, scope and value of every leaf that holds numbers."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(data)
+    named = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
+    return [(_path(path), scope, x) for (path, x), scope in named if getattr(x.dtype, "kind", "O") in "fiub"]
+
+
+def _path(path: jax.tree_util.KeyPath) -> str:
+    return ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)

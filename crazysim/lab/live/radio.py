@@ -1,0 +1,217 @@
+"""Real Crazyflies over ``cflib``, with the commands of the simulator.
+
+Nothing is sent without ``Radio(..., arm=True)``: a link without it opens no radio, checks commands and refuses them.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crazysim.closing import Closing
+from crazysim.control import Control
+from crazysim.drones import load_airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.errors import ConfigError, not_installed
+from crazysim.lab.live.mocap.frames import Frame
+from crazysim.lab.live.swarm import DroneState
+
+LOG = {
+    "pos": ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
+    "vel": ("stateEstimate.vx", "stateEstimate.vy", "stateEstimate.vz"),
+    "quat": ("stateEstimate.qx", "stateEstimate.qy", "stateEstimate.qz", "stateEstimate.qw"),
+    "ang_vel": ("gyro.x", "gyro.y", "gyro.z"),
+    "acc": ("acc.x", "acc.y", "acc.z"),
+}
+"""Log variables of each part of the state."""
+UNITS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
+"""Units of log variables that are not those of ``DroneState``: degrees/s and multiples of the standard gravity."""
+
+log = logging.getLogger(__name__)
+
+
+class Radio(Closing):
+    """Link to a real Crazyflie that stands on the ground; a ``Link``.
+
+    | Level | Packet of cflib | |
+    | --- | --- | --- |
+    | ``state`` | ``send_full_state_setpoint`` | position and velocity in steps of 1 mm and 1 mm/s |
+    | ``attitude`` | ``send_setpoint``, absolute roll, pitch and yaw | thrust in 65535 steps of the largest |
+    | ``body_rate`` | ``send_setpoint`` with rates | the same |
+    """
+
+    def __init__(
+        self,
+        uri: str,
+        arm: bool = False,
+        airframe: str = "cf21B_500",
+        period_ms: int = 10,
+        max_height: float = 2.0,
+        crazyflie: Any = None,
+        timeout: float = 10.0,
+    ):
+        """Connect and start logging.
+
+        Args:
+            uri: URI of cflib, such as ``radio://0/80/2M/E7E7E7E701``.
+            arm: True to connect, arm the drone and let commands be sent.
+            airframe: Airframe, whose largest thrust scales collective thrust.
+            period_ms: Time between two states, ms, a multiple of 10.
+            max_height: Largest height of a state command, m; higher ones are an error.
+            crazyflie: ``cflib.crazyflie.Crazyflie``, or an object with its interface; None for a new one.
+            timeout: Longest time until the first state arrives, s.
+
+        Raises:
+            ConfigError: If it is to be armed, and cflib is not installed or the drone does not answer.
+        """
+        self.name, self.armed, self.max_height = uri, bool(arm), max_height
+        frame = load_airframe(airframe)
+        self._most = frame.n_rotors * float(np.max(frame.value("rotors.thrust_max")))
+        self._lock, self._arrived = threading.Lock(), threading.Event()
+        self._values = {part: np.zeros(len(names)) for part, names in LOG.items()}
+        self._seen: set[str] = set()
+        self._stamp, self._mode = 0.0, None
+        self._sync: Any = None
+        self._configs: list[Any] = []
+        if self.armed:
+            self._connect(uri, period_ms, crazyflie, timeout)
+        else:
+            log.info("%s is not armed: nothing is sent, and the drone is not connected", uri)
+
+    def _connect(self, uri: str, period_ms: int, crazyflie: Any, timeout: float) -> None:
+        """Connect, start logging and arm."""
+        try:
+            import cflib.crtp
+            from cflib.crazyflie import Crazyflie
+            from cflib.crazyflie.log import LogConfig
+            from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+        except ImportError as error:
+            raise ConfigError(not_installed("real Crazyflies need", "cflib", "radio")) from error
+        if not cflib.crtp.CLASSES:
+            cflib.crtp.init_drivers()
+        self._sync = SyncCrazyflie(uri, cf=crazyflie or Crazyflie())
+        try:
+            self._sync.open_link()
+        except Exception as error:
+            raise ConfigError(f"expected a Crazyflie at {uri}, got: {error}. Check its address and battery.") from error
+        self._cf = self._sync.cf
+        for parts in (("pos", "vel"), ("quat",), ("ang_vel", "acc")):
+            config = LogConfig("-".join(parts), period_ms)
+            for name in (name for part in parts for name in LOG[part]):
+                config.add_variable(name, "float")
+            config.data_received_cb.add_callback(self._take)
+            self._cf.log.add_config(config)
+            config.start()
+            self._configs.append(config)
+        if not self._arrived.wait(timeout):
+            self.close()
+            raise ConfigError(f"expected log variables of {uri} within {timeout:g} s, got none. Use a newer firmware.")
+        self._cf.supervisor.send_arming_request(True)
+        self._cf.commander.send_setpoint(0, 0, 0, 0)  # crtp_commander_rpyt.c ignores thrust until it was zero once
+
+    def state(self) -> DroneState:
+        """Return the latest state that the drone has sent; its time is that of the drone.
+
+        Raises:
+            ConfigError: If the link is not armed.
+        """
+        self._require_armed()
+        with self._lock:
+            v = {part: UNITS.get(part, 1.0) * x for part, x in self._values.items()}
+            norm = np.linalg.norm(v["quat"])
+            quat = v["quat"] / norm if norm > 0.1 else np.array([0.0, 0.0, 0.0, 1.0])
+            return DroneState(self._stamp, v["pos"], quat, v["vel"], v["ang_vel"], v["acc"])
+
+    def command(self, level: Control | str, values: ArrayLike) -> None:
+        """Send a command: that of ``sim.state_control``, ``attitude_control`` or ``body_rate_control`` of one drone.
+
+        Raises:
+            ConfigError: If the link is not armed, the level is another one, or a number is invalid.
+        """
+        level = Control(level)
+        sizes = {Control.state: 16, Control.attitude: 4, Control.body_rate: 4}
+        if level not in sizes:
+            raise ConfigError(f"expected a command of level state, attitude or body_rate, got {level.value!r}")
+        x = np.asarray(values, float)
+        if x.shape != (sizes[level],) or not np.isfinite(x).all():
+            raise ConfigError(f"expected {sizes[level]} finite numbers for {level.value}, got {x.tolist()}")
+        if level == Control.state:
+            if x[2] > self.max_height or np.abs(x[:9]).max() > 32:
+                raise ConfigError(
+                    f"expected a setpoint below {self.max_height} m and within 32 m, got {x[:3].tolist()}"
+                )
+            if np.linalg.norm(x[9:13]) < 1e-3:
+                raise ConfigError(f"expected a unit quaternion, xyzw, got {x[9:13].tolist()}")
+        self._require_armed()
+        commander = self._cf.commander
+        if level == Control.state:
+            # The firmware reads mrad/s, although the docstring of cflib 0.1.34 states degrees/s.
+            commander.send_full_state_setpoint(x[0:3], x[3:6], x[6:9], x[9:13], *np.clip(x[13:16], -32, 32))
+            return
+        self._set_mode(level)
+        thrust = round(65535 * min(max(x[3] / self._most, 0.0), 1.0))
+        roll, pitch, yaw = np.degrees(x[:3])
+        # Legacy yaw rates turn to the right; absolute yaw does not.
+        commander.send_setpoint(roll, pitch, yaw if level == Control.attitude else -yaw, thrust)
+
+    def send_pose(self, frame: Frame, body: str) -> None:
+        """Send a measured pose to the drone's estimator, as motion capture does.
+
+        Raises:
+            ConfigError: If the link is not armed, or the frame has no such body.
+        """
+        self._require_armed()
+        if body not in frame.names:
+            raise ConfigError(f"expected one of the bodies {list(frame.names)}, got {body!r}")
+        k = frame.names.index(body)
+        if np.isfinite(frame.pos[k]).all() and np.isfinite(frame.quat[k]).all():
+            self._cf.loc.send_extpose(frame.pos[k], frame.quat[k])
+
+    def sleep(self, seconds: float) -> None:
+        """Wait, s."""
+        time.sleep(seconds)
+
+    def stop(self) -> None:
+        """Stop the motors; a link that is not armed sends nothing."""
+        if self._sync is not None:
+            self._cf.commander.send_stop_setpoint()
+
+    def close(self) -> None:
+        """Stop the motors and disconnect."""
+        if self._sync is not None:
+            self.stop()
+            for config in self._configs:
+                config.stop()
+            self._sync.close_link()
+            self._sync = None
+
+    def _require_armed(self) -> None:
+        if not self.armed:
+            raise ConfigError(
+                f"expected a link that is armed, got one to {self.name} that is not. Use Radio(..., arm=True)."
+            )
+
+    def _set_mode(self, level: Control) -> None:
+        """Let the firmware read angles or rates."""
+        if self._mode != level:
+            value = "1" if level == Control.attitude else "0"
+            for axis in ("Roll", "Pitch", "Yaw"):
+                self._cf.param.set_value(f"flightmode.stabMode{axis}", value)
+            self._mode = level
+
+    def _take(self, stamp: int, data: dict[str, float], config: Any) -> None:
+        with self._lock:
+            for part, names in LOG.items():
+                if names[0] in data:
+                    x = np.array([data[name] for name in names])
+                    if np.isfinite(x).all():
+                        self._values[part], self._stamp = x, stamp / 1000
+                        self._seen.add(part)
+        if len(self._seen) == len(LOG):
+            self._arrived.set()

@@ -1,0 +1,238 @@
+"""ROS 2: poses, speeds and inertial measurements of drones and objects as messages, commands from messages, the clock.
+
+The package does not depend on ROS. ``RosBridge`` takes a node and the message classes that it uses; without classes it
+imports those of the ROS installation in which it runs.
+
+| Topic | Message | |
+| --- | --- | --- |
+| `/clock` | `rosgraph_msgs/Clock` | simulated time |
+| `/NAME/pose` | `geometry_msgs/PoseStamped` | pose in the frame `world` |
+| `/NAME/odom` | `nav_msgs/Odometry` | pose in `world`, speeds in the drone's axes |
+| `/NAME/imu` | `sensor_msgs/Imu` | attitude, angular velocity, specific force |
+| `/NAME/cmd_vel` | `geometry_msgs/Twist` | velocity, world frame, and yaw rate |
+| `/NAME/cmd_pose` | `geometry_msgs/PoseStamped` | position and yaw |
+| `/NAME/cmd_attitude` | `geometry_msgs/QuaternionStamped` and `/NAME/cmd_thrust`, `std_msgs/Float64` | attitude, N |
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.control import Control
+from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import rotate, to_rpy
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.swarm import DroneState, Swarm
+
+MESSAGES = {
+    "Clock": "rosgraph_msgs.msg",
+    "Time": "builtin_interfaces.msg",
+    "PoseStamped": "geometry_msgs.msg",
+    "QuaternionStamped": "geometry_msgs.msg",
+    "Twist": "geometry_msgs.msg",
+    "Odometry": "nav_msgs.msg",
+    "Imu": "sensor_msgs.msg",
+    "Float64": "std_msgs.msg",
+}
+"""Message classes, and the ROS packages that have them."""
+DEPTH = 10
+"""Length of the queues of publishers and subscriptions."""
+
+
+def ros_messages() -> Any:
+    """Return the message classes of the ROS installation.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    try:
+        found = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGES.items()}
+    except ImportError as error:
+        raise ConfigError(
+            f"messages need ROS 2, which is not installed ({error}). Source its setup file, or pass messages=."
+        ) from error
+    return SimpleNamespace(**found)
+
+
+class RosBridge:
+    """Topics of the drones of a swarm, and of objects of the scene.
+
+    rclpy.init()
+    bridge = RosBridge(swarm, rclpy.create_node("crazysim"))
+    while rclpy.ok():
+        rclpy.spin_once(bridge.node, timeout_sec=0)
+        bridge.update()
+        swarm.advance(0.01)
+    """
+
+    def __init__(
+        self,
+        swarm: Swarm,
+        node: Any,
+        messages: Any = None,
+        objects: Sequence[str] = (),
+        freq: float = 100.0,
+        frame: str = "world",
+    ):
+        """Create publishers and subscriptions.
+
+        Args:
+            swarm: Swarm.
+            node: Node, ``rclpy.node.Node`` or an object with its ``create_publisher`` and ``create_subscription``.
+            messages: Object with the classes of ``MESSAGES`` as attributes; None for those of ROS.
+            objects: Names of movable objects of the scene, such as ``"cf1:0"``, whose poses are published too.
+            freq: Messages per second of simulated time, Hz.
+            frame: Name of the world frame.
+
+        Raises:
+            ConfigError: If ROS is missing, an object does not exist, or the rate is not positive.
+        """
+        if not 0 < freq < math.inf:
+            raise ConfigError(f"expected a positive rate of messages, got {freq} Hz")
+        self.swarm, self.node, self.frame = swarm, node, frame
+        self.messages = m = ros_messages() if messages is None else messages
+        names = swarm.sim.data.objects.names if swarm.sim.data.objects is not None else ()
+        for name in objects:
+            if name not in names:
+                raise ConfigError(f"expected one of the movable objects {list(names)}, got {name!r}")
+        self._rows = {name: names.index(name) for name in objects}
+        self._period, self._due = 1 / freq, 0.0
+        self._clock = node.create_publisher(m.Clock, "/clock", DEPTH)
+        kinds = {"pose": m.PoseStamped, "odom": m.Odometry, "imu": m.Imu}
+        self._publishers = [
+            {topic: node.create_publisher(kind, f"/{name}/{topic}", DEPTH) for topic, kind in kinds.items()}
+            for name in swarm.names
+        ]
+        self._of_objects = {
+            name: node.create_publisher(m.PoseStamped, f"/{name.replace(':', '_')}/pose", DEPTH) for name in objects
+        }
+        self._thrust = np.zeros(len(swarm.names))
+        for k, name in enumerate(swarm.names):
+            for topic, kind, take in (
+                ("cmd_vel", m.Twist, self._velocity),
+                ("cmd_pose", m.PoseStamped, self._pose),
+                ("cmd_thrust", m.Float64, self._set_thrust),
+                ("cmd_attitude", m.QuaternionStamped, self._attitude),
+            ):
+                node.create_subscription(kind, f"/{name}/{topic}", self._guarded(k, take), DEPTH)
+
+    def __call__(self, live: Live) -> None:
+        """Publish, as a process of a live loop."""
+        del live
+        self.update()
+
+    def update(self) -> None:
+        """Publish clock and states, if they are due."""
+        now = self.swarm.time
+        if now < self._due - 1e-9 and self._due - now <= self._period:
+            return
+        self._due = now + self._period
+        stamp = self._stamp(now)
+        clock = self.messages.Clock()
+        clock.clock = stamp
+        self._clock.publish(clock)
+        for k, publishers in enumerate(self._publishers):
+            state = self.swarm.state(k)
+            publishers["pose"].publish(self._pose_message(stamp, state.pos, state.quat))
+            publishers["odom"].publish(self._odometry(stamp, state, self.swarm.names[k]))
+            publishers["imu"].publish(self._imu(stamp, state, self.swarm.names[k]))
+        if self._rows:
+            objects = self.swarm.sim.data.objects
+            pos, quat = (np.asarray(x[0, 0], float) for x in (objects.pos, objects.quat))
+            for name, row in self._rows.items():
+                self._of_objects[name].publish(self._pose_message(stamp, pos[row], quat[row]))
+
+    # Messages -------------------------------------------------------------------------------------------------------
+
+    def _stamp(self, now: float) -> Any:
+        stamp = self.messages.Time()
+        nanoseconds = round(now * 1e9)
+        stamp.sec, stamp.nanosec = nanoseconds // 10**9, nanoseconds % 10**9
+        return stamp
+
+    def _pose_message(self, stamp: Any, pos: NDArray, quat: NDArray) -> Any:
+        message = self.messages.PoseStamped()
+        message.header.stamp, message.header.frame_id = stamp, self.frame
+        _set(message.pose.position, pos)
+        _set(message.pose.orientation, quat)
+        return message
+
+    def _odometry(self, stamp: Any, state: DroneState, name: str) -> Any:
+        message = self.messages.Odometry()
+        message.header.stamp, message.header.frame_id, message.child_frame_id = stamp, self.frame, name
+        _set(message.pose.pose.position, state.pos)
+        _set(message.pose.pose.orientation, state.quat)
+        _set(message.twist.twist.linear, rotate(state.quat * (-1, -1, -1, 1), state.vel))
+        _set(message.twist.twist.angular, state.ang_vel)
+        return message
+
+    def _imu(self, stamp: Any, state: DroneState, name: str) -> Any:
+        message = self.messages.Imu()
+        message.header.stamp, message.header.frame_id = stamp, name
+        _set(message.orientation, state.quat)
+        _set(message.angular_velocity, state.ang_vel)
+        _set(message.linear_acceleration, state.acc)
+        return message
+
+    # Commands -------------------------------------------------------------------------------------------------------
+
+    def _guarded(self, drone: int, take: Callable[[int, Any], None]) -> Callable[[Any], None]:
+        """Return the callback of a subscription: a refused command is reported."""
+
+        def callback(message: Any) -> None:
+            with self.swarm.lock:
+                try:
+                    take(drone, message)
+                except ConfigError as error:
+                    self.swarm.reports.add("refused", self.swarm.names[drone], self.swarm.time, str(error))
+
+        return callback
+
+    def _velocity(self, drone: int, message: Any) -> None:
+        self.swarm.commanders[drone].velocity(_get(message.linear), float(message.angular.z))
+
+    def _pose(self, drone: int, message: Any) -> None:
+        if message.header.frame_id not in ("", self.frame):
+            raise ConfigError(f"expected a pose in the frame {self.frame!r}, got {message.header.frame_id!r}")
+        quat = _get(message.pose.orientation, "xyzw")
+        self.swarm.commanders[drone].position(_get(message.pose.position), _unit_rpy(quat)[2])
+
+    def _set_thrust(self, drone: int, message: Any) -> None:
+        thrust = float(message.data)
+        if not 0 <= thrust < math.inf:
+            raise ConfigError(f"expected a collective thrust of 0 N or more, got {thrust}")
+        self._thrust[drone] = thrust
+
+    def _attitude(self, drone: int, message: Any) -> None:
+        rpy = _unit_rpy(_get(message.quaternion, "xyzw"))
+        self.swarm.commanders[drone].command(Control.attitude, [*rpy, self._thrust[drone]])
+
+
+def _set(part: Any, values: NDArray) -> None:
+    """Write numbers into the fields x, y, z and w of a part of a message."""
+    for name, value in zip("xyzw", values.tolist(), strict=False):
+        setattr(part, name, value)
+
+
+def _get(part: Any, names: str = "xyz") -> NDArray:
+    """Return fields of a part of a message."""
+    return np.array([getattr(part, name) for name in names], float)
+
+
+def _unit_rpy(quat: NDArray) -> NDArray:
+    """Return roll, pitch and yaw, rad, of a quaternion of any length.
+
+    Raises:
+        ConfigError: If it is zero or not finite.
+    """
+    norm = float(np.linalg.norm(quat))
+    if not 1e-3 < norm < math.inf:
+        raise ConfigError(f"expected a unit quaternion, xyzw, got {quat.tolist()}")
+    return to_rpy(quat / norm)

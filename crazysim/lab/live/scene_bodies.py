@@ -1,0 +1,157 @@
+"""Bodies of a scene that viewers pick and follow: drones, vehicles, loads and objects, each with its parts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import rotate
+from crazysim.scene.visual_geoms import VisualGeom
+from crazysim.sim.sim import Sim
+
+DRONE = "drone"
+"""Kind of drones."""
+MARK_RADIUS = 0.12
+"""Radius of the sphere around a marked drone, and the smallest around other bodies, m."""
+MAX_TRAILS = 256
+"""Number of bodies of a world up to which all have trails; above it only the drones have."""
+
+
+class SceneBody(NamedTuple):
+    """A body of every world."""
+
+    kind: str
+    """``"drone"``, or the name of the objects in the scene, such as ``"cars"``, ``"load"`` or that of a handle."""
+    index: int
+    """Number among those of its kind."""
+    name: str
+    """Name in viewers."""
+    mocap: int
+    """Mocap id."""
+
+
+class SceneBodies:
+    """All bodies that can be picked, drones first."""
+
+    items: tuple[SceneBody, ...]
+    """Bodies, drones first."""
+    owner: NDArray
+    """Index into ``items`` for each mocap body: the body itself, or, for a part such as a wheel, its car. (n_mocap,)"""
+    low: NDArray
+    """Lower corner of the box around the visible geoms of each mocap body, body frame, m. (n_mocap, 3)"""
+    high: NDArray
+    """Upper corner of that box, body frame, m. (n_mocap, 3)"""
+
+    def __init__(self, sim: Sim, shapes: Sequence[VisualGeom] = ()):
+        """Find the bodies of a compiled scene.
+
+        Args:
+            sim: Simulation.
+            shapes: Visible geoms, for the sizes of the bodies.
+        """
+        names = _mocap_names(sim)
+        parts = {part: base for plugin in sim.plugins.values() for part, base in _parts(plugin.placed_kinds or ())}
+        counts = Counter(kind for kind, _ in names)
+        members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
+        items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_drones(sim))]
+        own = {body.mocap for body in items}
+        for mocap, (kind, k) in enumerate(names):
+            if mocap not in own and kind not in parts:
+                called = members.get(kind, ())
+                name = called[k] if k < len(called) else kind if counts[kind] == 1 else f"{kind} {k}"
+                items.append(SceneBody(kind, k, name, mocap))
+        self.items = tuple(items)
+        places = {(body.kind, body.index): i for i, body in enumerate(items)}
+        of_mocap = {body.mocap: i for i, body in enumerate(items)}
+        self.owner = np.array([of_mocap.get(mocap, -1) for mocap in range(len(names))], int)
+        for mocap in np.flatnonzero(self.owner < 0):
+            kind, k = names[mocap]
+            base = parts[kind]  # parts are in the order of their bodies, equally many for each
+            self.owner[mocap] = places[base, k * counts[base] // counts[kind]]
+        self.low, self.high = _boxes(len(names), shapes)
+
+    @property
+    def tracked(self) -> NDArray:
+        """Mocap ids of the bodies that have trails, drones first. (n,)"""
+        drones = [body.mocap for body in self.items if body.kind == DRONE]
+        others = [body.mocap for body in self.items if body.kind != DRONE]
+        return np.array(drones + (others if len(self.items) <= MAX_TRAILS else []), int)
+
+    def radius(self, mocap: int) -> float:
+        """Return the radius of the mark around a body, m.
+
+        Args:
+            mocap: Mocap id of the body.
+        """
+        if self.items[self.owner[mocap]].kind == DRONE:
+            return MARK_RADIUS
+        return max(MARK_RADIUS, float(np.linalg.norm(np.maximum(-self.low[mocap], self.high[mocap]))))
+
+    def find(self, kind: str, index: int) -> SceneBody:
+        """Return a body.
+
+        Args:
+            kind: Kind, see ``SceneBody``.
+            index: Number among those of its kind.
+
+        Raises:
+            ConfigError: If there is none.
+        """
+        found = next((body for body in self.items if (body.kind, body.index) == (kind, index)), None)
+        if found is None:
+            counts = Counter(body.kind for body in self.items)
+            known = ", ".join(f"{kind!r} (0 to {n - 1})" for kind, n in counts.items())
+            raise ConfigError(f"expected a body to follow, got {kind!r} {index!r}. Use one of {known}.")
+        return found
+
+
+def _drones(sim: Sim) -> list[tuple[str, int]]:
+    return list(zip(sim.drone_names, np.asarray(sim.data.core.drone_mocap_ids).tolist(), strict=True))
+
+
+def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
+    """Return kind and number of every mocap body, by mocap id; bodies of MJCF without a number have the number 0."""
+    model = sim.mj_model
+    names: list[tuple[str, int]] = [("", 0)] * model.nmocap
+    for body in np.flatnonzero(model.body_mocapid >= 0):
+        text = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(body)) or f"body {body}"
+        kind, _, number = text.rpartition(":")
+        names[model.body_mocapid[body]] = (kind, int(number)) if kind and number.isdigit() else (text, 0)
+    return names
+
+
+def _parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the kinds of a plugin that are parts of another, ``cars_wheel`` of ``cars``, and that one."""
+    found = []
+    for kind in kinds:
+        bases = [base for base in kinds if kind.startswith(f"{base}_")]
+        found += [(kind, min(bases, key=len))] if bases else []
+    return found
+
+
+def _boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:
+    """Return the bounding boxes of mocap bodies in their frames, m; zero without geoms. (n, 3), (n, 3)"""
+    low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
+    for shape in shapes:
+        if shape.mocap >= 0 and shape.kind != "plane":
+            points = shape.pos + rotate(shape.quat, _corners(shape))
+            low[shape.mocap] = np.minimum(low[shape.mocap], points.min(0))
+            high[shape.mocap] = np.maximum(high[shape.mocap], points.max(0))
+    empty = ~np.isfinite(low).all(-1)
+    low[empty] = high[empty] = 0.0
+    return low, high
+
+
+def _corners(shape: VisualGeom) -> NDArray:
+    """Return the vertices of a mesh, or the corners of the box around another geom, in its frame, m. (k, 3)"""
+    if shape.kind == "mesh":
+        return shape.vertices
+    r, h, _ = shape.size
+    half = {"sphere": (r, r, r), "capsule": (r, r, r + h), "cylinder": (r, r, h)}.get(shape.kind, tuple(shape.size))
+    return np.array(half) * (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1)

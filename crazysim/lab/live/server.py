@@ -1,0 +1,295 @@
+"""Servers and listeners: threads that turn messages from the network into commands in a queue.
+
+Nothing but a queue is shared with the simulation, which takes commands out of it between two steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import socket
+import socketserver
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from crazysim.closing import Closing
+from crazysim.errors import ConfigError
+from crazysim.lab.live.commands import Command, command_of
+from crazysim.lab.live.framing import Frames, FramingError, Message, Request, ShowFile
+
+DRONE_PORT, STREAM_PORT = 7000, 7002
+"""Ports of the lab's test server, for commands to single drones and for the stream of all."""
+MAX_QUEUE = 10_000
+"""Most commands that wait for the simulation."""
+MAX_PEERS = 64
+"""Most connections at one time."""
+TIMEOUT = 10.0
+"""Time in which a message that has begun must be complete, s."""
+POLL = 0.2
+"""Time after which a thread that waits for bytes checks whether it is to stop, s."""
+
+log = logging.getLogger(__name__)
+
+
+class CommandQueue(Closing):
+    """Commands that wait for the simulation."""
+
+    def __init__(self) -> None:
+        """Begin with an empty queue."""
+        self._queue: queue.Queue[Command] = queue.Queue(MAX_QUEUE)
+
+    def commands(self) -> list[Command]:
+        """Return the commands that have arrived until this call, in their order; others wait for the next one."""
+        found = []
+        with contextlib.suppress(queue.Empty):
+            for _ in range(self._queue.qsize()):
+                found.append(self._queue.get_nowait())
+        return found
+
+    def _put(self, command: Command) -> None:
+        try:
+            self._queue.put_nowait(command)
+        except queue.Full:
+            raise ConfigError(
+                f"expected at most {MAX_QUEUE} waiting commands, got one more. Call commands() more often."
+            ) from None
+
+
+class CommandServer(CommandQueue):
+    """Server for the lab's protocol, in threads of its own.
+
+    At ``drone_port`` a client takes the control of one drone with ``REQ_07``, answered by ``ACK_07`` or, if the drone
+    does not exist or another client has it, ``ACK_00``. Its commands, ``CMDSTART_takeoff_0.5_EOF`` for example, are
+    answered by ``ACK``, or ``ERR`` if they are invalid. At ``stream_port`` messages name their drone,
+    ``07_CMDSTART_takeoff_0.5_EOF``; shows and ``START`` are accepted too.
+
+        with CommandServer() as server:
+            while True:
+                fleet.apply(server.commands())
+                sim.step(10)
+    """
+
+    def __init__(
+        self,
+        drones: Sequence[int] = tuple(range(1, 100)),
+        host: str = "127.0.0.1",
+        drone_port: int = DRONE_PORT,
+        stream_port: int = STREAM_PORT,
+        timeout: float = TIMEOUT,
+    ):
+        """Listen.
+
+        Args:
+            drones: IDs that clients may request.
+            host: Address to listen at; this machine's alone by default, ``0.0.0.0`` for every network. The protocol has
+                no passwords.
+            drone_port: Port for commands to single drones; 0 for any free one.
+            stream_port: Port for the stream of all; 0 for any free one.
+            timeout: Time in which a message that has begun must be complete, s.
+
+        Raises:
+            ConfigError: If it cannot listen there.
+        """
+        super().__init__()
+        self.drones, self.timeout = frozenset(drones), timeout
+        self._taken: set[int] = set()
+        self._lock = threading.Lock()
+        self._stopped = threading.Event()
+        self._listeners = []
+        if host not in ("127.0.0.1", "localhost", "::1"):
+            log.warning("listening at %s: every machine of that network can command the drones", host)
+        for port, serve in ((drone_port, self._serve_drone), (stream_port, self._serve_stream)):
+            try:
+                listener = _Listener((host, port), serve)
+            except (OSError, OverflowError) as error:
+                self.close()
+                raise ConfigError(f"expected a free address, got {host}:{port}: {error}. Use another port.") from error
+            self._listeners.append(listener)
+            threading.Thread(target=listener.serve_forever, args=(POLL,), daemon=True).start()
+
+    @property
+    def drone_port(self) -> int:
+        """Port for commands to single drones."""
+        return self._listeners[0].server_address[1]
+
+    @property
+    def stream_port(self) -> int:
+        """Port for the stream of all."""
+        return self._listeners[1].server_address[1]
+
+    def close(self) -> None:
+        """Stop listening and close all connections."""
+        self._stopped.set()
+        for listener in self._listeners:
+            listener.shutdown()
+            listener.server_close()
+
+    def _serve_drone(self, peer: socket.socket, name: str) -> None:
+        drone = None
+        try:
+            for frame in _frames(peer, self._stopped, self.timeout):
+                if drone is None:
+                    if not isinstance(frame, Request) or not self._take(frame.drone):
+                        log.warning("%s refused: drone %s is not free", name, getattr(frame, "drone", None))
+                        peer.sendall(b"ACK_00")
+                        return
+                    drone = frame.drone
+                    peer.sendall(f"ACK_{drone:02d}".encode())
+                elif isinstance(frame, Message):
+                    self._answer(peer, name, frame, drone)
+                else:
+                    raise FramingError("expected commands after the request, got another request or a show")
+        finally:
+            with self._lock:
+                self._taken.discard(drone)  # type: ignore[arg-type]
+
+    def _take(self, drone: int) -> bool:
+        with self._lock:
+            if drone not in self.drones or drone in self._taken:
+                return False
+            self._taken.add(drone)
+            return True
+
+    def _serve_stream(self, peer: socket.socket, name: str) -> None:
+        for frame in _frames(peer, self._stopped, self.timeout):
+            if isinstance(frame, Request):
+                raise FramingError("expected messages with the ID of a drone, got a request")
+            self._answer(peer, name, frame, None)
+
+    def _answer(self, peer: socket.socket, name: str, frame: Message | ShowFile, drone: int | None) -> None:
+        """Queue the command of a message and answer it."""
+        try:
+            if drone is not None and isinstance(frame, Message) and frame.drone not in (None, drone):
+                raise ConfigError(f"expected commands to drone {drone}, got one to drone {frame.drone}")
+            self._put(command_of(frame, drone))
+        except ConfigError as error:
+            log.warning("%s: command refused: %s", name, error)
+            peer.sendall(b"ERR")
+            return
+        peer.sendall(b"ACK")
+
+
+class StreamListener(CommandQueue):
+    """Client of a server's stream of commands, such as port 7002 of the lab's test server, in a thread of its own.
+
+    The simulation is one of many receivers there. Every valid message is answered by ``ACK``. When the server
+    disconnects or sends something else, the listener stops and ``alive`` is False; the fleet flies on.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = TIMEOUT):
+        """Connect.
+
+        Args:
+            host: Address of the server.
+            port: Port of the stream.
+            timeout: Time in which a connection, and a message that has begun, must be complete, s.
+
+        Raises:
+            ConfigError: If there is no server.
+        """
+        super().__init__()
+        self._stopped = threading.Event()
+        self._peer = connect(host, port, timeout)
+        self._timeout = timeout
+        self._thread = threading.Thread(target=self._listen, args=(f"{host}:{port}",), daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """True while the connection stands."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._stopped.set()
+        self._thread.join(5 * POLL)
+        self._peer.close()
+
+    def _listen(self, name: str) -> None:
+        with _logged(name), contextlib.closing(self._peer):
+            for frame in _frames(self._peer, self._stopped, self._timeout):
+                if isinstance(frame, Request):
+                    raise FramingError("expected commands, got a request")
+                try:
+                    self._put(command_of(frame))
+                    self._peer.sendall(b"ACK")
+                except ConfigError as error:
+                    log.warning("%s: command refused: %s", name, error)
+
+
+def connect(host: str, port: int, timeout: float) -> socket.socket:
+    """Return a connection.
+
+    Raises:
+        ConfigError: If there is no server.
+    """
+    try:
+        return socket.create_connection((host, port), timeout)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"expected a server at {host}:{port}, got none: {error}. Start it first.") from error
+
+
+class _Listener(socketserver.ThreadingTCPServer):
+    """Listening socket with a thread for every connection."""
+
+    allow_reuse_address, daemon_threads, block_on_close = True, True, False
+
+    def __init__(self, address: tuple[str, int], serve: Callable[[socket.socket, str], None]):
+        self._serve, self._n_peers = serve, threading.BoundedSemaphore(MAX_PEERS)
+        super().__init__(address, socketserver.BaseRequestHandler)
+
+    def finish_request(self, request: socket.socket, client_address: tuple[str, int]) -> None:
+        name = f"{client_address[0]}:{client_address[1]}"
+        if not self._n_peers.acquire(blocking=False):
+            log.warning("%s refused: %d clients are connected already", name, MAX_PEERS)
+            return
+        try:
+            with _logged(name):
+                self._serve(request, name)
+        finally:
+            self._n_peers.release()
+
+
+@contextlib.contextmanager
+def _logged(name: str) -> Iterator[None]:
+    """Log why a connection ends, in place of an error."""
+    try:
+        yield
+        log.info("%s disconnected", name)
+    except (FramingError, TimeoutError) as error:
+        log.warning("%s refused: %s", name, error)
+    except OSError as error:
+        log.warning("%s lost: %s", name, error)
+
+
+def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> Iterator[Message | Request | ShowFile]:
+    """Yield the messages of a connection until it ends, or the server stops.
+
+    Raises:
+        FramingError: If it sends something else.
+        TimeoutError: If it begins a message and does not finish it.
+    """
+    frames, deadline = Frames(), None
+    peer.settimeout(POLL)
+    while not stopped.is_set():
+        if deadline is not None and time.monotonic() > deadline:
+            raise TimeoutError(f"expected a complete message within {timeout:g} s")
+        try:
+            received = peer.recv(2**16)
+        except TimeoutError:
+            continue
+        if not received:
+            if frames.pending:
+                raise FramingError("expected a complete message, got the end of the connection")
+            return
+        for frame in frames.feed(received):
+            deadline = None
+            peer.settimeout(timeout)  # of the answer
+            yield frame
+            peer.settimeout(POLL)
+        if not frames.pending:
+            deadline = None
+        elif deadline is None:
+            deadline = time.monotonic() + timeout

@@ -1,0 +1,76 @@
+"""ArduPilot's software in the loop, over its JSON interface."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink
+from crazysim.lab.live.sitl.measured import Measured, frd, ned, quat_ned
+
+PORT = 9002
+"""Port at which a simulation listens."""
+FORMATS = {18458: "<HHI16H", 29569: "<HHI32H"}
+"""Packets with 16 and 32 outputs by their first number: rate, count and widths of pulses, us."""
+PULSE_MIN, PULSE_MAX = 1000.0, 2000.0
+"""Pulses of a motor that is off and of one at full power, us: ``MOT_PWM_MIN`` and ``MOT_PWM_MAX``."""
+
+
+class ArduPilot(FirmwareLink):
+    """A process of ArduPilot that was started with ``--model JSON:ADDRESS``; it waits for each answer.
+
+    The interface is that of ``libraries/SITL/examples/JSON`` of ArduPilot/ardupilot. ArduPilot has no HIL messages of
+    MAVLink any more.
+
+    It receives what the ``IMU`` measures. The interface has no fields for the others: ArduPilot simulates satellite
+    navigation, barometer and compass itself, with the errors of its parameters ``SIM_*``, from the true position,
+    velocity and attitude.
+    """
+
+    positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
+    yaw_torque_signs = (-1, -1, 1, 1)
+    remedy = "set FRAME_TYPE to the one whose motors turn so"
+    lockstep = True
+
+    def __init__(self, host: str = "127.0.0.1", *, port: int = PORT):
+        """Listen.
+
+        Args:
+            host: Address to listen at.
+            port: Port.
+
+        Raises:
+            ConfigError: If the port has no valid number, or is in use.
+        """
+        self._link = Datagrams(host, port)
+
+    def send(self, measured: Measured) -> None:
+        """Answer the last packet with the state; before the first one there is nothing to answer."""
+        line = {
+            "timestamp": measured.time,
+            "imu": {"gyro": frd(measured.gyro).tolist(), "accel_body": frd(measured.accel).tolist()},
+            "position": ned(measured.pos).tolist(),
+            "quaternion": quat_ned(measured.quat).tolist(),
+            "velocity": ned(measured.vel).tolist(),
+        }
+        self._link.answer(f"\n{json.dumps(line)}\n".encode())
+
+    def receive(self, timeout: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived in time. (4,)"""
+        return self._link.newest(timeout, _commands)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._link.close()
+
+
+def _commands(packet: bytes) -> NDArray | None:
+    """Return the motor commands of a packet, or None for another format. (4,)"""
+    form = FORMATS.get(int.from_bytes(packet[:2], "little"))
+    if form is None or len(packet) != struct.calcsize(form):
+        return None
+    pulses = np.array(struct.unpack(form, packet)[3:7], float)
+    return np.clip((pulses - PULSE_MIN) / (PULSE_MAX - PULSE_MIN), 0, 1)

@@ -1,0 +1,127 @@
+"""Betaflight's software in the loop, over UDP."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.core.settings import flag
+from crazysim.errors import ConfigError, shown
+from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
+from crazysim.lab.live.sitl.measured import TURN, ZURICH, Measured, Origin, as_origin, frd
+from crazysim.tables import bounds, numbers
+
+PORTS = (9002, 9003, 9004)
+"""Ports of the motors, which Betaflight sends, and of the state and the remote control, which it receives."""
+N_CHANNELS = 16
+LARGEST_PULSE = 65535
+"""Largest pulse that a packet of the remote control holds, us."""
+
+
+class Betaflight(FirmwareLink):
+    """A process ``betaflight_SITL``, which runs in real time.
+
+    Packets are those of ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
+    its clock to the simulation's but does not wait for it, and answers each packet of the state with at most one of the
+    motors.
+
+    It receives what ``IMU`` and ``GPS`` measure, and the pressure at the height that the ``Barometer`` measures, which
+    a firmware with ``gazebo`` replaces by that at the altitude of the ``GPS``. Its attitude is the true one, which it
+    takes in place of its own estimate unless it was built with ``USE_IMU_CALC``, and from which it simulates a compass.
+    """
+
+    positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))
+    yaw_torque_signs = (1, -1, -1, 1)
+    remedy = "set yaw_motors_reversed = ON in the firmware"
+    lockstep = False
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        *,
+        ports: tuple[int, int, int] = PORTS,
+        gazebo: bool = True,
+        origin: Origin = ZURICH,
+        rc_freq: float = 50.0,
+    ):
+        """Open the ports.
+
+        Args:
+            host: Address of the process.
+            ports: Ports of the motors, the state and the remote control.
+            gazebo: True for a firmware with ``ENABLE_GAZEBO_BRIDGE=1``, the default of its build.
+            origin: Place of the world's origin.
+            rc_freq: Packets of the remote control per second, Hz.
+
+        Raises:
+            ConfigError: If an argument is out of range, or the port of the motors is in use.
+        """
+        self.gazebo, self.origin, self._rc_rate = flag("gazebo", gazebo), as_origin(origin), Rate("rc_freq", rc_freq)
+        self._start: tuple[float, float] | None = None
+        if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
+            raise ConfigError(
+                f"expected ports of the motors, the state and the remote control, got {shown(ports)}. Use {PORTS}."
+            )
+        motors, self._state, self._rc = ports
+        for port in (self._state, self._rc):
+            check_address(host, port, least=1)
+        self._channels = np.array([1500.0, 1500.0, 1000.0, 1500.0, *[1000.0] * (N_CHANNELS - 4)])
+        self._link = Datagrams(host, motors)
+
+    @property
+    def channels(self) -> NDArray[np.float64]:
+        """Remote control, us: roll, pitch, throttle, yaw, and the switches, 1,000 to 2,000. (16,)
+
+        Set all of them, or single ones, which are checked when they are sent.
+
+        Raises:
+            ConfigError: If they are not 16 whole numbers that fit into a packet.
+        """
+        return self._channels
+
+    @channels.setter
+    def channels(self, values: ArrayLike) -> None:
+        self._channels = _pulses(values).astype(np.float64)
+
+    def send(self, measured: Measured) -> None:
+        """Send the state, and the remote control when it is due."""
+        gyro, (x, y, z, w) = frd(measured.gyro), measured.quat
+        latitude, longitude, altitude = self.origin.place(measured.gps_pos)
+        if self.gazebo:
+            quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
+            self._start = self._start or (latitude, longitude)  # the bridge mirrors places at the first one
+            latitude, longitude = (2 * x - y for x, y in zip(self._start, (latitude, longitude), strict=True))
+        else:
+            quat = TURN * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
+            gyro = gyro * [1, 1, -1]
+        place = (longitude, latitude, altitude)
+        state = (*gyro, *frd(measured.accel), *quat, *measured.gps_vel, *place, self.origin.pressure(measured.height))
+        self._link.send(struct.pack("<18d", measured.time, *state), self._state)
+        if self._rc_rate.is_due(measured.time):
+            self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *_pulses(self._channels)), self._rc)
+
+    def receive(self, timeout: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived in time. (4,)"""
+        return self._link.newest(timeout, _commands)
+
+    def close(self) -> None:
+        """Close the ports."""
+        self._link.close()
+
+
+def _pulses(channels: ArrayLike) -> NDArray[np.int64]:
+    """Return the pulses of a packet of the remote control, us. (16,)"""
+    pulses = numbers("channels", channels, bounds(0, LARGEST_PULSE), ((N_CHANNELS,),))
+    if np.any(pulses % 1):
+        raise ConfigError(f"expected channels as whole numbers, us, got {shown(pulses.tolist())}. Round them.")
+    return pulses.astype(np.int64)
+
+
+def _commands(packet: bytes) -> NDArray | None:
+    """Return the motor commands of a packet, or None for another format. (4,)"""
+    if len(packet) != struct.calcsize("<4f"):
+        return None
+    commands = np.frombuffer(packet, "<f4")
+    return np.clip(commands, 0, 1) if np.isfinite(commands).all() else None

@@ -1,0 +1,151 @@
+"""Links to the process of a firmware: their interface, the arrangement of its motors, and UDP sockets."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import ClassVar
+
+from numpy.typing import NDArray
+
+from crazysim.closing import Closing
+from crazysim.errors import ConfigError, shown
+from crazysim.lab.live.sitl.measured import Measured
+from crazysim.tables import POSITIVE, bounds, number, numbers
+
+ROUNDING = 1e-6
+"""Tolerance of times for the rounding of sums of periods, s."""
+LARGEST = 65535
+"""Longest datagram, bytes."""
+LAST_PORT = 65535
+"""Largest number of a port."""
+DRAINING = 0.1
+"""Longest time for reading the packets that are there once the time to wait is over, s, however fast others arrive."""
+TIMEOUT = bounds(high=1e6, positive=True)
+"""Range of a time to wait, s."""
+
+
+class FirmwareLink(Closing):
+    """Link to the process of a firmware that flies one quadrotor.
+
+    ``positions`` are signs of x (forward) and y (left) of motors 1 to 4, ``yaw_torque_signs`` those of the torque about
+    z (up) with which each acts on the body: positive for a rotor that turns clockwise, seen from above.
+    """
+
+    positions: ClassVar[tuple[tuple[int, int], ...]]
+    yaw_torque_signs: ClassVar[tuple[int, ...]]
+    remedy: ClassVar[str]
+    """Remedy for an airframe whose rotors turn the other way round, for a message."""
+    lockstep: ClassVar[bool]
+    """True for a firmware that waits for the simulation, False for one with a clock of its own."""
+
+    @abstractmethod
+    def send(self, measured: Measured) -> None:
+        """Send the measurements of an instant."""
+
+    @abstractmethod
+    def receive(self, timeout: float) -> NDArray | None:
+        """Return the newest motor commands from 0 to 1, or None if none arrived in time. (4,)
+
+        Args:
+            timeout: Time to wait for one, s; 0 for those that are there.
+        """
+
+
+class Rate:
+    """Times at which something is due, at a rate in simulated time."""
+
+    def __init__(self, name: str, freq: float):
+        """Begin at once.
+
+        Args:
+            name: Name of the rate, for messages.
+            freq: Rate, Hz.
+
+        Raises:
+            ConfigError: If the rate is not positive.
+        """
+        self._period, self._next = 1 / number(name, freq, POSITIVE), 0.0
+
+    def is_due(self, time: float) -> bool:
+        """Return True if it is due at a simulated time, s, and schedule the next one."""
+        if time < self._next - ROUNDING:
+            return False
+        self._next = max(self._next + self._period, time)
+        return True
+
+
+def check_address(host: str, port: int, least: int = 0) -> None:
+    """Check an address.
+
+    Args:
+        host: Name or address of a host.
+        port: Port.
+        least: Least port; 0 allows any free one.
+
+    Raises:
+        ConfigError: If the host is not text, or the port is not a whole number up to 65535.
+    """
+    if not isinstance(host, str):
+        raise ConfigError(f"expected host as text, got {shown(host)}. Use '127.0.0.1'.")
+    numbers("port", port, bounds(least, LAST_PORT), ((),), whole=True)
+
+
+class Datagrams(Closing):
+    """UDP socket that sends to one address, and receives the newest packet."""
+
+    def __init__(self, host: str, port: int):
+        """Bind the socket to a port of this machine.
+
+        Raises:
+            ConfigError: If the port has no valid number, or is in use.
+        """
+        check_address(host, port)
+        self._host = host
+        self._sender: tuple[str, int] | None = None
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
+
+    def send(self, packet: bytes, port: int) -> None:
+        """Send a packet, which is lost if no program listens."""
+        with contextlib.suppress(ConnectionRefusedError):
+            self._socket.sendto(packet, (self._host, port))
+
+    def answer(self, packet: bytes) -> None:
+        """Send a packet to the sender of the last one."""
+        if self._sender is not None:
+            with contextlib.suppress(ConnectionRefusedError):
+                self._socket.sendto(packet, self._sender)
+
+    def newest(self, timeout: float, read: Callable[[bytes], NDArray | None]) -> NDArray | None:
+        """Return the contents of the newest packet that has any, or None if none arrived in time.
+
+        Args:
+            timeout: Time to wait for one, s; 0 for those that are there.
+            read: Function that returns the contents of a packet, or None for another format, which is skipped.
+        """
+        found, now = None, time.monotonic()
+        deadline, end = now + timeout, now + timeout + DRAINING
+        while now < end:
+            self._socket.settimeout(max(deadline - now, 0.0) if found is None else 0.0)
+            try:
+                packet, sender = self._socket.recvfrom(LARGEST)
+            except (TimeoutError, BlockingIOError):
+                break
+            except ConnectionRefusedError:  # of a packet that was sent to a program that does not listen
+                packet, sender = b"", self._sender
+            contents, now = read(packet), time.monotonic()
+            if contents is not None:
+                found, self._sender = contents, sender
+        return found
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()

@@ -1,0 +1,280 @@
+"""Simulations that firmware flies: measurements out, motor commands in, for one process for each drone."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.closing import Closing
+from crazysim.control import Control
+from crazysim.core.airframes import as_airframes
+from crazysim.core.settings import dividing_rate, flag
+from crazysim.drones import Airframe
+from crazysim.errors import ConfigError, shown
+from crazysim.lab.live.attitude import rotate
+from crazysim.lab.live.pace import Pace, Speed
+from crazysim.lab.live.sitl.link import ROUNDING, TIMEOUT, FirmwareLink
+from crazysim.lab.live.sitl.measured import Measured
+from crazysim.lab.live.staging import compile_step
+from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.sim import Sim
+from crazysim.tables import NOT_NEGATIVE, number
+
+FIELD = np.array([0.0, 2e-5, -4.5e-5])
+"""Magnetic field where there is no ``Magnetometer``, world frame, T: about that of central Europe."""
+LONG = 1.0
+"""Time of a run from which a firmware that sends no motor commands in it is an error, s."""
+GPS_FREQ = 5
+"""Rate of satellite navigation where there is no ``GPS``, Hz."""
+KINDS = (IMU, Barometer, Magnetometer, GPS)
+"""Sensors whose measurements firmware receives."""
+MOUNTED = (IMU, Magnetometer)
+"""Those that measure in a frame of their own, at an attitude in the body."""
+
+
+class SoftwareInTheLoop(Closing):
+    """Processes of a firmware that fly the drones of a simulation, one each.
+
+    The plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation measure; an ``IMU`` without
+    errors is added where there is none, and in place of the others the true values are sent. Which of them a firmware
+    receives is stated by its link.
+    """
+
+    def __init__(
+        self,
+        sim: Sim,
+        links: FirmwareLink | Sequence[FirmwareLink],
+        *,
+        freq: int | None = None,
+        motors: Literal["speed", "thrust"] = "speed",
+        reversed: bool = False,
+        timeout: float = 10.0,
+    ):
+        """Prepare the simulation.
+
+        Args:
+            sim: Simulation at the level ``rotor_vel``.
+            links: Links to the firmware, one for each drone, those of the first world first.
+            freq: Exchanges per second, Hz, a divisor of ``sim.freq``; None for one in every step.
+            motors: Meaning of a motor command from 0 to 1: part of the largest speed of a rotor, or of its thrust.
+            reversed: True for a firmware that is set up for rotors that turn the other way round.
+            timeout: Time to wait for the motor commands of a firmware in lockstep, s.
+
+        Raises:
+            ConfigError: If the level, the links, the rate, the timeout or the rotors of an airframe do not fit.
+        """
+        self.sim, self.timeout, self.motors = sim, number("timeout", timeout, TIMEOUT), motors
+        self.links = _as_links(links)
+        freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
+        if sim.control != Control.rotor_vel:
+            raise ConfigError(
+                f"expected control='rotor_vel', got {sim.control.value!r}. Use Sim(control='rotor_vel'), as a firmware "
+                f"commands motors."
+            )
+        if len(self.links) != sim.n_worlds * sim.n_drones:
+            raise ConfigError(
+                f"expected a link for each of {sim.n_worlds * sim.n_drones} drones, got {len(self.links)}. "
+                f"Pass one for each drone."
+            )
+        if motors not in ("speed", "thrust"):
+            raise ConfigError(f"expected motors as 'speed' or 'thrust', got {motors!r}")
+        reversed = flag("reversed", reversed)
+        self._n_steps = sim.freq // freq
+        airframes = [*as_airframes(sim.airframes, sim.n_drones)] * sim.n_worlds
+        self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]
+        self._airframes, self._fastest = airframes, [airframe.rotor_vel_limits[1] for airframe in airframes]
+        self._sensors: dict[type, Any] = {
+            kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None) for kind in KINDS
+        }
+        if self._sensors[IMU] is None:
+            self._sensors[IMU] = sim.add(IMU())
+        self._rotor_vel = np.zeros((len(self.links), 4), np.float32)
+        self._taken: NDArray | None = None
+        self._heard = [0.0] * len(self.links)
+        self._exchanges = 0
+        self._compiled = False
+
+    def run(self, seconds: float, speed: Speed | None = None) -> None:
+        """Fly for a simulated time.
+
+        Args:
+            seconds: Simulated time, s.
+            speed: Simulated seconds per second, or ``"max"``; None for real time with a firmware that has a clock
+                of its own, and as fast as possible in lockstep.
+
+        Raises:
+            ConfigError: If the time or the speed is out of range, or a firmware does not answer in time.
+        """
+        seconds = number("seconds", seconds, NOT_NEGATIVE)
+        if speed is None:
+            speed = "max" if all(link.lockstep for link in self.links) else 1.0
+        if not self._compiled:  # a firmware with a clock of its own does not wait
+            compile_step(self.sim, self._n_steps)
+            self._compiled = True
+        dt, began = self._n_steps / self.sim.freq, time.monotonic()
+        self._heard = [began] * len(self.links)
+        pace = Pace(dt, speed)
+        for k in range(round(seconds / dt)):
+            if (due := pace.due_in()) > 0:
+                time.sleep(due)
+            pace.begin(k * dt)
+            self.exchange()
+            self._check_heard(time.monotonic() - self.timeout, self.timeout)
+            self.sim.step(self._n_steps)
+        if seconds > LONG and (passed := time.monotonic() - began) > LONG:
+            self._check_heard(began, passed)
+
+    def exchange(self) -> None:
+        """Send measurements, and put the motor commands that come back in force."""
+        measured, self._taken = self._measurements()
+        for link, each in zip(self.links, measured, strict=True):
+            link.send(each)
+        for k, link in enumerate(self.links):
+            command = link.receive(self.timeout if link.lockstep else 0.0)
+            if command is not None:
+                self._rotor_vel[k] = self._speeds(k, command)
+                self._heard[k] = time.monotonic()
+            elif link.lockstep:
+                raise _silent(link, self.timeout)
+        self._exchanges += 1
+        sim = self.sim
+        sim.rotor_vel_control(self._rotor_vel.reshape(sim.n_worlds, sim.n_drones, 4))
+
+    def measure(self) -> list[Measured]:
+        """Return the measurements of every drone; new ones are those since the last exchange."""
+        return self._measurements()[0]
+
+    def _measurements(self) -> tuple[list[Measured], NDArray]:
+        """Return the measurements of every drone, and when the sensors took them. (n_links, n_kinds)"""
+        states, time_now = self.sim.data.states, self._exchanges * self._n_steps / self.sim.freq
+        pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
+        values, taken = zip(*map(self._latest, KINDS), strict=True)
+        imu, height, field, gps = values
+        if field is None:
+            field = rotate(quat * [-1, -1, -1, 1], FIELD)
+        gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
+        counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING)}
+        when = np.empty((len(self.links), len(KINDS)), np.int64)
+        for k, kind in enumerate(KINDS):
+            when[:, k] = counts.get(kind, self._exchanges) if taken[k] is None else taken[k]
+        is_new = np.ones_like(when, bool) if self._taken is None else when != self._taken
+        found = []
+        for k in range(len(self.links)):
+            found.append(
+                Measured(
+                    time=time_now,
+                    gyro=imu[k, :3],
+                    accel=imu[k, 3:],
+                    pos=pos[k],
+                    quat=quat[k],
+                    vel=vel[k],
+                    ang_vel=ang_vel[k],
+                    gps_pos=gps[k, :3],
+                    gps_vel=gps[k, 3:],
+                    height=float(pos[k, 2] if height is None else height[k, 1]),
+                    field=field[k],
+                    new=frozenset(kind for kind, changed in zip(KINDS, is_new[k], strict=True) if changed),
+                )
+            )
+        return found, when
+
+    def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
+        """Return the latest measurements of a sensor, vectors in the body frame, and when they were taken, in steps.
+
+        Before the first one they are those of a perfect sensor. Without the sensor there are none.
+        """
+        sensor = self._sensors[kind]
+        if sensor is None:
+            return None, None
+        record = sensor.read(self.sim.data)
+        value, taken = np.asarray(record.samples.value, float), np.asarray(record.samples.taken).reshape(-1)
+        if taken.min() < 0:
+            observed = self.sim.plugins.observations(self.sim.data)
+            value = np.concatenate([observed[f"{sensor.name}.{name}"] for name in sensor.channels], axis=-1)
+        if kind in MOUNTED:
+            vectors = value.reshape(*value.shape[:-1], -1, 3)
+            value = rotate(np.asarray(record.quat, float)[..., None, :], vectors).reshape(value.shape)
+        return _rows(value), taken
+
+    def _check_heard(self, since: float, seconds: float) -> None:
+        """Check that motor commands of every firmware arrived after a time of ``time.monotonic``, ``seconds`` ago."""
+        for link, heard in zip(self.links, self._heard, strict=True):
+            if heard <= since:
+                raise _silent(link, seconds)
+
+    def close(self) -> None:
+        """Close all links."""
+        for link in self.links:
+            link.close()
+
+    def _speeds(self, k: int, command: NDArray) -> NDArray:
+        """Return the speeds of the rotors of a drone for the motor commands of its firmware, rpm. (4,)"""
+        of_rotors, airframe = np.zeros(4), self._airframes[k]
+        of_rotors[self._orders[k]] = command
+        if self.motors == "speed":
+            return of_rotors * self._fastest[k]
+        speeds = airframe.rotor_vel(of_rotors * float(airframe.value("rotors.thrust_max")))
+        return np.where(of_rotors > 0, speeds, 0.0)
+
+
+def _as_links(links: object) -> tuple[FirmwareLink, ...]:
+    """Return links to firmware.
+
+    Raises:
+        ConfigError: If there is something else, or one is there twice.
+    """
+    found = (links,) if isinstance(links, FirmwareLink) else links
+    if not isinstance(found, Sequence) or not all(isinstance(link, FirmwareLink) for link in found):
+        raise ConfigError(f"expected a link to firmware or a list of them, got {shown(links)}. Use ArduPilot(), say.")
+    if len(set(map(id, found))) < len(found):
+        raise ConfigError(
+            f"expected a link of its own for each of {len(found)} drones, got one twice. Make one for each, with other "
+            f"ports."
+        )
+    return tuple(found)
+
+
+def _rows(values: Any) -> NDArray:
+    """Return values of all drones as one row for each, of those of the first world first. (n_links, k)"""
+    values = np.asarray(values, float)
+    return values.reshape(-1, values.shape[-1])
+
+
+def _silent(link: FirmwareLink, seconds: float) -> ConfigError:
+    return ConfigError(
+        f"expected motor commands of {type(link).__name__} within {seconds:.3g} s, got none. Start the firmware, or "
+        f"set timeout."
+    )
+
+
+def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) -> NDArray:
+    """Return which rotor of an airframe each motor of a firmware drives. (4,)
+
+    Raises:
+        ConfigError: If the airframe has no rotor in a quadrant, or its rotors turn the other way round.
+    """
+    if airframe.n_rotors != 4:
+        raise ConfigError(f"expected an airframe with 4 rotors, got {airframe.name!r} with {airframe.n_rotors}")
+    signs = [tuple(map(int, np.sign(pos[:2]))) for pos in airframe.value("rotors.position")]
+    if sorted(signs) != sorted(link.positions):
+        raise ConfigError(
+            f"expected a rotor in each quadrant of the body, got signs of x and y {signs}. Turn the frame."
+        )
+    order = np.array([signs.index(position) for position in link.positions])
+    turns = tuple(map(int, airframe.value("rotors.yaw_torque_sign")[order]))
+    expected = tuple(-sign if reversed else sign for sign in link.yaw_torque_signs)
+    if turns != expected:
+        change = (
+            "reversed=False, with the firmware's default senses" if reversed else f"reversed=True, and {link.remedy}"
+        )
+        raise ConfigError(
+            f"expected rotors of {airframe.name!r} whose drag turns the body by {expected} about z, for motors 1 "
+            f"to 4 of {type(link).__name__}, got {turns}. Pass {change}."
+        )
+    return order

@@ -1,0 +1,203 @@
+"""PX4's software in the loop, over MAVLink's HIL messages."""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError, not_installed
+from crazysim.lab.live.sitl.link import DRAINING, TIMEOUT, FirmwareLink, check_address
+from crazysim.lab.live.sitl.measured import ZURICH, Measured, Origin, as_origin, frd, ned, quat_ned
+from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
+from crazysim.plugins.sensors.sensor import Sensor
+from crazysim.tables import number
+
+PORT = 4560
+"""Port at which the first instance of PX4 looks for a simulation."""
+FIELDS: dict[type[Sensor], int] = {IMU: 0x003F, Magnetometer: 0x01C0, Barometer: 0x1A00}
+"""Bits of ``HIL_SENSOR.fields_updated`` for the fields of each sensor, without which PX4 ignores them: ``ACCEL`` with
+``GYRO``, ``MAG`` and ``BARO`` of ``SensorSource`` in SimulatorMavlink.hpp of PX4/PX4-Autopilot."""
+START = 0.02
+"""Time by which the simulation lags behind the clock until PX4 has started, s."""
+TEMPERATURE = 25.0
+"""Temperature that is reported, degrees Celsius."""
+GAUSS, HECTOPASCAL = 1e-4, 100.0
+"""T in a gauss, Pa in a hectopascal."""
+CHUNK = 65536
+"""Most bytes that are read at once."""
+
+
+class Px4(FirmwareLink):
+    """A process of PX4 that was started without a simulator of its own, as ``make px4_sitl none_iris``.
+
+    PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
+    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts it needs the clock and does not
+    answer: until the first answer the simulation keeps real time with its motors off. It answers to measurements of the
+    gyroscope alone, so its motor commands stay in force where the ``IMU`` has no new one.
+
+    It receives what ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` measure, each when a measurement is new. It
+    treats a sensor whose measurements never change as broken: give all of them noise. The true state in
+    ``HIL_STATE_QUATERNION`` is for its log; the accelerations there are those of the ``IMU``.
+    """
+
+    positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
+    yaw_torque_signs = (-1, -1, 1, 1)
+    remedy = "set the parameters CA_ROTOR0_KM to CA_ROTOR3_KM"
+    lockstep = True
+
+    def __init__(
+        self, host: str = "127.0.0.1", *, port: int = PORT, origin: Origin = ZURICH, connect_timeout: float = 60.0
+    ):
+        """Listen for PX4, which connects when it is started.
+
+        Args:
+            host: Address to listen at.
+            port: Port, 4560 plus the number of the instance.
+            origin: Place of the world's origin.
+            connect_timeout: Time to wait for PX4 when the first measurements are sent, s.
+
+        Raises:
+            ConfigError: If pymavlink is not installed, an argument is out of range, or the port is in use.
+        """
+        try:
+            from pymavlink.dialects.v20 import common
+        except ImportError as error:
+            raise ConfigError(not_installed("links to PX4 need", "pymavlink", "mavlink")) from error
+        self._mavlink: Any = common
+        check_address(host, port)
+        self.origin = as_origin(origin)
+        self.connect_timeout = number("connect_timeout", connect_timeout, TIMEOUT)
+        self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._server.bind((host, port))
+        except OSError as error:
+            self._server.close()
+            raise ConfigError(f"expected a free port at {host}:{port}, got: {error}. End what uses it.") from error
+        self._server.listen(1)
+        self._client: socket.socket | None = None
+        self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
+        self._mav.robust_parsing = True  # bytes that are no message are skipped
+        self._began: tuple[float, float] | None = None
+        self._time = 0.0
+        self._asked = self._answers = False
+        self._motors = np.zeros(4)
+        self.armed = False
+        """True while PX4 is armed."""
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Address at which it listens."""
+        return self._server.getsockname()
+
+    def send(self, measured: Measured) -> None:
+        """Send ``HIL_SENSOR``, ``HIL_GPS`` where there is a new position, and ``HIL_STATE_QUATERNION``."""
+        origin, mav, micros = self.origin, self._mavlink, round(measured.time * 1e6)
+        field = frd(measured.field) / GAUSS
+        altitude = origin.altitude + measured.height
+        pressure = origin.pressure(measured.height) / HECTOPASCAL
+        updated = sum(FIELDS.get(kind, 0) for kind in measured.new)
+        self._send(
+            mav.MAVLink_hil_sensor_message(
+                micros, *frd(measured.accel), *frd(measured.gyro), *field, pressure, 0.0, altitude, TEMPERATURE,
+                updated,
+            )
+        )  # fmt: skip
+        self._time, self._asked = measured.time, IMU in measured.new
+        if GPS in measured.new:
+            north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
+            speed = round(float(np.hypot(north, east)))
+            course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
+            place = self._place(measured.gps_pos)
+            self._send(mav.MAVLink_hil_gps_message(micros, 3, *place, 30, 40, speed, north, east, down, course, 10))
+        vel = [round(100 * v) for v in ned(measured.vel)]
+        accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
+        quat, rates = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
+        place = self._place(measured.pos)
+        self._send(mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *place, *vel, 0, 0, *accel))
+
+    def receive(self, timeout: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived in time. (4,)"""
+        now = time.monotonic()
+        if self._began is None:
+            self._began = now, self._time
+        passed, simulated = now - self._began[0], self._time - self._began[1]
+        if self._answers:
+            must_answer, patience = self._asked, timeout * self._asked
+        else:
+            must_answer, patience = passed > timeout, min(max(simulated + START - passed, 0.0), timeout)
+        found = self._newest(now + patience)
+        if found is not None:
+            self._answers, self._motors = True, found
+        return None if found is None and must_answer else self._motors
+
+    def close(self) -> None:
+        """Close the connection."""
+        for each in (self._client, self._server):
+            if each is not None:
+                each.close()
+
+    def _newest(self, deadline: float) -> NDArray | None:
+        """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
+        found, now = None, time.monotonic()
+        end = max(deadline, now) + DRAINING
+        while now < end and self._readable(max(deadline - now, 0.0) if found is None else 0.0):
+            for message in self._messages():
+                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
+                    self.armed = bool(message.mode & self._mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+                    found = np.clip(np.nan_to_num(message.controls[:4]), 0, 1) * self.armed  # NaN: no command
+            now = time.monotonic()
+        return found
+
+    def _place(self, pos: NDArray) -> tuple[int, int, int]:
+        """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a position in the world, m. (3,)"""
+        latitude, longitude, altitude = self.origin.place(pos)
+        return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
+
+    def _connected(self) -> socket.socket:
+        if self._client is None:
+            self._server.settimeout(self.connect_timeout)
+            try:
+                self._client = self._server.accept()[0]
+            except TimeoutError:
+                host, port = self.address
+                raise ConfigError(
+                    f"expected PX4 to connect to {host}:{port} within {self.connect_timeout:g} s, got no connection. "
+                    f"Start it, or set connect_timeout."
+                ) from None
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return self._client
+
+    def _send(self, message: Any) -> None:
+        client = self._connected()
+        client.settimeout(self.connect_timeout)
+        try:
+            client.sendall(message.pack(self._mav))
+        except (ConnectionError, TimeoutError):
+            raise _closed() from None
+
+    def _readable(self, timeout: float) -> bool:
+        client = self._connected()
+        client.settimeout(max(timeout, 1e-6))
+        try:
+            return bool(client.recv(1, socket.MSG_PEEK))
+        except ConnectionError:
+            raise _closed() from None
+        except (TimeoutError, BlockingIOError):
+            return False
+
+    def _messages(self) -> list[Any]:
+        client = self._connected()
+        client.settimeout(0)
+        try:
+            return self._mav.parse_buffer(client.recv(CHUNK)) or []
+        except BlockingIOError:
+            return []
+
+
+def _closed() -> ConfigError:
+    return ConfigError("expected PX4 to stay connected, got a closed connection. Start it again.")

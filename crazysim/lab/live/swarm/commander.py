@@ -1,0 +1,402 @@
+"""Commander of one drone: which setpoint is in force, as in the firmware of the Crazyflie.
+
+High-level commands plan smooth moves. Streamed setpoints take precedence until they stop: after 0.5 s without one the
+drone stays in its place, after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
+commander.h of crazyflie-firmware). Each of them discards the plan of a high-level command, and a plan that is made
+while they are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
+``crtpCommanderHighLevelGetSetpoint`` in crtp_commander_high_level.c). Until the first command, and after landing, the
+motors are off.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.control import Control
+from crazysim.errors import ConfigError
+from crazysim.lab.live.attitude import yaw_of
+from crazysim.lab.live.paths import Path
+from crazysim.lab.live.swarm.estimate import EstimateFrame
+from crazysim.lab.live.swarm.plan import Plan, move, nearest_yaw
+from crazysim.lab.live.swarm.state import DroneState
+
+STABILIZE, SHUTDOWN = 0.5, 2.0
+"""Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
+FARTHEST = 1e3
+"""Largest coordinate of a command, m, and largest number of any command."""
+SINK, DEEPEST = 0.3, 1.0
+"""Speed at which the setpoint continues down where a landing has ended above its height, m/s, and its distance, m."""
+REACHED, RESTING, REST_TIME = 0.01, 0.02, 0.5
+"""Height above that of a landing at which the motors stop, m; or vertical speed below which a drone stands on ground,
+m/s, some time, s, after the end of the landing."""
+SHORTEST, LONGEST = 1e-3, 1e4
+"""Limits of durations, s, and of factors of durations, 1."""
+N_TRAJECTORIES = 256
+"""Number of trajectories that a drone holds; their IDs are one byte."""
+
+
+class Commander:
+    """Setpoints of one drone from commands; all times are simulated, s."""
+
+    def __init__(self, control: Control = Control.state, report: Callable[[str], None] | None = None):
+        """Begin on the floor with motors off.
+
+        Args:
+            control: Command level of the simulation.
+            report: Function that is called with a message when a command has no effect yet; None for none.
+        """
+        self.control = control
+        self._report = report
+        self.group = 0
+        self.trajectories: dict[int, Path] = {}
+        self._compressed: set[int] = set()
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the floor with motors off and an estimate in the world's frame; trajectories stay."""
+        self.now = 0.0
+        self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
+        self.armed, self.locked = True, False
+        self._plan: Plan | None = None
+        self._held: tuple[Plan, NDArray] | None = None
+        self.estimate_frame: EstimateFrame | None = None
+        self._stream: tuple[str, NDArray] | None = None
+        self._stream_time, self._released = 0.0, math.inf
+        self._reference = np.zeros(4)  # position and yaw that velocity setpoints move
+        self._last = np.zeros((3, 4))
+
+    # State ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def motors_on(self) -> bool:
+        """True while a command is in force."""
+        return self.armed and not self.locked and (self._plan is not None or self._stream is not None)
+
+    @property
+    def finished(self) -> bool:
+        """True where no planned move is under way."""
+        return self._plan is None or self._plan.finished(self.now)
+
+    def goal(self) -> NDArray:
+        """Return position and yaw, their rates and second derivatives in force, or of the drone itself. (3, 4)"""
+        if self._stream is not None:
+            return self._last
+        if self._plan is not None:
+            point = self._plan.at(self.now)
+            if self._plan.lands and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
+                point[:2, 2] += -min(SINK * (self.now - self._plan.end), DEEPEST), -SINK
+            return point
+        return self._motion()
+
+    def in_group(self, mask: int) -> bool:
+        """Return True if a command for a group of drones is for this one."""
+        return mask == 0 or (mask & self.group) != 0
+
+    # High-level commands --------------------------------------------------------------------------------------------
+
+    def take_off(self, height: float, duration: float, yaw: float | None = None) -> None:
+        """Rise to a height, m, within a duration, s; a yaw of None keeps the present one."""
+        self._vertical(height, duration, yaw, lands=False)
+
+    def land(self, height: float, duration: float, yaw: float | None = None) -> None:
+        """Descend to a height, m, and stop the motors there, or where the drone stands; None keeps the yaw.
+
+        A drone that is still higher at the end, because its controller lags or has an offset, descends further.
+        """
+        self._vertical(height, duration, yaw, lands=True)
+
+    def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
+        """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
+        goal, (yaw,) = _numbers("goal", goal, 3), _numbers("yaw", [yaw], 1)
+        begin = self._begin("go_to")
+        if relative:
+            goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
+        end = [*goal, nearest_yaw(begin[0, 3], yaw)]
+        self._plan = Plan(move(begin, end, _duration(duration), linear), self.now)
+
+    def stop(self) -> None:
+        """Stop the motors."""
+        self._plan = self._stream = None
+
+    def upload(self, identity: int, path: Path, compressed: bool = False) -> None:
+        """Receive a trajectory.
+
+        Args:
+            identity: Number of the trajectory.
+            path: Its path.
+            compressed: True for one that the firmware keeps compressed, and can neither stretch nor reverse.
+
+        Raises:
+            ConfigError: If its number is not from 0 to 255.
+        """
+        if not 0 <= identity < N_TRAJECTORIES:
+            raise ConfigError(f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {identity}")
+        self.trajectories[identity] = path
+        (self._compressed.add if compressed else self._compressed.discard)(identity)
+
+    def start_trajectory(
+        self,
+        identity: int,
+        timescale: float = 1.0,
+        relative: bool = True,
+        reversed: bool = False,
+        relative_yaw: bool = False,
+    ) -> None:
+        """Follow a trajectory that was uploaded.
+
+        Args:
+            identity: Number of the trajectory.
+            timescale: Factor of its duration, 1.
+            relative: True to begin at the present setpoint.
+            reversed: True to follow it from its end to its start.
+            relative_yaw: True to begin at the present yaw too.
+
+        Raises:
+            ConfigError: If there is none, the factor is out of range, or a compressed one is to be stretched or
+                reversed.
+        """
+        if identity not in self.trajectories:
+            raise ConfigError(
+                f"expected one of the trajectories {sorted(self.trajectories)}, got {identity}. Upload it."
+            )
+        if not SHORTEST <= timescale <= LONGEST:
+            raise ConfigError(f"expected a timescale from {SHORTEST:g} to {LONGEST:g}, got {timescale}")
+        if identity in self._compressed and (timescale != 1 or reversed):
+            raise ConfigError(
+                f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
+                f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
+            )
+        plan = Plan(self.trajectories[identity], self.now, timescale, bool(reversed))
+        begin, first = self._begin("start_trajectory")[0], plan.at(self.now)[0]
+        shift = np.zeros(4)
+        if relative:
+            shift[:3] = begin[:3] - first[:3]
+            if relative_yaw and identity not in self._compressed:
+                shift[3] = begin[3] - nearest_yaw(begin[3], first[3])
+        self._plan = plan._replace(shift=shift)
+
+    # Streamed setpoints ---------------------------------------------------------------------------------------------
+
+    def command(self, level: Control | str, values: ArrayLike) -> None:
+        """Stream a command of the simulator's own: the numbers of ``sim.state_control`` and so on, of one drone. (k,)
+
+        Raises:
+            ConfigError: If the simulation has another command level, or a number is not finite.
+        """
+        level = Control(level)
+        self._require(level)
+        size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
+        self._put("command", _numbers(f"{level.value} command", values, size, limit=math.inf))
+
+    def full_state(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, quat: ArrayLike, ang_vel: ArrayLike) -> None:
+        """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, attitude, xyzw, body rates, rad/s."""
+        parts = [_numbers("full state", x, n) for x, n in ((pos, 3), (vel, 3), (acc, 3), (quat, 4), (ang_vel, 3))]
+        norm = np.linalg.norm(parts[3])
+        if norm < 1e-3:
+            raise ConfigError(f"expected a unit quaternion, xyzw, got {list(parts[3])}")
+        parts[3] = parts[3] / norm
+        self._require(Control.state)
+        self._put("command", np.concatenate(parts))
+
+    def position(self, pos: ArrayLike, yaw: float) -> None:
+        """Stream a position, m (3,), and yaw, rad."""
+        self._require(Control.state)
+        self._put("position", np.append(_numbers("position", pos, 3), _numbers("yaw", [yaw], 1)))
+
+    def velocity(self, vel: ArrayLike, yaw_rate: float) -> None:
+        """Stream a velocity, world frame, m/s (3,), and yaw rate, rad/s; a reference position moves with it."""
+        self._require(Control.state)
+        self._put("velocity", np.append(_numbers("velocity", vel, 3), _numbers("yaw rate", [yaw_rate], 1)))
+
+    def hover(self, vx: float, vy: float, yaw_rate: float, height: float) -> None:
+        """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
+        self._require(Control.state)
+        self._put("hover", _numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
+
+    def attitude(self, roll: float, pitch: float, yaw_rate: float, thrust: float) -> None:
+        """Stream roll, pitch, rad, yaw rate, rad/s, and collective thrust, N."""
+        self._require(Control.attitude)
+        self._put("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
+
+    def notify_setpoints_stop(self, remain_valid: float = 0.0) -> None:
+        """Let high-level commands take over after some time, s, in which the last setpoint stays in force."""
+        self._released = self.now + max(float(remain_valid), 0.0)
+
+    # Safety ---------------------------------------------------------------------------------------------------------
+
+    def arm(self, armed: bool = True) -> None:
+        """Arm, or stop the motors and refuse commands."""
+        if not armed:
+            self.stop()
+        self.armed = bool(armed)
+
+    def emergency(self) -> None:
+        """Stop the motors, and refuse commands until a reset."""
+        self.stop()
+        self.locked = True
+
+    # The estimate ---------------------------------------------------------------------------------------------------
+
+    def place_estimate(self, pos: NDArray, yaw: float, pose: NDArray) -> None:
+        """Set the pose of the drone's estimate; commands are in the frame of that estimate from now on.
+
+        Args:
+            pos: Position, world frame, m. (3,)
+            yaw: Yaw, world frame, rad.
+            pose: Position, m, and yaw, rad, of the estimate. (4,)
+        """
+        self.estimate_frame = EstimateFrame.from_pose(pos, yaw, pose)
+
+    def estimate(self, state: DroneState) -> DroneState:
+        """Return the drone's estimate of its state."""
+        return state if self.estimate_frame is None else self.estimate_frame.state(state)
+
+    # The loop -------------------------------------------------------------------------------------------------------
+
+    def tick(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
+        """Return the command in force, of the simulation's level and in the world's frame; None with the motors off.
+
+        Args:
+            now: Time, s.
+            pos: Position, world frame, m. (3,)
+            vel: Velocity, world frame, m/s. (3,)
+            yaw: Yaw, world frame, rad.
+        """
+        frame = self.estimate_frame
+        if frame is None:
+            return self._command(now, pos, vel, yaw)
+        command = self._command(now, *frame.motion(pos, vel, yaw))
+        return None if command is None else frame.command(self.control, command)
+
+    def _command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
+        """Return the command in force; all in the frame of the estimate."""
+        dt, self.now = now - self.now, now
+        self.pos, self.vel, self.yaw = pos, vel, yaw
+        if self._stream is not None:
+            age = now - self._stream_time
+            if now >= self._released and self._plan is not None:
+                self._stream = None
+            elif age > SHUTDOWN:
+                self.stop()
+            elif age > STABILIZE and self._stream[0] != "stay":
+                self._stream = ("stay", np.append(pos, yaw))
+        plan = self._plan
+        if self._stream is None and plan is not None and plan.lands and plan.finished(now) and self._has_landed(plan):
+            self.stop()
+        if not self.motors_on:
+            return None
+        if self._stream is not None:
+            return self._streamed(dt)
+        if plan is None or not plan.finished(now) or plan.lands:
+            return _state_command(*self.goal())
+        if self._held is None or self._held[0] is not plan:  # a drone that hovers costs nothing
+            self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
+        return self._held[1]
+
+    def _has_landed(self, plan: Plan) -> bool:
+        """Return True if the drone is as low as its landing goes, or stands on something."""
+        stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING
+        return stands or self.pos[2] <= plan.at(self.now)[0, 2] + REACHED
+
+    def _streamed(self, dt: float) -> NDArray:
+        kind, x = self._stream  # type: ignore[misc]
+        if self.control != Control.state:
+            return self._streamed_attitude(kind, x, dt)
+        if kind == "command":
+            self._last = np.array([[*x[:3], yaw_of(x[9:13])], [*x[3:6], x[15]], [*x[6:9], 0.0]])
+            self._reference = self._last[0].copy()
+            return x
+        rate = np.zeros(4)
+        if kind in ("position", "stay"):
+            self._reference = x.copy()
+        else:
+            c, s = math.cos(self._reference[3]), math.sin(self._reference[3])
+            rate = x if kind == "velocity" else np.array([c * x[0] - s * x[1], s * x[0] + c * x[1], 0.0, x[2]])
+            self._reference = self._reference + dt * rate
+            if kind == "hover":
+                self._reference[2] = x[3]
+        self._last = np.array([self._reference, rate, np.zeros(4)])
+        return _state_command(*self._last)
+
+    def _streamed_attitude(self, kind: str, x: NDArray, dt: float) -> NDArray:
+        if kind == "attitude":
+            self._reference[3] += dt * x[2]
+            return np.array([x[0], x[1], self._reference[3], x[3]])
+        if kind == "stay":  # level, with the thrust of the last command
+            return np.array([0.0, 0.0, self._reference[3] if self.control == Control.attitude else 0.0, self._thrust])
+        return x
+
+    def _put(self, kind: str, values: NDArray) -> None:
+        if self._stream is None:
+            self._last = self.goal()
+            self._reference = self._last[0].copy()
+        self._stream, self._stream_time, self._released, self._plan = (kind, values), self.now, math.inf, None
+        self._thrust = float(values[3]) if kind in ("command", "attitude") else 0.0
+
+    def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
+        (height,) = _numbers("height", [height], 1)
+        here = self._begin("land" if lands else "take_off")[0]
+        goal = here.copy()
+        goal[2] = height
+        if yaw is not None:
+            goal[3] = nearest_yaw(here[3], _numbers("yaw", [yaw], 1)[0])
+        begin = np.array([here, np.zeros(4), np.zeros(4)])
+        self._plan = Plan(move(begin, goal, _duration(duration)), self.now, lands=lands)
+
+    def _motion(self) -> NDArray:
+        """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
+        return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
+
+    def _begin(self, command: str) -> NDArray:
+        """Return where a high-level command begins: at the setpoint in force, or at the drone while setpoints stream.
+
+        One that the stream keeps from taking effect is reported.
+        """
+        self._require(Control.state)
+        if self._stream is None:
+            return self.goal()
+        if math.isinf(self._released) and self._report is not None:
+            self._report(
+                f"expected no streamed setpoints in force before {command}, got some: it begins after "
+                f"notify_setpoints_stop, and the next streamed setpoint discards it. Call notify_setpoints_stop first."
+            )
+        return self._motion()
+
+    def _require(self, level: Control) -> None:
+        if self.locked or not self.armed:
+            raise ConfigError(
+                f"expected a drone that is armed, got one that is {'locked' if self.locked else 'disarmed'}"
+            )
+        if level != self.control:
+            raise ConfigError(
+                f"expected a command that Sim(control={self.control.value!r}) takes, got one of level {level.value!r}. "
+                f"Use Sim(control={level.value!r})."
+            )
+
+
+def _numbers(name: str, values: ArrayLike, n: int, limit: float = FARTHEST) -> NDArray:
+    """Return finite numbers within a limit. (n,)"""
+    try:
+        x = np.array(values, float)
+    except (TypeError, ValueError):
+        raise ConfigError(f"expected {n} numbers for {name}, got {values!r}") from None
+    if x.shape != (n,) or not np.isfinite(x).all() or (np.abs(x) > limit).any():
+        raise ConfigError(f"expected {n} finite numbers up to {limit:g} for {name}, got {x.tolist()}")
+    return x
+
+
+def _duration(value: float) -> float:
+    (value,) = _numbers("duration", [value], 1, LONGEST)
+    if value < SHORTEST:
+        raise ConfigError(f"expected a positive duration of at least {SHORTEST:g} s, got {value} s")
+    return value
+
+
+def _state_command(point: NDArray, rate: NDArray, second: NDArray) -> NDArray:
+    """Return the state command of position and yaw, their rates and second derivatives. (16,)"""
+    half = point[3] / 2
+    return np.array([*point[:3], *rate[:3], *second[:3], 0.0, 0.0, math.sin(half), math.cos(half), 0.0, 0.0, rate[3]])

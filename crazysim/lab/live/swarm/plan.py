@@ -1,0 +1,79 @@
+"""Plans of the high-level commander: smooth moves and uploaded trajectories, as in the firmware of the Crazyflie."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.lab.live.paths import Path
+
+NO_JERK = np.linalg.inv(
+    [[k * (k - 1) * (k - 2) if d == 3 else [1, k, k * (k - 1)][d] for k in range(4, 8)] for d in range(4)]
+)
+"""Inverse of the powers 4 to 7 of a polynomial and its derivatives 1, 2, 3 at the end of its unit interval. (4, 4)"""
+
+
+class Plan(NamedTuple):
+    """A path with its start, speed, direction and place."""
+
+    path: Path
+    """Path."""
+    start: float
+    """Time at which it starts, s."""
+    timescale: float = 1.0
+    """Factor of its duration, 1."""
+    reversed: bool = False
+    """True where it is followed from its end to its start."""
+    shift: NDArray = np.zeros(4)
+    """Offset of position, m, and yaw, rad. (4,)"""
+    lands: bool = False
+    """True where the motors are stopped at its end."""
+
+    @property
+    def end(self) -> float:
+        """Time at which it ends, s."""
+        return self.start + self.path.duration * self.timescale
+
+    def finished(self, t: float) -> bool:
+        """Return True from the end of the plan on."""
+        return not self.path.repeats and t >= self.end
+
+    def at(self, t: float) -> NDArray:
+        """Return position and yaw, their rates and second derivatives at a time, s. (3, 4)"""
+        since = (t - self.start) / self.timescale
+        rate = (-1.0 if self.reversed else 1.0) / self.timescale
+        found = self.path.derivatives(self.path.duration - since if self.reversed else since, 2)
+        found = found * np.array([1.0, rate, rate * rate])[:, None]
+        found[0] += self.shift
+        return found
+
+
+def move(begin: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> Path:
+    """Return the move to rest at a goal.
+
+    It is the polynomial of degree 7 with the given position, velocity and acceleration at its start, at rest at its
+    end, and without jerk at both (crazyflie-firmware, ``piecewise_plan_7th_order_no_jerk``); or the straight line at
+    constant speed.
+
+    Args:
+        begin: Position, m, and yaw, rad, their rates and second derivatives at the start. (3, 4)
+        goal: Position, m, and yaw, rad, at the end. (4,)
+        duration: Duration, s.
+        linear: True for the straight line.
+    """
+    p, v, a = np.asarray(begin, float) * np.array([1.0, duration, duration**2 / 2])[:, None]
+    goal = np.asarray(goal, float)
+    if linear:
+        coefficients = np.stack([p, goal - p], axis=-1)
+    else:
+        known = np.stack([p, v, a, np.zeros(4)])
+        ends = np.stack([goal - p - v - a, -v - 2 * a, -2 * a, np.zeros(4)])
+        coefficients = np.concatenate([known, NO_JERK @ ends]).T
+    return Path(np.array([duration]), coefficients[None], False)
+
+
+def nearest_yaw(yaw: float, goal: float) -> float:
+    """Return the angle equal to a goal that is nearest to a yaw, rad."""
+    return yaw + (goal - yaw + np.pi) % (2 * np.pi) - np.pi

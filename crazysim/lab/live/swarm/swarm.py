@@ -1,0 +1,313 @@
+"""A simulation whose drones take the commands of Crazyflies, each through a commander of its own."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim.closing import Closing
+from crazysim.control import Control
+from crazysim.core.data import SimData
+from crazysim.core.stage import over_drones, over_worlds
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.dynamics import Dynamics
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.lab.live.attitude import from_yaw, rotate, to_rpy
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.mocap.source_events import Reports
+from crazysim.lab.live.staging import compile_step
+from crazysim.lab.live.swarm.commander import Commander
+from crazysim.lab.live.swarm.parameters import LIGHTS, Parameters, parameters_of
+from crazysim.lab.live.swarm.sensors import ranges_of
+from crazysim.lab.live.swarm.state import DroneState
+from crazysim.plugins.effects import MotorFailure
+from crazysim.plugins.estimators import Estimator
+from crazysim.sim.sim import Sim
+
+
+class Swarm(Closing):
+    """A simulation of one world, driven by commanders.
+
+        swarm = Swarm(Sim(n_drones=2, control="state"))
+        swarm["cf1"].take_off(1.0, 2.0)
+        swarm.advance(3.0)
+
+    States are those of the filter of ``Sim(estimator=...)`` and of its ``IMU``, or the true ones without a filter.
+    Commands come from other threads or from the same one; ``lock`` protects them. The simulation advances by
+    ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
+    that ``advance`` runs, after ``run_in(live)``.
+    """
+
+    reports: Reports
+    """Refused commands and packets."""
+    parameters: list[Parameters]
+    """Parameters of each drone; ``set_parameter`` sets them."""
+    colors: NDArray
+    """Colour of the light of each drone, red, green, blue from 0 to 1. (n_drones, 3)"""
+
+    def __init__(self, sim: Sim, names: Sequence[str] | None = None):
+        """Let commands drive a simulation.
+
+        Args:
+            sim: Simulation of one world. High-level commands need ``control="state"``; attitudes and body rates need
+                those command levels.
+            names: Names of the drones; None for ``cf1``, ``cf2``, ...
+
+        Raises:
+            ConfigError: If there are several worlds, or not one name for each drone.
+        """
+        if sim.n_worlds != 1:
+            raise ConfigError(f"expected a simulation of one world, got {sim.n_worlds} worlds. Use Sim(n_worlds=1).")
+        names = [f"cf{k + 1}" for k in range(sim.n_drones)] if names is None else list(names)
+        if len(names) != sim.n_drones or len(set(names)) < len(names):
+            raise ConfigError(f"expected {sim.n_drones} different names, got {names}")
+        self.sim, self.names, self.lock = sim, tuple(names), threading.RLock()
+        self.commanders = [Commander(sim.control, functools.partial(self._refused, name)) for name in names]
+        ranged = "front" in ranges_of(sim, 0)
+        self.parameters = [Parameters(parameters_of(airframe, ranged)) for airframe in sim.airframes]
+        self.colors, self.reports = np.zeros((len(names), 3)), Reports()
+        self.listeners: list[Callable[[], object]] = []
+        self._period = sim.freq // sim.control_freq
+        self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
+        self._motors = self._add_motors()
+        estimators = [plugin for plugin in sim.plugins.values() if isinstance(plugin, Estimator)]
+        self._estimator = next((each for each in estimators if each.control), None)
+        self._estimate = jax.jit(over_worlds(over_drones(self._estimated)))
+        self._on = np.ones(len(names), bool)
+        self._states: list[DroneState] = []
+        self._yaws: list[float] = []
+        self._home = np.asarray(sim.data.states.pos[0], float)
+        self._thread: threading.Thread | None = None
+        self._stopped = threading.Event()
+        self._live: Live | None = None
+        self._read()
+        self._write()
+
+    def __getitem__(self, name: str) -> Commander:
+        """Return the commander of a drone."""
+        return self.commanders[self.index(name)]
+
+    def index(self, name: str) -> int:
+        """Return the index of a drone.
+
+        Raises:
+            UnknownNameError: If there is none of that name.
+        """
+        if name not in self.names:
+            raise UnknownNameError(f"expected one of the drones {list(self.names)}, got {name!r}")
+        return self.names.index(name)
+
+    @property
+    def time(self) -> float:
+        """Time of the states, s."""
+        return self._states[0].time
+
+    def state(self, drone: int | str) -> DroneState:
+        """Return the state of a drone after the last control step."""
+        return self._states[self.index(drone) if isinstance(drone, str) else drone]
+
+    def home(self, drone: int | str) -> NDArray:
+        """Return the position of a drone when the swarm was made, m. (3,)"""
+        return self._home[self.index(drone) if isinstance(drone, str) else drone].copy()
+
+    # Parameters -----------------------------------------------------------------------------------------------------
+
+    def set_parameter(self, drone: int | str, name: str, value: float) -> None:
+        """Set a parameter of a drone's firmware, with its effect on commands, estimate and light.
+
+        Raises:
+            ConfigError: If there is no such parameter, or its effect is not simulated.
+        """
+        k = self.index(drone) if isinstance(drone, str) else drone
+        parameters = self.parameters[k]
+        with self.lock:
+            parameters.set(name, float(value), self.time)
+            if name == "hlCommander.groupmask":
+                self.commanders[k].group = int(value)
+            elif name == "kalman.resetEstimation" and value and parameters.has_initial_pose:
+                self.commanders[k].place_estimate(self._states[k].pos, self._yaws[k], parameters.initial_pose)
+            elif name.startswith(LIGHTS):
+                self.colors[k] = parameters.light.color(self.time)
+
+    def set_leds(self, drone: int, packed: NDArray) -> None:
+        """Set the LEDs of a drone's ring, 16 bits of red, green and blue (5, 6, 5) each; ``ring.effect`` 13 shows them.
+
+        Args:
+            drone: Index of the drone.
+            packed: Colours. (12,)
+        """
+        bits = np.asarray(packed, int)[:, None]
+        parameters = self.parameters[drone]
+        parameters.light.memory = (bits >> [11, 5, 0] & [31, 63, 31]) / [31, 63, 31]
+        parameters.light.changed(parameters, "memory", self.time)
+        self.colors[drone] = parameters.light.color(self.time)
+
+    # Time -----------------------------------------------------------------------------------------------------------
+
+    def __call__(self, live: Live) -> None:
+        """Stage the commands in force, and let viewers show the colours.
+
+        Raises:
+            ConfigError: If it is another simulation.
+        """
+        self._check_loop(live)
+        self.update()
+        live.lights[0] = self.colors
+
+    def run_in(self, live: Live) -> None:
+        """Let ``advance`` and ``sleep`` run a live loop, with its speed and its viewers.
+
+        Raises:
+            ConfigError: If it is the loop of another simulation, or a thread advances the simulation.
+        """
+        self._check_loop(live)
+        if self._thread is not None:
+            raise ConfigError("expected a swarm that no thread advances, got a running one. Call close first.")
+        live.add(self, name="swarm")
+        self._live = live
+
+    def _check_loop(self, live: Live) -> None:
+        if live.sim is not self.sim:
+            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
+
+    def update(self) -> None:
+        """Read the states and stage the commands in force, between two control steps."""
+        with self.lock:
+            self._read()
+            self._write()
+            for k, parameters in enumerate(self.parameters):
+                if parameters.light.fades(self.time - self._period / self.sim.freq):
+                    self.colors[k] = parameters.light.color(self.time)
+            for listener in self.listeners:
+                listener()
+
+    def advance(self, seconds: float) -> None:
+        """Advance by a time, s, rounded to control steps: as fast as possible, or at the speed of the ``run_in`` loop.
+
+        Raises:
+            ConfigError: If a thread advances the simulation.
+        """
+        if self._thread is not None:
+            raise ConfigError("expected a swarm that no thread advances, got a running one. Use sleep.")
+        if self._live is not None:
+            if seconds > 0:
+                self._live.run(seconds)
+        else:
+            for _ in range(max(round(seconds * self.sim.freq / self._period), 0)):
+                self.update()
+                self.sim.step(self._period)
+        with self.lock:
+            self._read()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for simulated time to pass, s: advance, or wait for the thread that advances."""
+        if self._thread is None:
+            self.advance(seconds)
+            return
+        end = self.time + seconds
+        while self.time < end - 1e-9 and self._thread.is_alive():
+            time.sleep(0.001)
+
+    def compile_step(self) -> None:
+        """Compile what a control step needs, before programs wait for answers: they give up sooner than it takes."""
+        with self.lock:
+            compile_step(self.sim, self._period)
+
+    def start(self, speed: float = 1.0) -> Swarm:
+        """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm.
+
+        Raises:
+            ConfigError: If a live loop advances the simulation.
+        """
+        if self._live is not None:
+            raise ConfigError("expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
+        self.compile_step()
+        self._stopped.clear()
+        self._thread = threading.Thread(target=self._run, args=(speed,), name="swarm", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Stop the thread, if there is one."""
+        self._stopped.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _run(self, speed: float) -> None:
+        dt = self._period / self.sim.freq / speed
+        due = time.perf_counter()
+        while not self._stopped.is_set():
+            with self.lock:
+                self.update()
+                self.sim.step(self._period)
+            due = max(due + dt, time.perf_counter() - 0.1)
+            self._stopped.wait(max(due - time.perf_counter(), 0.0))
+
+    def _refused(self, name: str, text: str) -> None:
+        """Report that a command to a drone has no effect."""
+        self.reports.add("refused", name, self.time, text)
+
+    # State and commands ---------------------------------------------------------------------------------------------
+
+    def _add_motors(self) -> MotorFailure | None:
+        """Return the plugin that switches motors; None if the dynamics have no rotors."""
+        if self.sim.dynamics != Dynamics.first_principles:
+            return None
+        return self.sim.add(MotorFailure(name="motor_switch"))
+
+    def _read(self) -> None:
+        data, states = self.sim.data, self.sim.data.states
+        values = [states.pos, states.quat, states.vel, states.ang_vel]
+        if self._estimator is not None:
+            values = self._estimate(data)
+        pos, quat, vel, ang_vel, *measured = (np.asarray(x)[0].astype(float) for x in values)
+        now = float(np.asarray(data.core.steps)[0, 0]) / self.sim.freq
+        before = self._states
+        if before and now < before[0].time:
+            for commander in self.commanders:
+                commander.reset()
+            before, self._on = [], np.ones(len(self.names), bool)
+        dt = now - before[0].time if before else 0.0
+        moved = np.stack([state.vel for state in before]) if before else vel
+        force = (vel - moved) / dt if dt > 0 else np.zeros_like(vel)
+        acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY_MAGNITUDE])
+        if before and dt == 0:
+            acc = np.stack([state.acc for state in before])
+        acc = measured[0] if measured else acc
+        self._yaws = to_rpy(quat)[:, 2].tolist()
+        self._states = [DroneState(now, *x) for x in zip(pos, quat, vel, ang_vel, acc, strict=True)]
+
+    def _estimated(self, data: SimData) -> list[Array]:
+        """Return the estimate of one drone and the reading of its accelerometer, as fields of ``DroneState``."""
+        estimator, s = self._estimator, data.states
+        known = {"pos": s.pos, "quat": s.quat, "vel": s.vel, "ang_vel": s.ang_vel} | estimator.measured_states(data)
+        return [known[name] for name in ("pos", "quat", "vel", "ang_vel")] + [estimator.inertial(data)[1]]
+
+    def _write(self) -> None:
+        sim = self.sim
+        command = np.zeros((1, len(self.names), self._size))
+        on = np.ones(len(self.names), bool)
+        drones = zip(self.commanders, self._states, self._yaws, strict=True)
+        for k, (commander, state, yaw) in enumerate(drones):
+            found = commander.tick(state.time, state.pos, state.vel, yaw)
+            on[k] = found is not None
+            if found is not None:
+                command[0, k] = found
+            elif sim.control == Control.state:
+                command[0, k, :3], command[0, k, 9:13] = state.pos, from_yaw(yaw)
+        getattr(sim, f"{sim.control.value}_control")(command)
+        if self._motors is not None and (on != self._on).any():
+            self._on = on
+            record = self._motors.read(sim.data)
+            shape = record.effectiveness.shape
+            switched = jnp.asarray(np.broadcast_to(on[None, :, None], shape), record.effectiveness.dtype)
+            sim.data = self._motors.write(sim.data, record.replace(effectiveness=switched))

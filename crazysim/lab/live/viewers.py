@@ -1,0 +1,90 @@
+"""The open viewers of a live simulation, and the rate of their pictures."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from crazysim.lab.live.viewer import Viewer
+
+L = TypeVar("L")
+
+log = logging.getLogger(__name__)
+
+
+class Viewers(Generic[L]):
+    """Open viewers, which get pictures at one rate; a viewer that fails is closed, and the others continue."""
+
+    period: float
+    """Time between two pictures, s."""
+
+    n_pictures: int
+    """Number of pictures sent so far; one sent to several viewers counts once."""
+    failures: int
+    """Number of viewers that failed."""
+    next_at: float
+    """Time at which the next picture is due, s, by ``time.perf_counter``."""
+
+    def __init__(self, fps: float, on_last_closed: Callable[[], object]):
+        """Begin without viewers.
+
+        Args:
+            fps: Pictures per second.
+            on_last_closed: Function that is called when no viewer is left.
+        """
+        self.period = 1.0 / fps
+        self.n_pictures = self.failures = 0
+        self.next_at = 0.0
+        self._open: list[Viewer[L]] = []
+        self._on_last_closed = on_last_closed
+
+    def __bool__(self) -> bool:
+        """Return True if a viewer is open."""
+        return bool(self._open)
+
+    def open(self, live: L, viewer: Viewer[L]) -> None:
+        """Open a viewer.
+
+        Raises:
+            RenderError: If this machine cannot show it, or a port is in use.
+        """
+        viewer.open(live)
+        self._open.append(viewer)
+
+    def draw(self, live: L, due: float) -> bool:
+        """Send a picture to every viewer if it is due, and return True if it was.
+
+        Args:
+            live: Loop.
+            due: Time from which a picture is sent, s, by ``time.perf_counter``.
+        """
+        now = time.perf_counter()
+        if not self._open or now < due:
+            return False
+        self.next_at = max(self.next_at + self.period, now - self.period)
+        self.update(live)
+        return True
+
+    def update(self, live: L) -> None:
+        """Send a picture to every viewer, and remove those that are closed or fail."""
+        for viewer in list(self._open):
+            try:
+                if viewer.is_open:
+                    viewer.update(live)
+                    continue
+            except Exception as error:
+                self.failures += 1
+                log.warning("%s failed and is closed: %s", type(viewer).__name__, error)
+            self._open = [other for other in self._open if other is not viewer]  # viewers can be equal
+            viewer.close()
+            if not self._open:
+                self._on_last_closed()
+        self.n_pictures += bool(self._open)
+
+    def close(self) -> None:
+        """Close all viewers."""
+        for viewer in self._open:
+            viewer.close()
+        self._open.clear()

@@ -1,0 +1,187 @@
+"""A live simulation in a window of the desktop, drawn by a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+import crazysim
+from crazysim.errors import ConfigError, RenderError
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.picture import Picture, PictureSource, quantities
+from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.lab.live.viewer import Viewer
+from crazysim.media.worlds import world_indices
+from crazysim.scene.render import camera_id, require_size
+from crazysim.scene.visual_geoms import visual_geoms
+from crazysim.scene.window import require_screen
+
+START = 60.0
+"""Longest time until the window must be open, s."""
+STOP = 3.0
+"""Longest time in which it must close, s."""
+LENGTH = struct.Struct("<Q")
+"""Length in front of each message to the process of the window."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass
+class Window(Viewer[Live]):
+    """Viewer in a window, ``live.show(Window())``; show several for several views.
+
+    The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
+    follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop
+    makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] move the
+    chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws in a process of
+    its own, as fast as it can, and never delays the simulation.
+    """
+
+    worlds: Sequence[int] = (0,)
+    """Indices of the worlds, shown in a grid."""
+    width: int = 1280
+    """Width, pixels."""
+    height: int = 720
+    """Height, pixels."""
+    camera: int | str = -1
+    """Name or id of a camera; -1 is the free camera, which the mouse moves."""
+    cam_config: Mapping[str, ArrayLike] | None = None
+    """Settings of the free camera at first: lookat, distance, azimuth, elevation."""
+    follow: bool = False
+    """True to let the free camera look at the followed body."""
+    trail: float = 2.0
+    """Duration of trails, s; 0 for none."""
+    setpoints: bool = True
+    """True to draw the positions of state commands."""
+    contacts: bool = False
+    """True to mark drones that touch something, which is computed for every picture."""
+    wind: bool = True
+    """True to draw the wind at every drone."""
+    plot: str = ""
+    """Quantity of the selected drone that is plotted over time, such as ``"states.pos"``; empty for none."""
+
+    def __post_init__(self) -> None:
+        """Check the settings that do not depend on a simulation."""
+        require_size(self.width, self.height)
+        if not np.isfinite(self.trail) or self.trail < 0:
+            raise ConfigError(f"expected a trail of 0 s or more, got {self.trail!r}")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._next: Picture | None = None
+        self._changed = threading.Condition()
+
+    @property
+    def is_open(self) -> bool:
+        """True until the user or ``close`` closes the window."""
+        return self._process is not None and self._process.poll() is None
+
+    def open(self, live: Live) -> None:
+        """Start the process of the window, and wait until it is open.
+
+        Raises:
+            ConfigError: If a world or the camera does not exist.
+            RenderError: If there is no screen, or the window cannot be opened.
+        """
+        require_screen()
+        sim = live.sim
+        worlds = world_indices(sim, self.worlds).tolist()
+        camera_id(sim.mj_model, self.camera)
+        if self.plot and self.plot not in (known := [*live.quantities, *quantities(sim)]):
+            raise ConfigError(f"expected a quantity to plot, one of {', '.join(known)}, got {self.plot!r}")
+        sim.scene.compile_if_edited()
+        sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), worlds[0])
+        bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
+        self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind)
+        path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+        self._process = process = subprocess.Popen(
+            [sys.executable, "-m", "crazysim.lab.live.window_program"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": path},
+        )  # fmt: skip
+        settings = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        _send(process, {"model": model_bytes(sim.mj_model), "bodies": bodies, "settings": settings})
+        ready = threading.Event()
+        threading.Thread(target=self._listen, args=(live, process, ready), daemon=True).start()
+        if not ready.wait(START) or not self.is_open:
+            self.close()
+            raise RenderError("expected a screen that can open a window, got none. Use Browser() without one.")
+        threading.Thread(target=self._write, args=(process,), daemon=True).start()
+
+    def update(self, live: Live) -> None:
+        """Hand the present picture to the process of the window, in place of one that it has not taken yet."""
+        picture = self._source.take(live, self.plot)
+        with self._changed:
+            self._next = picture
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Close the window."""
+        process, self._process = self._process, None
+        with self._changed:
+            self._changed.notify()
+        if process is None:
+            return
+        with contextlib.suppress(OSError):
+            process.stdin.close()  # the process ends at the end of its input
+        try:
+            process.wait(STOP)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def _write(self, process: subprocess.Popen[bytes]) -> None:
+        """Write the latest picture to the process whenever it has read the previous one."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._next is not None or self._process is not process)
+                picture, self._next = self._next, None
+            if self._process is not process or picture is None:
+                return
+            try:
+                _send(process, picture)
+            except (OSError, ValueError):
+                return  # the window was closed
+
+    def _listen(self, live: Live, process: subprocess.Popen[bytes], ready: threading.Event) -> None:
+        """Pass the actions of the user in the window to the loop."""
+        for line in process.stdout:
+            kind, *values = json.loads(line)
+            if kind == "ready":
+                ready.set()
+            elif kind == "press":
+                live.keyboard.press(*values)
+            elif kind == "release":
+                live.keyboard.release(*values)
+            elif kind == "follow":
+                live.post(lambda live, chosen=values: live.follow(*chosen))
+            elif kind == "click":
+                live.post(lambda live, where=values: live.click(where[0], np.array(where[1])))
+        process.stdout.close()
+        process.wait()
+        live.keyboard.release_all()
+        ready.set()
+
+
+def model_bytes(model: mujoco.MjModel) -> bytes:
+    """Return a compiled model as the content of an ``.mjb`` file."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def _send(process: subprocess.Popen[bytes], message: object) -> None:
+    content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+    process.stdin.write(LENGTH.pack(len(content)) + content)
+    process.stdin.flush()

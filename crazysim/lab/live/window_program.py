@@ -1,0 +1,246 @@
+"""The process of a window: it draws pictures from its standard input, and writes what the user does to its output."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import sys
+import threading
+import time
+from typing import Any, BinaryIO, TextIO
+
+import mujoco
+import numpy as np
+
+from crazysim.drones.body import LED_MATERIALS
+from crazysim.errors import RenderError
+from crazysim.lab.live.chart import Chart
+from crazysim.lab.live.picture import LIGHT_RADIUS, WIND_SCALE, Picture
+from crazysim.lab.live.scene_bodies import MARK_RADIUS, SceneBodies
+from crazysim.lab.live.window import LENGTH
+from crazysim.media.trail import Trail, colors_of
+from crazysim.scene.overlays import Overlays
+from crazysim.scene.render import camera_id
+from crazysim.scene.window import Window
+
+IDLE = 0.005
+"""Time between two looks for a new picture, s."""
+REDRAW = 0.03
+"""Longest time between two drawings, s: the mouse moves the view even when no new picture arrives."""
+DOUBLE_CLICK = 0.35
+"""Longest time between the clicks of a double click, s."""
+STILL = 0.01
+"""Largest movement of the cursor between these clicks, as a fraction of the window's size."""
+SETPOINT_RADIUS = 0.02
+"""Radius of a setpoint's sphere, m."""
+TOUCHING, FOLLOWED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
+"""Colours of marks, rgba."""
+
+
+class Inbox:
+    """The latest picture from the standard input, read by a thread."""
+
+    def __init__(self, stream: BinaryIO):
+        """Begin to read."""
+        self._stream = stream
+        self.picture: Picture | None = None
+        self.ended = False
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        while (message := read_message(self._stream)) is not None:
+            self.picture = message
+        self.ended = True
+
+
+def read_message(stream: BinaryIO) -> Any:
+    """Return the next message of a stream; None at its end."""
+    head = stream.read(LENGTH.size)
+    if len(head) < LENGTH.size:
+        return None
+    (length,) = LENGTH.unpack(head)
+    content = stream.read(length)
+    return pickle.loads(content) if len(content) == length else None
+
+
+class Leds:
+    """Materials of the drones' LEDs in a model."""
+
+    def __init__(self, model: mujoco.MjModel):
+        """Find the materials that airframes have: ``led_top:0``, ``led_bot:0``, ..."""
+        self._model = model
+        names = [model.material(k).name.partition(":") for k in range(model.nmat)]
+        leds = [
+            (k, int(drone)) for k, (kind, _, drone) in enumerate(names) if kind in LED_MATERIALS and drone.isdigit()
+        ]
+        self._materials, self._drones = np.array(leds, int).reshape(-1, 2).T
+        self._off = model.mat_rgba[self._materials].copy(), model.mat_emission[self._materials].copy()
+
+    def color(self, colors: np.ndarray) -> None:
+        """Set the colours of the drones of one world, 0 to 1; zero for off. (n_drones, 3)"""
+        own = colors[self._drones]
+        brightest = own.max(-1, initial=0.0)
+        lit, (rgba, emission) = brightest > 0, self._off
+        self._model.mat_rgba[self._materials] = np.where(lit[:, None], np.insert(own, 3, 1.0, axis=1), rgba)
+        self._model.mat_emission[self._materials] = np.where(lit, brightest, emission)
+
+
+class Program:
+    """Window, model and what is drawn into it."""
+
+    def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: TextIO):
+        """Open the window.
+
+        Args:
+            model: Compiled scene.
+            bodies: Bodies that can be followed.
+            settings: Fields of ``crazysim.lab.live.Window``.
+            out: Stream to which the actions of the user are written.
+
+        Raises:
+            RenderError: If it cannot be opened.
+        """
+        self._model, self._data, self._bodies, self._settings = model, mujoco.MjData(model), bodies, settings
+        self._out = out
+        self._tracked, self._leds = bodies.tracked, Leds(model)
+        self._trail = Trail(settings["trail"]) if settings["trail"] > 0 else None
+        self._overlays = Overlays(limit=100_000)
+        self._camera = mujoco.MjvCamera()
+        number = camera_id(model, settings["camera"])
+        if number >= 0:
+            self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
+        else:
+            mujoco.mjv_defaultFreeCamera(model, self._camera)
+            for key, value in (settings["cam_config"] or {}).items():
+                setattr(self._camera, key, value if np.ndim(value) == 0 else np.asarray(value, float))
+        self.window = Window(model, 100_000 + model.ngeom, settings["width"], settings["height"])
+        self.window.on_key = lambda key, down: self._say("press" if down else "release", key)
+        self._chart = Chart(settings["plot"])
+        self.window.on_drawn = self._chart.draw
+        self._was_down, self._click = False, (-np.inf, (0.0, 0.0))
+
+    def run(self, inbox: Inbox) -> None:
+        """Draw until the input ends or the user closes the window."""
+        shown, drawn = None, -np.inf
+        self._say("ready")
+        while self.window.is_open and not inbox.ended:
+            picture, now = inbox.picture, time.perf_counter()
+            if picture is None or (picture is shown and now - drawn < REDRAW):
+                time.sleep(IDLE)
+                continue
+            if picture is not shown and self._trail is not None:
+                self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._tracked])
+            if picture is not shown:
+                self._chart.add(picture)
+            shown, drawn = picture, now
+            self.draw(picture)
+        self.window.close()
+
+    def draw(self, picture: Picture) -> None:
+        """Draw a picture, and report a double click."""
+        if self._settings["follow"] and picture.followed is not None and picture.followed[0] in picture.worlds:
+            k = picture.worlds.tolist().index(picture.followed[0])
+            point = picture.pos[k, picture.followed[1]]
+            if np.isfinite(point).all():
+                self.window.look_at(point)
+        n, settings = len(picture.worlds), self._settings
+        self.window.draw_tiles(n, lambda k: self._tile(picture, k), self._camera, settings["width"], settings["height"])
+        if self.window.is_open and self._double_clicked():
+            self._report(picture, self.window.pick(n, lambda k: self._tile(picture, k)))
+
+    def _tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
+        """Return the state of the k-th world, and what is drawn over it."""
+        data, overlays, settings = self._data, self._overlays, self._settings
+        data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_comPos(self._model, data)
+        mujoco.mj_camlight(self._model, data)
+        overlays.clear()
+        drones = picture.drones[k]
+        colors = colors_of(len(drones), None)
+        if self._trail is not None:
+            self._trail.draw(overlays, k)
+        if settings["setpoints"] and len(picture.setpoint[k]):
+            overlays.points(picture.setpoint[k], colors, SETPOINT_RADIUS)
+        if picture.touching[k].any():
+            overlays.points(drones[picture.touching[k]], TOUCHING, MARK_RADIUS)
+        for pos, air in zip(drones, picture.wind[k], strict=False):
+            if air.any():
+                overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, AIR, cylinder=True)
+        self._leds.color(picture.lights[k])
+        lit = picture.lights[k].any(-1)
+        if lit.any():
+            overlays.points(drones[lit], np.insert(picture.lights[k, lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0)
+        if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
+            place, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
+            overlays.points(place[None], FOLLOWED, radius)
+            overlays.label(_ascii(picture.name), place + [0.0, 0.0, radius])
+        text = picture.status if k == 0 else ""
+        if len(picture.worlds) > 1:
+            text = f"world {picture.worlds[k]}\n{text}".strip()
+        if text:
+            overlays.text(text, "top left")
+        if k == 0 and picture.controls:
+            overlays.text(_ascii("\n".join(picture.controls)), "bottom left")
+        return data, overlays
+
+    def _double_clicked(self) -> bool:
+        """Return True if the left button has just been pressed for the second time."""
+        down, was_down = self.window.is_pressed("left"), self._was_down
+        self._was_down = down
+        if not down or was_down:
+            return False
+        (then, where), here, now = self._click, self.window.cursor, time.perf_counter()
+        double = now - then < DOUBLE_CLICK and max(abs(a - b) for a, b in zip(where, here, strict=True)) < STILL
+        self._click = (-np.inf if double else now, here)
+        return double
+
+    def _report(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
+        """Write which body, or which point, was clicked."""
+        if hit is None:
+            return
+        k, geom, point = hit
+        body = int(self._model.geom_bodyid[geom])
+        while body and self._model.body_mocapid[body] < 0:
+            body = int(self._model.body_parentid[body])
+        mocap, world = int(self._model.body_mocapid[body]), int(picture.worlds[k])
+        if mocap >= 0:
+            followed = self._bodies.items[self._bodies.owner[mocap]]
+            self._say("follow", world, followed.kind, followed.index)
+        else:
+            self._say("click", world, point.tolist())
+
+    def _say(self, *message: object) -> None:
+        try:
+            self._out.write(json.dumps(message) + "\n")
+            self._out.flush()
+        except OSError:  # the simulation has ended
+            self.window.close()
+
+
+def _ascii(text: str) -> str:
+    """Return text that MuJoCo's font can show."""
+    return text.encode("ascii", "replace").decode()
+
+
+def main() -> int:
+    """Show a window until the input ends; return the exit status."""
+    out = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is not for the simulation
+    stream = sys.stdin.buffer
+    start = read_message(stream)
+    if start is None:
+        return 1
+    model = mujoco.MjModel.from_binary_path("scene.mjb", {"scene.mjb": start["model"]})
+    try:
+        program = Program(model, start["bodies"], start["settings"], out)
+    except RenderError as error:
+        print(error, file=sys.stderr)
+        return 2
+    program.run(Inbox(stream))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

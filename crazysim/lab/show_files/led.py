@@ -1,0 +1,239 @@
+"""Light programs of Skybrush: the byte code that its drones run for their LEDs.
+
+Commands and arguments are those of libskybrush (``src/lights/commands.h``, ``commands.cpp``), their effects those of
+its ``executor.cpp``; pyledctrl compiles the same code. Durations and times are varints, LEB128, of 20 ms.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+
+import numpy as np
+
+from crazysim.errors import ConfigError
+from crazysim.lab.show_files.lights import Lights
+
+TICK = 0.02
+"""Unit of durations, s."""
+MAX_BYTES = 2**20
+"""Longest program, bytes."""
+MAX_REPEATED = 200_000
+"""Most commands that the loops and jumps of a program may repeat."""
+MAX_LOOPS = 4
+"""Deepest nesting of loops, that of libskybrush's ``CONFIG_MAX_LOOP_DEPTH``."""
+MAX_VARINT = 2**28 - 1
+"""Largest duration or address, that of pyledctrl's compiler."""
+
+END, NOP, SLEEP, WAIT_UNTIL = 0x00, 0x01, 0x02, 0x03
+SET_COLOR, SET_GRAY, SET_BLACK, SET_WHITE = 0x04, 0x05, 0x06, 0x07
+FADE_TO_COLOR, FADE_TO_GRAY, FADE_TO_BLACK, FADE_TO_WHITE = 0x08, 0x09, 0x0A, 0x0B
+LOOP_BEGIN, LOOP_END, RESET_CLOCK = 0x0C, 0x0D, 0x0E
+SET_COLOR_FROM_CHANNELS, FADE_TO_COLOR_FROM_CHANNELS = 0x10, 0x11
+JUMP, TRIGGERED_JUMP, SET_PYRO, SET_PYRO_ALL = 0x12, 0x13, 0x14, 0x15
+
+BLACK, WHITE = (0, 0, 0), (255, 255, 255)
+
+
+def decode_lights(
+    program: bytes | str, until: float = 3600.0, place: str = "a light program", max_repeated: int = MAX_REPEATED
+) -> Lights:
+    """Return the lights of a light program.
+
+    A drone of the simulation has no remote control and no pyrotechnics: colours from channels are black, as libskybrush
+    shows them without channels, triggers never fire, and pyro commands do nothing.
+
+    Args:
+        program: Byte code, or its base64 form as in ``lights.json``.
+        until: Time at which the program is stopped, s; endless loops end there.
+        place: File and place in it, for messages.
+        max_repeated: Most commands that loops and jumps may repeat.
+
+    Raises:
+        ConfigError: If it is no program: an unknown command, a missing argument, a jump to nowhere, loops that are too
+            deep or never advance in time, or too many commands.
+    """
+    if isinstance(program, str):
+        try:
+            program = base64.b64decode(program, validate=True)
+        except (binascii.Error, ValueError) as error:
+            raise ConfigError(f"expected base64 in {place}, got {str(error)[:60]}") from error
+    if len(program) > MAX_BYTES:
+        raise ConfigError(f"expected at most {MAX_BYTES} bytes in {place}, got {len(program)}")
+    machine = _Machine(program, place)
+    machine.run(round(until / TICK), len(program) + max_repeated)
+    return machine.lights()
+
+
+class _Machine:
+    """State of a program that runs."""
+
+    def __init__(self, code: bytes, place: str):
+        self.code, self.place, self.at = code, place, 0
+        self.now = self.origin = 0  # in ticks
+        self.color = BLACK
+        self.loops: list[tuple[int, int]] = []  # address of the body, iterations left; 0 for endless
+        self.pieces: list[tuple[int, tuple, tuple]] = [(0, BLACK, BLACK)]
+
+    def refuse(self, expected: str, got: str) -> None:
+        raise ConfigError(f"expected {expected}, got {got} in {self.place}, byte {self.at}")
+
+    def byte(self) -> int:
+        if self.at >= len(self.code):
+            self.refuse("an argument", "the end of the program")
+        self.at += 1
+        return self.code[self.at - 1]
+
+    def varint(self) -> int:
+        value = shift = 0
+        while True:
+            byte = self.byte()
+            value |= (byte & 0x7F) << shift
+            shift += 7
+            if value > MAX_VARINT or shift > 35:
+                self.refuse(f"a number of at most {MAX_VARINT}", "a larger one")
+            if byte < 0x80:
+                return value
+
+    def run(self, end: int, max_commands: int) -> None:
+        """Run until the program ends, or a time, ticks."""
+        for _ in range(max_commands):
+            if self.at >= len(self.code) or self.now > end or not self.command(self.byte()):
+                return
+        self.refuse(f"a program that runs at most {max_commands} commands in {end * TICK:g} s", "more")
+
+    def command(self, code: int) -> bool:
+        """Run one command; return False at the end of the program."""
+        if code == END:
+            return False
+        if code in (NOP, SET_PYRO, SET_PYRO_ALL):
+            self.at += code != NOP
+        elif code == SLEEP:
+            self.now += self.varint()
+        elif code == WAIT_UNTIL:
+            self.now = max(self.now, self.origin + self.varint())
+        elif code == RESET_CLOCK:
+            self.origin = self.now
+        elif SET_COLOR <= code <= FADE_TO_WHITE or code in (SET_COLOR_FROM_CHANNELS, FADE_TO_COLOR_FROM_CHANNELS):
+            self.set_color(code)
+        elif code == LOOP_BEGIN:
+            if len(self.loops) == MAX_LOOPS:
+                self.refuse(f"loops nested at most {MAX_LOOPS} deep", "a further one")
+            iterations = self.byte()
+            self.loops.append((self.at, iterations))
+        elif code == LOOP_END:
+            self.end_loop()
+        elif code == JUMP:
+            self.jump(self.varint())
+        elif code == TRIGGERED_JUMP:
+            if self.byte() & 0x30:  # a rising or falling edge to react to, with the address
+                self.varint()
+        else:
+            self.at -= 1
+            self.refuse("a command of Skybrush's light programs, 0x00 to 0x15", f"0x{code:02x}")
+        return True
+
+    def set_color(self, code: int) -> None:
+        fades = FADE_TO_COLOR <= code <= FADE_TO_WHITE or code == FADE_TO_COLOR_FROM_CHANNELS
+        if code in (SET_COLOR, FADE_TO_COLOR):
+            color = (self.byte(), self.byte(), self.byte())
+        elif code in (SET_GRAY, FADE_TO_GRAY):
+            color = (self.byte(),) * 3
+        elif code in (SET_WHITE, FADE_TO_WHITE):
+            color = WHITE
+        else:
+            if code in (SET_COLOR_FROM_CHANNELS, FADE_TO_COLOR_FROM_CHANNELS):
+                _ = self.byte(), self.byte(), self.byte()
+            color = BLACK
+        duration = self.varint()
+        if fades and duration:
+            self.pieces.append((self.now, self.color, color))
+            self.now += duration
+            self.pieces.append((self.now, color, color))
+        else:
+            if self.pieces[-1][1:] != (color, color):  # loops of one colour need one piece
+                self.pieces.append((self.now, color, color))
+            self.now += duration
+        self.color = color
+
+    def end_loop(self) -> None:
+        if not self.loops:
+            self.refuse("the start of a loop in front of its end", "none")
+        start, left = self.loops.pop()
+        if left != 1:
+            self.loops.append((start, max(left - 1, 0)))
+            self.at = start
+
+    def jump(self, address: int) -> None:
+        if address >= len(self.code):
+            self.refuse(f"a jump to one of {len(self.code)} bytes", f"one to byte {address}")
+        self.at = address
+        self.loops.clear()
+
+    def lights(self) -> Lights:
+        """Return the colours so far: of pieces that begin at one time, the last."""
+        last = {start: (a, b) for start, a, b in self.pieces}
+        starts, colors = list(last), np.array(list(last.values()), float) / 255
+        return Lights.of_pieces(TICK * np.array(starts), colors[:, 0], colors[:, 1])
+
+
+def encode_lights(lights: Lights) -> bytes:
+    """Return the light program of one drone's lights, with colours of 8 bits and times in steps of 20 ms.
+
+    Args:
+        lights: Lights of one drone.
+
+    Raises:
+        ConfigError: If they are those of several drones.
+    """
+    times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
+    if times.ndim != 1:
+        raise ConfigError(f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
+    ticks = np.maximum(np.round((times - min(times[0], 0.0)) / TICK), 0).astype(int)
+    first, last = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
+    code = bytearray()
+    color = None
+    if ticks[0] > 0:
+        code += _colored(SET_COLOR, first[0], ticks[0])
+    for k, start in enumerate(ticks):
+        duration = ticks[k + 1] - start if k + 1 < len(ticks) else 0
+        if k + 1 < len(ticks) and not duration:
+            continue  # padding, or a piece shorter than a tick
+        fades = duration and not np.array_equal(first[k], last[k])
+        if fades:
+            if color is None or not np.array_equal(color, first[k]):
+                code += _colored(SET_COLOR, first[k], 0)
+            code += _colored(FADE_TO_COLOR, last[k], duration)
+            color = last[k]
+        else:
+            code += _colored(SET_COLOR, first[k], duration)
+            color = first[k]
+    code.append(END)
+    return bytes(code)
+
+
+def _colored(code: int, color: np.ndarray, duration: int) -> bytes:
+    """Return the shortest command that sets, or fades to, a colour."""
+    red, green, blue = (int(x) for x in color)
+    if (red, green, blue) == BLACK:
+        head = [code + 2]
+    elif (red, green, blue) == WHITE:
+        head = [code + 3]
+    elif red == green == blue:
+        head = [code + 1, red]
+    else:
+        head = [code, red, green, blue]
+    return bytes(head) + _varint(int(duration))
+
+
+def _varint(value: int) -> bytes:
+    if value > MAX_VARINT:
+        raise ConfigError(
+            f"expected durations of at most {MAX_VARINT * TICK:g} s, got {value * TICK:g} s. Split longer pieces."
+        )
+    code = bytearray()
+    while value >= 0x80:
+        code.append(value & 0x7F | 0x80)
+        value >>= 7
+    code.append(value)
+    return bytes(code)

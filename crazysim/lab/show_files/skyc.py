@@ -1,0 +1,287 @@
+"""Shows of Skybrush, ``.skyc`` files: zip archives of ``show.json``, ``cues.json``, trajectories and lights.
+
+The format is that of Skybrush's own reader (skybrush.js, ``packages/show-format``), with the additions of the
+AIMotionLab: yaw as a fourth coordinate, the trajectory types of the Crazyflie, parameters, and ``colors``.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.errors import ConfigError, shown
+from crazysim.lab.show_files.archive import Archive, write_archive
+from crazysim.lab.show_files.led import MAX_REPEATED, decode_lights, encode_lights
+from crazysim.lab.show_files.lights import Lights
+from crazysim.lab.show_files.show import Cue, ParameterChange, Show
+from crazysim.lab.show_files.show_trajectory import format_trajectory, parse_trajectory
+from crazysim.storage import read_bytes
+from crazysim.trajectories.files import checks
+from crazysim.trajectories.trajectory import Trajectory
+
+MAX_DRONES = 5000
+"""Most drones of a show, that of Skybrush."""
+MAX_PIECES = 2_000_000
+"""Most pieces of all trajectories, or all lights, padded to the longest."""
+MAX_LOOPED = 10_000_000
+"""Most commands that the loops of all light programs may repeat."""
+
+log = logging.getLogger(__name__)
+
+
+def load_show(path: str | Path) -> Show:
+    """Return the show in a ``.skyc`` file.
+
+    Lights come from the byte code in ``data``, or else from the lab's ``colors``; a drone without either is white, as
+    in Skybrush. A drone without a name is named after its index.
+
+    Raises:
+        ConfigError: If the file is no valid show, with the place of the error.
+    """
+    return parse_show(read_bytes(path, checks.MAX_FILE), str(path))
+
+
+def parse_show(content: bytes, place: str = "a show") -> Show:
+    """Return the show in the contents of a ``.skyc`` file; see ``load_show``.
+
+    Args:
+        content: Contents of the file.
+        place: Name of the file, for messages.
+
+    Raises:
+        ConfigError: If it is no valid show, with the place of the error.
+    """
+    archive = Archive(content, place)
+    at = f"{place}: show.json"
+    show = checks.record(archive.json("show.json"), at)
+    checks.version_one(show, at)
+    settings, _ = archive.resolve(show.get("settings", {}), at)
+    settings = checks.record(settings, f"{at}, settings")
+    swarm, swarm_at = archive.resolve(show.get("swarm"), f"{at}, swarm")
+    drones = checks.sequence(checks.record(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones")
+    if not drones:
+        checks.refuse("at least one drone", "none", swarm_at)
+    found = []
+    for i, drone in enumerate(drones):
+        found.append(_drone(archive, drone, f"{swarm_at}, drone {i}", i))
+        _bound(len(drones) * found[-1]["trajectory"].n_pieces, found[-1]["at"])
+    trajectories = [drone["trajectory"] for drone in found]
+    duration = max(float(x.duration) for x in trajectories)
+    lights, decoded = [], {}
+    for drone in found:
+        lights.append(_lights(archive, drone, duration, MAX_LOOPED // len(found), decoded))
+        _bound(len(found) * len(lights[-1].times), f"{drone['at']}, lights")
+    names = [drone["name"] for drone in found]
+    if len(set(names)) < len(names):
+        checks.refuse("different names of the drones", f"{shown(sorted(names))}", swarm_at)
+    environment = show.get("environment") or {}
+    kind = checks.record(environment, f"{at}, environment").get("type", "outdoor")
+    if kind not in ("indoor", "outdoor"):
+        checks.refuse("environment indoor or outdoor", shown(kind), at)
+    return Show(
+        names=tuple(names),
+        trajectories=Trajectory.stack(trajectories),
+        lights=Lights.stack(lights),
+        cues=_cues(archive, settings.get("cues"), f"{at}, cues"),
+        settings={name: value for name, value in settings.items() if name != "cues"},
+        homes=np.stack([drone["home"] for drone in found]),
+        landings=np.stack([drone["landing"] for drone in found]),
+        parameters=tuple(drone["parameters"] for drone in found),
+        encodings=tuple(drone["encoding"] for drone in found),
+        environment=kind,
+        meta=checks.record(show.get("meta") or {}, f"{at}, meta"),
+    )
+
+
+def _bound(n_pieces: int, place: str) -> None:
+    if n_pieces > MAX_PIECES:
+        checks.refuse(f"at most {MAX_PIECES} pieces, padded to the longest", str(n_pieces), place)
+
+
+def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str, Any]:
+    """Return what the show says about one drone; its lights are not yet decoded."""
+    value, place = archive.resolve(value, place)
+    settings, place = archive.resolve(checks.record(value, place).get("settings"), f"{place}, settings")
+    settings = checks.record(settings, place)
+    data, at = archive.resolve(settings.get("trajectory"), f"{place}, trajectory")
+    yaw_control, _ = archive.resolve(settings.get("yawControl"), f"{place}, yawControl")
+    if isinstance(yaw_control, dict) and yaw_control.get("autoYaw"):
+        log.warning("%s: autoYaw is ignored; the yaw is that of the setpoints", place)
+    trajectory, encoding = parse_trajectory(data, at, yaw_control)
+    c = np.asarray(trajectory.coefficients, float)
+    start, end = c[0, :, 0], c[-1].sum(-1)
+    if settings.get("startYaw") is not None:
+        checks.number(settings["startYaw"], f"{place}, startYaw", -checks.MAX_COORDINATE, checks.MAX_COORDINATE)
+    name = settings.get("name")
+    return {
+        "at": place,
+        "name": f"drone_{index}" if name is None else checks.text(name, f"{place}, name"),
+        "trajectory": trajectory,
+        "encoding": encoding,
+        "home": _position(settings.get("home"), start[:3], f"{place}, home"),
+        "landing": _position(settings.get("landAt"), end[:3], f"{place}, landAt"),
+        "parameters": _parameters(settings.get("parameters"), f"{place}, parameters"),
+        "lights": settings.get("lights"),
+    }
+
+
+def _position(value: object, default: NDArray, place: str) -> NDArray:
+    return default if value is None else checks.numbers(value, [3], checks.MAX_COORDINATE, place)
+
+
+def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
+    changes = []
+    for i, entry in enumerate(checks.sequence(value, checks.MAX_POINTS, place) if value is not None else []):
+        if not isinstance(entry, list) or len(entry) != 3:
+            checks.refuse("[time, name, value]", shown(entry), f"{place}, entry {i}")
+        at = f"{place}, entry {i}"
+        time = checks.number(entry[0], at, 0.0, checks.MAX_TIME)
+        changes.append(ParameterChange(time, checks.text(entry[1], at), checks.number(entry[2], at)))
+    return tuple(changes)
+
+
+def _cues(archive: Archive, value: object, place: str) -> tuple[Cue, ...]:
+    if value is None:
+        return ()
+    value, place = archive.resolve(value, place)
+    value = checks.record(value, place)
+    checks.version_one(value, place)
+    cues = []
+    for i, item in enumerate(checks.sequence(value.get("items", []), checks.MAX_POINTS, place)):
+        at = f"{place}, item {i}"
+        item = checks.record(item, at)
+        time = checks.number(item.get("time"), at, 0.0, checks.MAX_TIME)
+        cues.append(Cue(time, checks.text(item.get("name", ""), at)))
+    return tuple(sorted(cues, key=lambda cue: cue.time))
+
+
+def _lights(
+    archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded: dict[str, Lights]
+) -> Lights:
+    """Return the lights of one drone; those of equal programs are decoded once."""
+    if drone["lights"] is None:
+        return Lights.constant()
+    value, place = archive.resolve(drone["lights"], f"{drone['at']}, lights")
+    value = checks.record(value, place)
+    checks.version_one(value, place)
+    if value.get("data") is not None:
+        data = checks.text(value["data"], f"{place}, data", 2**22)
+        if data not in decoded:
+            decoded[data] = decode_lights(data, until, place, min(max_looped, MAX_REPEATED))
+        return decoded[data]
+    if value.get("colors") is not None:
+        return parse_colors(value["colors"], f"{place}, colors")
+    return Lights.constant()
+
+
+def parse_colors(value: object, place: str) -> Lights:
+    """Return the lights of the lab's ``colors``, in either form.
+
+    The newer form is ``[[time, [red, green, blue]], ...]``, each colour from its time on, the older
+    ``[["red, green, blue", duration], ...]``; colours are 0 to 255, times s.
+
+    Args:
+        value: The JSON array.
+        place: File and place in it, for messages.
+
+    Raises:
+        ConfigError: If an entry is invalid.
+    """
+    entries = checks.sequence(value, MAX_REPEATED, place)
+    times, colors, now = [], [], 0.0
+    for i, entry in enumerate(entries):
+        at = f"{place}, entry {i}"
+        if not isinstance(entry, list) or len(entry) != 2:
+            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", shown(entry), at)
+        first, second = entry
+        if isinstance(first, str):
+            channels: Any = [_integer(x, at) for x in first.split(",")[:4]]
+            times.append(now)
+            now += checks.number(second, at, 0.0, checks.MAX_TIME)
+        else:
+            channels = second
+            times.append(checks.number(first, at, 0.0, checks.MAX_TIME))
+        colors.append(checks.numbers(channels, [3], 255.0, at) / 255)
+        if colors[-1].min() < 0:
+            checks.refuse("colours from 0 to 255", shown(channels), at)
+    if not entries:
+        return Lights.constant((0.0, 0.0, 0.0))
+    checks.ascending(np.array(times), 0.0, place)
+    if times[0] > 0:
+        times, colors = [0.0, *times], [np.zeros(3), *colors]
+    return Lights.of_pieces(times, colors)
+
+
+def _integer(text: str, place: str) -> int:
+    text = text.strip()
+    if not (text.isascii() and text.isdigit() and len(text) <= 3):
+        checks.refuse("colours as 'red, green, blue', 0 to 255", shown(text), place)
+    return int(text)
+
+
+def save_show(show: Show, path: str | Path) -> None:
+    """Write a show as a ``.skyc`` file, which Skybrush reads too.
+
+    Skybrush itself accepts curves of degree 1 to 3 and no yaw: a trajectory without yaw is written without, and in the
+    lowest degree that reproduces it. Lights are byte code; those without fades are written as ``colors`` as well.
+
+    Args:
+        show: Show.
+        path: File to write; its name ends with ``.skyc``.
+
+    Raises:
+        ConfigError: If the name has another ending, the folder does not exist, or a trajectory has a degree above 7.
+    """
+    path = Path(path)
+    if path.suffix != ".skyc":
+        raise ConfigError(f"expected the name of a show to end with .skyc, got {str(path)!r}. Rename the file.")
+    files: dict[str, Any] = {}
+    drones = []
+    for i, name in enumerate(show.names):
+        folder = f"drones/drone_{i}"
+        trajectory = show.trajectory(i)
+        c = np.asarray(trajectory.coefficients, float)
+        yaw = bool(np.any(c[:, 3] != 0))
+        files[f"{folder}/trajectory.json"] = format_trajectory(trajectory, show.encodings[i], yaw)
+        files[f"{folder}/lights.json"] = _format_lights(show.light(i))
+        settings = {
+            "trajectory": {"$ref": f"./{folder}/trajectory.json#"},
+            "lights": {"$ref": f"./{folder}/lights.json#"},
+            "home": np.round(show.homes[i], 6).tolist(),
+            "startYaw": round(float(np.rad2deg(c[0, 3, 0])), 6),
+            "landAt": np.round(show.landings[i], 6).tolist(),
+            "name": name,
+        }
+        if show.parameters[i]:
+            settings["parameters"] = [[x.time, x.name, x.value] for x in show.parameters[i]]
+        drones.append({"type": "generic", "settings": settings})
+    head = {
+        "version": 1,
+        "settings": {**show.settings, "cues": {"$ref": "./cues.json"}},
+        "swarm": {"drones": drones},
+        "environment": {"type": show.environment},
+        "meta": dict(show.meta),
+        "media": {},
+    }
+    cues = {"version": 1, "items": [{"time": cue.time, "name": cue.name} for cue in show.cues]}
+    texts = {name: json.dumps(x) for name, x in {"show.json": head, "cues.json": cues, **files}.items()}
+    write_archive(path, texts)
+
+
+def _format_lights(lights: Lights) -> dict[str, Any]:
+    """Return the contents of a ``lights.json``."""
+    value: dict[str, Any] = {"version": 1, "data": base64.b64encode(encode_lights(lights)).decode()}
+    times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
+    if np.array_equal(starts, ends):
+        kept = np.diff(times, append=np.inf) > 0
+        colors = np.round(255 * starts[kept]).astype(int).tolist()
+        value["colors"] = [
+            [float(str(t)), color] for t, color in zip(np.asarray(lights.times)[kept], colors, strict=True)
+        ]
+    return value

@@ -1,0 +1,27 @@
+"""Light shows in the simulation: flying them, measuring separation and tracking, and showing them with lights."""
+
+from crazysim.lab.show_files import Cue, Lights, Show, load_show, save_show
+from crazysim.lab.shows.flight import ShowFlight, fly
+from crazysim.lab.shows.live_show import ShowLights, live_show
+from crazysim.lab.shows.show_report import collisions, report, sampled_approaches, summary, tracking_rms
+from crazysim.lab.shows.view import film, page, play
+
+__all__ = [
+    "Cue",
+    "Lights",
+    "Show",
+    "ShowFlight",
+    "ShowLights",
+    "collisions",
+    "film",
+    "fly",
+    "live_show",
+    "load_show",
+    "page",
+    "play",
+    "report",
+    "sampled_approaches",
+    "save_show",
+    "summary",
+    "tracking_rms",
+]

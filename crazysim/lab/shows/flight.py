@@ -1,0 +1,154 @@
+"""Flights of light shows: all drones of a show in one world."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim.core.data import SimData
+from crazysim.dynamics import first_principles
+from crazysim.errors import ConfigError
+from crazysim.lab.show_files.show import Show
+from crazysim.plugins.follow import Follow
+from crazysim.sim.sim import Sim
+from crazysim.trajectories import Trajectory
+
+RATES = (50, 25, 10, 5)
+"""Rates at which a flight may be recorded, Hz; the first that divides the physics' rate and fits is used."""
+MAX_RECORDED = 20_000_000
+"""Most poses of a recording, which take 28 bytes each."""
+CHUNK = 250
+"""Samples that one compiled call flies."""
+
+Progress = Callable[[Iterable[int], str], Iterable[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class ShowFlight:
+    """A show as it was flown, and as it was planned, at the same times."""
+
+    show: Show
+    """The show."""
+    sim: Sim
+    """The simulation of one world, after the flight."""
+    times: NDArray
+    """Times of the samples, s; the first is 0. (n,)"""
+    pos: NDArray
+    """Positions flown, world frame, m. (n, n_drones, 3)"""
+    quat: NDArray
+    """Attitudes flown, body to world, xyzw. (n, n_drones, 4)"""
+    planned: NDArray
+    """Positions planned, world frame, m. (n, n_drones, 3)"""
+    colors: NDArray
+    """Colours of the LEDs, 0 to 1. (n, n_drones, 3)"""
+    wall_s: float
+    """Time of the computation without compilation, s."""
+
+    @property
+    def duration(self) -> float:
+        """Duration of the flight, s."""
+        return float(self.times[-1])
+
+
+def fly(show: Show, seconds: float | None = None, progress: Progress | None = None, **settings: Any) -> ShowFlight:
+    """Return the flight of a show: its drones start hovering at the first points of their trajectories.
+
+    Args:
+        show: Show.
+        seconds: Duration, s; None for that of the show.
+        progress: Function that returns the items it gets, with a progress bar, ``progress(items, label)``; None for
+            none.
+        settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
+
+    Raises:
+        ConfigError: If the duration is not positive, or a setting is invalid.
+    """
+    end = show.duration if seconds is None else min(float(seconds), show.duration)
+    if not np.isfinite(end) or end <= 0:
+        raise ConfigError(f"expected a positive duration of the flight, s, got {seconds!r}")
+    sim = at_start(show, settings)
+    rate = _rate(sim.freq, end, show.n_drones)
+    n = max(int(np.ceil(end * rate - 1e-6)), 1)
+    times = np.arange(n + 1) / rate
+
+    fly_chunk = _compile_chunk(sim, sim.freq // rate)
+    jax.block_until_ready(planned_at(show.trajectories, jnp.asarray(times)))  # compiles
+    show.lights.colors(times)
+    begin = time.perf_counter()
+    data = sim.data
+    recorded = [[np.asarray(x)[None, 0] for x in _pose(data)]]
+    chunks = range(0, n, CHUNK)
+    for _ in chunks if progress is None else progress(chunks, "flying"):
+        data, samples = fly_chunk(data)
+        recorded.append([np.asarray(x)[:, 0] for x in samples])
+    sim.data = data
+    pos, quat = (np.concatenate(parts)[: n + 1] for parts in zip(*recorded, strict=True))
+    planned = np.asarray(planned_at(show.trajectories, jnp.asarray(times)))
+    colors = show.lights.colors(times)
+    return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - begin)
+
+
+def at_start(show: Show, settings: dict[str, Any]) -> Sim:
+    """Return a simulation of one world whose drones hover where their trajectories begin."""
+    sim = Sim(n_worlds=1, n_drones=show.n_drones, control="state", **settings)
+    sim.add(Follow(show.trajectories, index=np.arange(show.n_drones)[None], visible=False))
+    start = _start(show.trajectories)
+    states = sim.data.states
+    pos = jnp.asarray(start[None, :, :3], states.pos.dtype)
+    half = start[None, :, 3:] / 2
+    zeros = np.zeros((1, show.n_drones, 2))
+    quat = jnp.asarray(np.concatenate([zeros, np.sin(half), np.cos(half)], axis=-1), states.quat.dtype)
+    states = states.replace(pos=pos, quat=quat)
+    if isinstance(sim.data.params, first_principles.Params):
+        hover = first_principles.hover_rotor_vel(sim.data.params)
+        states = states.replace(rotor_vel=jnp.broadcast_to(hover, states.rotor_vel.shape))
+    sim.data = sim.data.replace(states=states)
+    sim.build_default_data()
+    return sim
+
+
+def _start(trajectories: Trajectory) -> NDArray:
+    """Return position, m, and yaw, rad, where each trajectory begins. (n_drones, 4)"""
+    return np.asarray(trajectories.coefficients, float)[:, 0, :, 0]
+
+
+def _rate(freq: int, seconds: float, n_drones: int) -> int:
+    """Return the rate of the recording, Hz."""
+    for rate in RATES:
+        if freq % rate == 0 and seconds * rate * n_drones <= MAX_RECORDED:
+            return rate
+    raise ConfigError(
+        f"expected at most {MAX_RECORDED} recorded poses and freq a multiple of {RATES[-1]} Hz, got {seconds:g} s of "
+        f"{n_drones} drones at {freq} Hz. Fly a part of the show with seconds=..."
+    )
+
+
+def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
+    """Return a compiled function from data to the data ``CHUNK`` samples later, and poses after every ``n_steps``."""
+    step, zeros = sim.step_fn, sim.step_fn.zeros(sim.data)
+
+    def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
+        data = step(data, n_steps, zeros)
+        return data, _pose(data)
+
+    return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK)).lower(sim.data).compile()
+
+
+def _pose(data: SimData) -> tuple[Array, Array]:
+    """Return positions and attitudes of the drones."""
+    return data.states.pos, data.states.quat
+
+
+@jax.jit
+def planned_at(trajectories: Trajectory, times: Array) -> Array:
+    """Return planned positions, m. (n, n_drones, 3)"""
+    of_all = jax.vmap(lambda trajectory, t: trajectory.derivatives(t, 0)[0][:3], in_axes=(0, None))
+    return jax.vmap(of_all, in_axes=(None, 0))(trajectories, times)

@@ -1,0 +1,148 @@
+"""Figures of a flown show: closest approaches, collisions and tracking errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.lab.shows.flight import ShowFlight
+
+N_LISTED = 5
+"""Pairs that a summary lists."""
+
+
+def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
+    """Return the least distance of every pair of drones, and the time at which it occurs.
+
+    Between samples the distance is that of drones at constant velocities: its square is a parabola of time, through the
+    closest sample and its neighbours.
+
+    Args:
+        times: Times of the samples, s, in equal steps. (n,)
+        pos: Positions, m. (n, n_drones, 3)
+
+    Returns:
+        Distances, m, infinite on the diagonal, and times, s. (n_drones, n_drones) each
+    """
+    t, p = np.asarray(times, float), np.asarray(pos)
+    n, n_drones = p.shape[:2]
+    x = np.ascontiguousarray(np.transpose(p, (2, 1, 0)))  # time last: what is reduced lies together
+    distance, when = np.full((n_drones, n_drones), np.inf), np.zeros((n_drones, n_drones))
+    for i in range(n_drones - 1):
+        squares = np.zeros((n_drones - 1 - i, n), x.dtype)
+        for axis in x:
+            difference = axis[i + 1 :] - axis[i]
+            difference *= difference
+            squares += difference
+        least, at = _refined(squares, t)
+        distance[i, i + 1 :] = distance[i + 1 :, i] = np.sqrt(least)
+        when[i, i + 1 :] = when[i + 1 :, i] = at
+    return distance, when
+
+
+def _refined(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the minima of sampled curves and their times, from parabolas through three samples. (k,) each
+
+    Args:
+        squares: Curves. (k, n)
+        times: Times of the samples, s. (n,)
+    """
+    rows, n = np.arange(len(squares)), squares.shape[1]
+    k = squares.argmin(axis=1)
+    if n < 3:
+        return squares[rows, k].astype(float), times[k]
+    middle = np.clip(k, 1, n - 2)
+    before, here, after = (squares[rows, middle + d].astype(float) for d in (-1, 0, 1))
+    slope, curvature = (after - before) / 2, after - 2 * here + before
+    offset = np.where(curvature > 0, -slope / np.where(curvature > 0, curvature, 1.0), k - middle)
+    offset = np.clip(offset, -1.0, 1.0)
+    least = here + slope * offset + curvature * offset**2 / 2
+    return np.maximum(np.minimum(least, squares[rows, k]), 0.0), times[middle] + offset * (times[1] - times[0])
+
+
+def tracking_rms(flight: ShowFlight) -> dict[str, float]:
+    """Return the root mean square of every drone's distance from its planned position, m, by name."""
+    errors = flight.pos - flight.planned
+    mean = np.einsum("tnk,tnk->n", errors, errors, dtype=float) / len(errors)
+    return dict(zip(flight.show.names, np.sqrt(mean).tolist(), strict=True))
+
+
+def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
+    """Return the pairs of drones whose collision spheres touched, each with the time of the first contact, by time."""
+    reach = 2 * collision_radius(flight)
+    distance, _ = sampled_approaches(flight.times, flight.pos)
+    found = []
+    for i, j in np.argwhere(np.triu(distance < reach, 1)):
+        apart = np.linalg.norm(flight.pos[:, i] - flight.pos[:, j], axis=-1)
+        first = int(np.argmax(apart <= max(reach, apart.min())))
+        found.append({"drones": [flight.show.names[i], flight.show.names[j]], "time": float(flight.times[first])})
+    return sorted(found, key=lambda pair: pair["time"])
+
+
+def collision_radius(flight: ShowFlight) -> float:
+    """Return the radius of the sphere with which a drone collides, m."""
+    model = flight.sim.mj_model
+    return float(model.geom_size[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "col_sphere:0"), 0])
+
+
+def report(flight: ShowFlight) -> dict[str, Any]:
+    """Return the figures of a flight as JSON, planned and flown separately.
+
+    Both have ``closest``, a list of ``{"drones": [name, name], "distance": m, "time": s}`` of every pair, the closest
+    first, and ``duration``, s; the flight also has ``tracking_rms``, m, by name.
+    """
+    return {
+        "planned": {"closest": _pairs(flight, flight.planned), "duration": flight.duration},
+        "flown": {
+            "closest": _pairs(flight, flight.pos),
+            "tracking_rms": tracking_rms(flight),
+            "duration": flight.duration,
+        },
+    }
+
+
+def _pairs(flight: ShowFlight, pos: NDArray) -> list[dict[str, Any]]:
+    distance, when = sampled_approaches(flight.times, pos)
+    first, second = np.triu_indices(len(distance), 1)
+    names = flight.show.names
+    order = np.argsort(distance[first, second], kind="stable")
+    rows = zip(
+        first[order].tolist(), second[order].tolist(), distance[first, second][order].tolist(),
+        when[first, second][order].tolist(), strict=True,
+    )  # fmt: skip
+    return [{"drones": [names[i], names[j]], "distance": d, "time": t} for i, j, d, t in rows]
+
+
+def summary(flight: ShowFlight, figures: dict[str, Any]) -> str:
+    """Return the figures of a flight for reading.
+
+    Args:
+        flight: Flight.
+        figures: Result of ``report``.
+    """
+    rms = figures["flown"]["tracking_rms"]
+    worst = max(rms, key=rms.__getitem__)
+    lines = [
+        f"{flight.show.n_drones} drones, {flight.duration:.1f} s, computed in {flight.wall_s:.2f} s, "
+        f"{flight.duration / flight.wall_s:.0f} times real time",
+        f"tracking error    {100 * float(np.sqrt(np.mean(np.square(list(rms.values()))))):.1f} cm RMS, largest "
+        f"{100 * rms[worst]:.1f} cm ({worst})",
+    ]
+    limit = flight.show.settings.get("validation", {})
+    limit = limit.get("minDistance") if isinstance(limit, dict) else None
+    for kind in ("planned", "flown"):
+        pairs = figures[kind]["closest"]
+        if not pairs:
+            continue
+        listed = ", ".join(f"{' and '.join(p['drones'])} {p['distance']:.2f} m at {p['time']:.1f} s" for p in pairs[:3])
+        lines.append(f"closest, {kind:8} {listed}")
+        if isinstance(limit, (int, float)):
+            n = sum(pair["distance"] < limit for pair in pairs)
+            lines.append(f"                  {n} of {len(pairs)} pairs closer than the show's {limit:g} m")
+    touched = collisions(flight)
+    shown = ", ".join(f"{' and '.join(pair['drones'])} at {pair['time']:.1f} s" for pair in touched[:N_LISTED])
+    lines.append(f"collisions        {len(touched)}{': ' + shown if touched else ''}")
+    return "\n".join(lines)

@@ -1,0 +1,182 @@
+"""Films, windows and pages of flown shows, with the drones' lights."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.core.settings import flag
+from crazysim.drones.body import LED_MATERIALS
+from crazysim.errors import ConfigError
+from crazysim.lab.shows.flight import ShowFlight
+from crazysim.lab.shows.show_report import collisions
+from crazysim.media import Film, Flight, View, flight_of, web
+from crazysim.media.flight_recorder import put
+from crazysim.sim.sim import Sim
+from crazysim.sim.visualize import change_material, draw_label, draw_points
+
+GLOW = 0.006
+"""Radius of the glow around a light, as a fraction of the size of the show."""
+MIN_GLOW = 0.03
+"""Least radius of that glow, m."""
+ROOM = 1.2
+"""Distance of the camera, as a multiple of the size of the show."""
+SHOWN = 0.7
+"""Time for which a collision is marked, s."""
+RED = (1.0, 0.1, 0.1, 0.55)
+"""Colour of a mark."""
+MAX_FPS = 60.0
+"""Largest number of images per second of a window."""
+NIGHT_LIGHT = 0.1
+"""Brightest light at night, 0 to 1."""
+NIGHT_SKY = (8, 10, 24)
+"""Brightest colour of the sky at night, 0 to 255."""
+
+
+def film(
+    flight: ShowFlight, path: str | Path, fps: float = 25, progress: bool = False, night: bool = True, **view: Any
+) -> int:
+    """Film a flown show, and return the number of frames.
+
+    Args:
+        flight: Flight.
+        path: ``.mp4`` or ``.gif`` file to write.
+        fps: Frames per second.
+        progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
+        night: True to darken the scene, which makes the lights stand out.
+        view: Settings of ``crazysim.media.View`` other than its own.
+
+    Raises:
+        ConfigError: If a setting is invalid.
+        ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
+        RenderError: If this machine cannot draw, or the file cannot be written.
+    """
+    if flag("night", night):
+        darken(flight.sim)
+    with Film(path, view_of(flight, **view), fps=fps, progress=progress) as recording:
+        return recording.play(flight.sim, media_flight(flight))
+
+
+def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
+    """Show a flown show in a window, in real time, until it ends or the user closes the window.
+
+    Args:
+        flight: Flight.
+        speed: Seconds of the show per second.
+        view: Settings of ``crazysim.media.View`` other than its own.
+
+    Raises:
+        ConfigError: If a setting is invalid.
+        RenderError: If there is no screen.
+    """
+    if not np.isfinite(speed) or speed <= 0:
+        raise ConfigError(f"expected a positive speed, got {speed!r}")
+    sim, recorded, camera = flight.sim, media_flight(flight), view_of(flight, **view)
+    data = sim.data
+    try:
+        put(sim, recorded, 0.0)
+        camera.show(sim)
+        start = time.perf_counter()  # opening the window can take longer than a short show
+        while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
+            shown = time.perf_counter()
+            put(sim, recorded, now)
+            camera.show(sim)
+            time.sleep(max(shown + 1 / MAX_FPS - time.perf_counter(), 0.0))
+    finally:
+        sim.data = data
+
+
+def page(flight: ShowFlight) -> str:
+    """Return a flown show as an HTML page to play in a browser, with lights.
+
+    Raises:
+        ImportError: If viser is not installed.
+    """
+    return web.page(media_flight(flight), lights=flight.colors)
+
+
+def media_flight(flight: ShowFlight) -> Flight:
+    """Return the poses of a flown show as ``crazysim.media`` plays them."""
+    states = SimpleNamespace(pos=flight.pos[:, None], quat=flight.quat[:, None])
+    return flight_of(flight.sim, states, float(flight.times[1] - flight.times[0]))
+
+
+def view_of(flight: ShowFlight, **settings: Any) -> View:
+    """Return a view of the whole show with lights, time, and marks of collisions.
+
+    Args:
+        flight: Flight.
+        settings: Settings of ``crazysim.media.View`` that replace the defaults.
+    """
+    camera = camera_around(flight.planned)
+    size = camera["distance"] / ROOM
+    marks = collisions(flight)
+    lit = _lit(flight.sim)
+
+    def draw(sim: Sim, world: int) -> None:
+        now = float(sim.time[world, 0])
+        k = int(np.argmin(np.abs(flight.times - now)))
+        color_leds(sim, lit, flight.colors[k])
+        glow = np.concatenate([flight.colors[k], np.full((flight.show.n_drones, 1), 0.6)], axis=1)
+        pos = np.asarray(sim.data.states.pos[world], float)
+        sim.overlays.points(pos, glow, max(GLOW * size, MIN_GLOW), emission=1.0)
+        for mark in marks:
+            if 0 <= now - mark["time"] <= SHOWN:
+                ids = [flight.show.names.index(name) for name in mark["drones"]]
+                point = pos[ids].mean(0)
+                draw_points(sim, point, RED, 4 * max(GLOW * size, MIN_GLOW))
+                draw_label(sim, point, _ascii(" x ".join(mark["drones"])))
+
+    defaults = {"width": 1280, "height": 720, "cam_config": camera, "text": "{time:.1f} s", "draw": draw}
+    return View(**(defaults | settings))
+
+
+def camera_around(points: NDArray) -> dict[str, Any]:
+    """Return the settings of a free camera with all points of a show in view. (n, n_drones, 3)"""
+    low, high = points.min((0, 1)), points.max((0, 1))
+    size = max(float(np.linalg.norm(high - low)), 1.0)
+    return {"lookat": (low + high) / 2, "distance": ROOM * size, "azimuth": 110, "elevation": -18}
+
+
+def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:
+    """Set the LEDs of all drones of a simulation.
+
+    Args:
+        sim: Simulation.
+        materials: Names of the LEDs' materials, such as ``led_top``.
+        colors: Colours, 0 to 1. (n_drones, 3)
+    """
+    rgba = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
+    for material in materials:
+        change_material(sim, material, np.arange(len(colors)), rgba=rgba, emission=colors.max(1))
+
+
+def darken(sim: Sim) -> None:
+    """Limit the lights and the sky of a simulation's scene to those of a night, before its first image."""
+    model = sim.mj_model
+    head = model.vis.headlight
+    for light in (model.light_diffuse, model.light_ambient, head.ambient, head.diffuse):
+        np.minimum(light, NIGHT_LIGHT, out=light)
+    haze = model.vis.rgba.haze
+    np.minimum(haze[:3], np.array(NIGHT_SKY) / 255, out=haze[:3])
+    for k in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+        n = model.tex_height[k] * model.tex_width[k] * model.tex_nchannel[k]
+        sky = model.tex_data[model.tex_adr[k] : model.tex_adr[k] + n].reshape(-1, model.tex_nchannel[k])
+        np.minimum(sky[:, :3], NIGHT_SKY, out=sky[:, :3], casting="unsafe")
+
+
+def _lit(sim: Sim) -> tuple[str, ...]:
+    """Return the materials of the LEDs that the airframe has."""
+    return tuple(
+        x for x in LED_MATERIALS if mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{x}:0") >= 0
+    )
+
+
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "replace").decode()[:99]

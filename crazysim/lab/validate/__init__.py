@@ -1,0 +1,35 @@
+"""Comparisons with closed forms, other simulators, the compiled firmware and logs of real flights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from crazysim.errors import ConfigError
+from crazysim.lab.validate.rows import Row, measure
+from crazysim.lab.validate.sections import NAMES, sections
+
+__all__ = ["NAMES", "Row", "validate"]
+
+
+def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> list[Row]:
+    """Return the rows that ``crazysim validate`` writes to its page.
+
+    Sections whose package is not installed, or whose logs are missing, have no rows. A comparison that raises an error
+    is a row with a ``problem``.
+
+    Args:
+        data: Folder with logs of real flights in ``idsia`` and ``nanobench``; None for none.
+        only: Names of sections.
+
+    Raises:
+        ConfigError: If a section does not exist, or the folder does not.
+    """
+    if unknown := [name for name in only if name not in NAMES]:
+        raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown[0]!r}")
+    folder = None if data is None else Path(data)
+    if folder is not None and not folder.is_dir():
+        raise ConfigError(
+            f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it."
+        )
+    return measure([section for section in sections(folder) if section.name in only])

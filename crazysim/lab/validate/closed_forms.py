@@ -1,0 +1,241 @@
+"""Motions with a closed form, and the order of the integrators."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim import rotation
+from crazysim.core.data import SimData
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.lab.validate.rows import Row
+from crazysim.plugins.payloads import SlungLoad
+from crazysim.sim.sim import Sim
+
+INERTIA = (2e-5, 3e-5, 5e-5)
+"""Moments of inertia of a body, all different, about the size of a Crazyflie's, kg m^2."""
+SPIN = (4.0, 1.0, 7.0)
+"""Angular velocity of a tumbling body, rad/s."""
+
+
+def free_body(
+    integrator: str = "rk4",
+    freq: int = 500,
+    ang_vel: ArrayLike = (0.0, 0.0, 0.0),
+    inertia: ArrayLike | None = None,
+    gravity: bool = True,
+    n_worlds: int = 1,
+) -> Sim:
+    """Return a simulation of a drone without thrust or drag, thrown from a height of 100 m.
+
+    Args:
+        integrator: Integrator.
+        freq: Steps per second, Hz.
+        ang_vel: Angular velocity, body frame, rad/s. (3,)
+        inertia: Moments of inertia, kg m^2. (3, 3)
+        gravity: True for weight.
+        n_worlds: Number of worlds.
+    """
+    sim = Sim(n_worlds, control="rotor_vel", integrator=integrator, freq=freq)
+    inertia = np.diag(INERTIA) if inertia is None else np.asarray(inertia)
+    p = sim.data.params
+    params = p.replace(
+        drag_matrix=np.zeros_like(p.drag_matrix),
+        rpm2thrust=np.zeros_like(p.rpm2thrust) + np.array([0.0, 0.0, 1e-30], p.rpm2thrust.dtype),
+        rpm2torque=np.zeros_like(p.rpm2torque),
+        J=np.asarray(inertia, p.J.dtype),
+        J_inv=np.asarray(np.linalg.inv(inertia), p.J.dtype),
+        gravity_vec=np.asarray(p.gravity_vec) * gravity,
+    )
+    start = {"pos": [0.0, 0.0, 100.0], "vel": [1.0, -2.0, 3.0], "ang_vel": ang_vel}
+    sim.data = with_states(sim.data.replace(params=params), **start)
+    return sim
+
+
+def with_states(data: SimData, **changes: Any) -> SimData:
+    """Return the data with other states, broadcast to every drone."""
+    states = data.states
+    new = {k: np.broadcast_to(v, getattr(states, k).shape).astype(getattr(states, k).dtype) for k, v in changes.items()}
+    return data.replace(states=states.replace(**{k: jnp.asarray(v) for k, v in new.items()}))
+
+
+def turn(vector: NDArray) -> Array:
+    """Return the quaternion, xyzw, of a rotation vector, rad. (4,)"""
+    angle = float(np.linalg.norm(vector))
+    return jnp.asarray([*(vector / angle * math.sin(angle / 2)), math.cos(angle / 2)])
+
+
+def state_of(sim: Sim) -> dict[str, NDArray]:
+    """Return the states of the first drone."""
+    s = sim.data.states
+    return {k: np.asarray(getattr(s, k))[0, 0] for k in ("pos", "vel", "quat", "ang_vel", "rotor_vel")}
+
+
+def angle_between(one: ArrayLike, other: ArrayLike) -> float:
+    """Return the angle between two attitudes, unit quaternions xyzw, rad."""
+    turn = rotation.multiply(rotation.conjugate(jnp.asarray(one)), jnp.asarray(other))
+    return 2 * math.asin(min(1.0, float(np.linalg.norm(turn[:3]))))
+
+
+def free_fall_error(integrator: str) -> float:
+    """Return the distance after 1 s from the closed form of the scheme, m.
+
+    Under constant acceleration a scheme is a sum: ``v0 t + g t^2 / 2``, minus or plus ``g t dt / 2`` for Euler's two.
+    """
+    sim, t, dt = free_body(integrator), 1.0, 1 / 500
+    sim.step(500)
+    extra = {
+        "euler": 0.5 * GRAVITY_MAGNITUDE * t * dt,
+        "symplectic_euler": -0.5 * GRAVITY_MAGNITUDE * t * dt,
+        "rk4": 0.0,
+    }[integrator]
+    expected = np.array([1.0, -2.0, 103.0 - 0.5 * GRAVITY_MAGNITUDE * t**2 + extra])
+    return float(np.linalg.norm(state_of(sim)["pos"] - expected))
+
+
+def free_fall() -> Iterable[Row]:
+    """Yield the errors of a free fall."""
+    for name in ("euler", "symplectic_euler", "rk4"):
+        with jax.enable_x64(True):
+            error = free_fall_error(name)
+        # 500 additions of numbers near 100, each rounded to 1.4e-14
+        yield Row(f"free fall, 1 s, {name}: position", "sum of the scheme", error, "m", (0, 1e-11))
+
+
+def precession() -> Iterable[Row]:
+    """Yield the attitude of a symmetric top that nothing turns: a product of two turns at constant rates."""
+    a, c, w, t = 2e-5, 5e-5, np.array([4.0, 3.0, 8.0]), 0.5
+    with jax.enable_x64(True):
+        sim = free_body("rk4", 500, w, np.diag([a, a, c]))
+        sim.step(250)
+        quat = state_of(sim)["quat"]
+        exact = rotation.multiply(turn(np.array([a, a, c]) * w / a * t), turn(np.array([0, 0, w[2] * (1 - c / a) * t])))
+        angle = angle_between(exact, quat)
+    # a step turns by 0.019 rad; ten times 250 * 0.019^5 / 120, the error of a linear system, as Euler's is not linear
+    yield Row("precession of a top at 9.4 rad/s, 0.5 s, RK4: attitude", "closed form", angle, "rad", (0, 5e-8))
+
+
+def terminal_velocity() -> Iterable[Row]:
+    """Yield the velocity of a drone that has fallen for 40 s with its rotors off."""
+    with jax.enable_x64(True):
+        sim = Sim(control="rotor_vel", integrator="rk4")
+        p = sim.data.params
+        fall = float(np.ravel(p.mass)[0]) * GRAVITY_MAGNITUDE / -float(np.asarray(p.drag_matrix)[..., 2, 2].ravel()[0])
+        sim.data = with_states(sim.data, pos=[0, 0, 2000.0], rotor_vel=np.zeros(4))
+        sim.rotor_vel_control(np.zeros((1, 1, 4)))
+        sim.step(20_000)
+        found = -state_of(sim)["vel"][2]
+    rate = GRAVITY_MAGNITUDE / fall
+    # what is left of the transient, and rounding
+    text = f"m g / D = {fall:.3f} m/s"
+    yield Row("terminal velocity, 40 s", text, abs(found / fall - 1), "", (0, 2 * math.exp(-40 * rate)))
+
+
+def motor_step() -> Iterable[Row]:
+    """Yield the speed of a rotor on its way up: ``r' = (c - r) (a + b (c + r))`` has a rational solution of exp."""
+    low, high, t = 10_000.0, 16_000.0, 0.05
+    with jax.enable_x64(True):
+        sim = Sim(control="rotor_vel", integrator="rk4")
+        a, b = (float(x) for x in np.asarray(sim.data.params.rotor_dyn_coef).reshape(-1, 4)[0, :2])
+        sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=np.full(4, low))
+        sim.rotor_vel_control(np.full((1, 1, 4), high))
+        sim.step(25)
+        found = state_of(sim)["rotor_vel"][0]
+    # with e = c - r: e' = -e (a + 2 b c - b e), Bernoulli's equation
+    rate, start = a + 2 * b * high, high - low
+    e = rate / (b + (rate / start - b) * math.exp(rate * t))
+    # RK4: a step of 2 ms is 0.035 of the time constant; 25 * 0.035^5 / 120 of 6,000 rpm
+    yield Row(
+        "motor, 50 ms after a step from 10,000 to 16,000 rpm", "closed form", abs(found - high + e), "rpm", (0, 1e-4)
+    )
+
+
+def pendulum() -> Iterable[Row]:
+    """Yield the period of a load of 0.2 kg on 0.4 m below a body that does not move."""
+    angles, length = np.array([0.2, 0.8, 1.4]), 0.4
+    with jax.enable_x64(True):
+        sim = Sim(3, drone="bumblebee", control="rotor_vel", integrator="rk4")
+        sim.data = sim.data.replace(params=sim.data.params.replace(mass=jnp.full(1, 1e9)))
+        sim.data = with_states(sim.data, pos=[0, 0, 5.0], force=[0, 0, 1e9 * GRAVITY_MAGNITUDE])
+        load = sim.add(SlungLoad(mass=0.2, length=length, in_scene=False))
+        record = load.read(sim.data)
+        pos = np.stack([length * np.sin(angles), 0 * angles, 5 - length * np.cos(angles)], axis=-1)[:, None]
+        sim.data = load.write(sim.data, record.replace(pos=jnp.asarray(pos, record.pos.dtype)))
+        x = []
+        for _ in range(1500):
+            sim.step()
+            x.append(np.asarray(load.read(sim.data).pos - sim.data.states.pos)[:, 0, 0])
+    for k, angle in enumerate(angles):
+        swing = np.stack(x)[:, k]
+        at = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))[:2]
+        times = (at + 1 + swing[at] / (swing[at] - swing[at + 1])) / sim.freq
+        mean, other = 1.0, math.cos(angle / 2)
+        for _ in range(6):
+            mean, other = (mean + other) / 2, math.sqrt(mean * other)
+        period = 2 * math.pi * math.sqrt(length / GRAVITY_MAGNITUDE) / mean
+        error = abs(float(times[1] - times[0]) / period - 1)
+        # crossings are interpolated linearly between samples of 2 ms: (2 ms)^3 of the curvature, relative to 1.3 s
+        name = f"period of a load on a rod, amplitude {angle:g} rad"
+        yield Row(name, f"elliptic integral, {period:.4f} s", error, "", (0, 1e-5))
+
+
+def dzhanibekov() -> Iterable[Row]:
+    """Yield the growth rate of a wobble about the middle axis: ``w sqrt((J2 - J1) (J3 - J2) / (J1 J3))``."""
+    j1, j2, j3 = INERTIA
+    w, small, t = 10.0, 1e-7, 1.0
+    rate = w * math.sqrt((j2 - j1) * (j3 - j2) / (j1 * j3))
+    start = [small, w, rate * j1 / ((j2 - j3) * w) * small]
+    with jax.enable_x64(True):
+        sim = free_body("rk4", 500, start)
+        sim.step(500)
+        found = math.log(abs(state_of(sim)["ang_vel"][0]) / small) / t
+    # RK4: growth per step of 2 ms is exp(0.0126) to order five, 500 * 0.0126^5 / 120 over 6.3
+    yield Row("Dzhanibekov effect: growth rate", f"{rate:.4f} 1/s", abs(found / rate - 1), "", (0, 1e-8))
+
+
+STEPS = {"euler": (400, 800, 1600), "symplectic_euler": (400, 800, 1600), "rk4": (100, 200, 400)}
+"""Steps per second of the flights that show the order of an integrator, Hz."""
+
+
+def order_errors() -> dict[str, NDArray]:
+    """Return errors of position, m, and attitude of a tumbling body in drag, by integrator. (n_freqs, 2)
+
+    The drag depends on the attitude, and the axis turns, so that rotations which do not commute count. The reference
+    is RK4 at 6,400 Hz.
+    """
+
+    def flight(freq: int, scheme: str) -> tuple[NDArray, NDArray]:
+        sim = free_body(scheme, freq, SPIN)
+        drag = np.diag([-0.02, -0.05, -0.2])
+        sim.data = sim.data.replace(params=sim.data.params.replace(drag_matrix=drag))
+        sim.step(freq // 2)
+        state = state_of(sim)
+        return state["pos"], state["quat"]
+
+    with jax.enable_x64(True):
+        exact = flight(6400, "rk4")
+        flights = {name: [flight(f, name) for f in freqs] for name, freqs in STEPS.items()}
+    return {
+        name: np.array([[np.linalg.norm(x - e) for x, e in zip(flown, exact, strict=True)] for flown in each])
+        for name, each in flights.items()
+    }
+
+
+def orders() -> Iterable[Row]:
+    """Yield the orders of the integrators: slopes of the error over the step, both as logarithms."""
+    for name, errors in order_errors().items():
+        order = 4 if name == "rk4" else 1
+        for what, column in zip(("position", "attitude"), errors.T, strict=True):
+            slope = float(np.polyfit(np.log(1 / np.array(STEPS[name])), np.log(column), 1)[0])
+            bound = (order - 0.35, order + 0.35)  # terms of the next order
+            yield Row(f"order of {name}: {what}", f"theory: {order}", slope, "", bound)
+
+
+CHECKS = (free_fall, precession, terminal_velocity, motor_step, pendulum, dzhanibekov, orders)

@@ -1,0 +1,181 @@
+"""Closed loop against logs: controller and filter of the firmware follow the setpoints of real flights."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.core.airframes import AirframeSource
+from crazysim.errors import ConfigError
+from crazysim.lab.identify.tables import read_table
+from crazysim.plugins.estimators import Estimator, Kalman
+from crazysim.plugins.sensors import IMU, MotionCapture
+from crazysim.sim.sim import Sim
+
+FREQ = 100
+"""Samples of a flight per second, Hz, at which setpoints are commanded."""
+COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrltarget_z", "sp_ctrltarget_yaw")
+"""Columns of a log of NanoBench (arXiv 2603.09908): time, s, motion capture, m, setpoint, m and degrees."""
+AIRBORNE, SETTLED, BEFORE_LANDING = 0.9, 2.0, 0.5
+"""A flight is compared from SETTLED seconds after its setpoint has reached this share of its median height, until
+BEFORE_LANDING seconds before it leaves that height."""
+LOST = 2.0
+"""Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
+LONGEST_LAG = 1.2
+"""Longest lag that is looked for, s."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Flight:
+    """A logged flight at ``FREQ``, from its first setpoint to its last."""
+
+    name: str
+    """Name of the log."""
+    setpoint: NDArray
+    """Commanded position, relative to the place of the tracked body at rest on the floor, m, and yaw, rad. (n, 4)"""
+    pos: NDArray
+    """Measured position, likewise, m. (n, 3)"""
+
+    @property
+    def compared(self) -> slice:
+        """Samples that are compared."""
+        height = self.setpoint[:, 2]
+        up = np.flatnonzero(height > AIRBORNE * np.median(height[height > 0.5 * height.max()]))
+        return slice(up[0] + round(SETTLED * FREQ), up[-1] - round(BEFORE_LANDING * FREQ))
+
+    def rmse(self, pos: NDArray) -> float:
+        """Return the root mean square distance of positions, (n, 3), from the setpoint, m."""
+        error = (pos - self.setpoint[:, :3])[self.compared]
+        return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
+
+    def lag(self, pos: NDArray) -> float:
+        """Return the lag behind the setpoint at which positions, (n, 3), are closest to it horizontally, s."""
+        first, last = self.compared.start, self.compared.stop
+
+        def distance(k: int) -> float:
+            return float(np.mean((pos[first + k : last, :2] - self.setpoint[first : last - k, :2]) ** 2))
+
+        return min(range(round(LONGEST_LAG * FREQ)), key=distance) / FREQ
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Tracking errors of a flight and of its simulation."""
+
+    name: str
+    """Name of the log."""
+    logged: float
+    """Root mean square distance from the setpoint in the log, m."""
+    simulated: float
+    """The same in the simulation, m."""
+    logged_lag: float
+    """Lag behind the setpoint in the log, s."""
+    simulated_lag: float
+    """The same in the simulation, s."""
+    failed: bool
+    """True if the real drone was farther than ``LOST`` from its setpoint."""
+
+    @property
+    def ratio(self) -> float:
+        """Simulated error over the logged one."""
+        return self.simulated / self.logged
+
+
+def read_flight(path: str | Path) -> Flight:
+    """Return the flight of a log of NanoBench, a table with ``COLUMNS``.
+
+    Raises:
+        ConfigError: If a column is missing, or there is no setpoint.
+    """
+    path = Path(path)
+    columns = columns_of(path, COLUMNS)
+    t, logged, given = columns[0], columns[1:4], columns[4:]
+    rest, commanded = logged[2, 0], commanded_samples(path.name, given[2])
+    grid = np.arange(float(t[commanded[0]]), float(t[commanded[-1]]), 1 / FREQ)
+    pos = np.stack([np.interp(grid, t, x) for x in logged], axis=-1)
+    nearest = np.searchsorted((t[1:] + t[:-1]) / 2, grid)
+    setpoint = given[:, nearest].T * [1, 1, 1, np.pi / 180]
+    pos[:, 2], setpoint[:, 2] = pos[:, 2] - rest, setpoint[:, 2] - rest
+    return Flight(path.stem, setpoint, pos)
+
+
+def columns_of(path: Path, names: Sequence[str]) -> NDArray:
+    """Return columns of a log of NanoBench. (len(names), n)
+
+    Raises:
+        ConfigError: If one is missing.
+    """
+    _, table = read_table(path, [], None)
+    if missing := [name for name in names if name not in table]:
+        raise ConfigError(
+            f"{path.name}: expected columns {', '.join(names)}, got no {', '.join(missing)}. Give a log of NanoBench."
+        )
+    return np.stack([table[name] for name in names]).astype(np.float64)
+
+
+def commanded_samples(name: str, height: NDArray) -> NDArray:
+    """Return the indices of samples with a setpoint above the floor.
+
+    Args:
+        name: Name of the log, for messages.
+        height: Height of the setpoint, m. (n,)
+
+    Raises:
+        ConfigError: If there are none.
+    """
+    commanded = np.flatnonzero(height > 0)
+    if not len(commanded):
+        raise ConfigError(f"{name}: expected a setpoint above the floor, got none. Give the log of a flight.")
+    return commanded
+
+
+def laboratory(quat_deviation: float = 0.06) -> Estimator:
+    """Return the firmware's filter as laboratories with motion capture set it up.
+
+    Positions at rest in NanoBench's logs scatter by 0.1 mm at most. The default of ``quat_deviation``, rad, is what
+    Bitcraze's examples for motion capture set (crazyflie-lib-python, examples/mocap/qualisys_hl_commander.py).
+    """
+    sensors = [IMU.crazyflie(), MotionCapture(noise=1e-4)]
+    return Kalman(sensors, deviations={"quat": quat_deviation})
+
+
+def fly(flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimator: Estimator | None = None) -> NDArray:
+    """Return the positions of simulated drones that follow the setpoints of flights, m. (n, n_flights, 3)
+
+    The controller is the firmware's ``"pid"``, and each drone starts where the real one did. Flights are continued with
+    their last setpoint until the longest one ends.
+
+    Args:
+        flights: Flights.
+        drone: Airframe.
+        estimator: Filter that the controllers fly on; None for the true state.
+    """
+    sim = Sim(len(flights), drone=drone, control="state", controller="pid", estimator=estimator)
+    start = np.stack([flight.pos[0] * [1, 1, 0] for flight in flights])[:, None]
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=start.astype(np.float32)))
+    n = max(len(flight.pos) for flight in flights)
+    setpoints = np.stack([f.setpoint[np.minimum(np.arange(n), len(f.pos) - 1)] for f in flights], axis=1)[:, :, None]
+    pos = np.empty((n, len(flights), 3))
+    for k, setpoint in enumerate(setpoints):
+        pos[k] = np.asarray(sim.data.states.pos)[:, 0]
+        sim.state_control(pos=setpoint[..., :3], yaw=setpoint[..., 3])
+        sim.step(sim.freq // FREQ)
+    return pos
+
+
+def compare(
+    flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimator: Estimator | None = None
+) -> list[Comparison]:
+    """Return the tracking errors of flights beside those of their simulation; see ``fly`` for the arguments."""
+    rows, flown = [], fly(flights, drone, estimator)
+    for k, flight in enumerate(flights):
+        pos = flown[: len(flight.pos), k]
+        away = np.linalg.norm(flight.pos - flight.setpoint[:, :3], axis=-1)[flight.compared]
+        errors = flight.rmse(flight.pos), flight.rmse(pos)
+        lags = flight.lag(flight.pos), flight.lag(pos)
+        rows.append(Comparison(flight.name, *errors, *lags, bool(np.max(away) > LOST)))
+    return rows

@@ -1,0 +1,124 @@
+"""The single-track car of CommonRoad's vehicle models under the same commands."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.lab.validate.rows import Row
+from crazysim.plugins.vehicles import CarState, CommonRoadParams, CommonRoadState, commonroad_single_track, single_track
+from crazysim.plugins.vehicles.parameters import SLIP_SPEED, CarParams
+from crazysim.pytree import as_parameter
+
+REFERENCE = "CommonRoad, BMW 320i"
+STEP, DURATION, SPEED = 0.005, 6.0, 15.0
+"""Step of Runge-Kutta and duration of the drives, s, and their speed at the start, m/s."""
+
+
+def parameters(car: Any) -> CommonRoadParams:
+    """Return our parameters of a vehicle of CommonRoad."""
+    numbers = {
+        "friction": car.tire.p_dy1,
+        "stiffness": [-car.tire.p_ky1 / car.tire.p_dy1] * 2,
+        "arms": [car.a, car.b],
+        "height": car.h_s,
+        "mass": car.m,
+        "yaw_inertia": car.I_z,
+        "steer": [car.steering.min, car.steering.max],
+        "steer_rate": [car.steering.v_min, car.steering.v_max],
+        "speed": [car.longitudinal.v_min, car.longitudinal.v_max],
+        "switch_speed": car.longitudinal.v_switch,
+        "acc_max": car.longitudinal.a_max,
+    }
+    return CommonRoadParams(**{name: as_parameter(x) for name, x in numbers.items()})
+
+
+def rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
+    """Return the rates of states and commands in CommonRoad's order. (..., 7)"""
+    x = jnp.asarray(state)
+    split = CommonRoadState(x[..., :2], *(x[..., k : k + 1] for k in range(2, 7)))
+    return jnp.concatenate(commonroad_single_track(split, jnp.asarray(command), params), axis=-1)
+
+
+def own_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
+    """Return the rates by ``single_track``, the model of our cars, which has tyres with limited grip. (7,)
+
+    Steering angle and acceleration follow the commands within CommonRoad's limits.
+    """
+    x, p = jnp.asarray(state), params
+    limited = rates(state, command, params)
+    zero, speed, slip = jnp.zeros(1), x[3:4], x[6:7]
+    loads = p.mass * GRAVITY_MAGNITUDE * p.arms[..., ::-1] / jnp.sum(p.arms)
+    car = CarParams(
+        mass=p.mass, yaw_inertia=p.yaw_inertia, front=p.arms[..., :1], rear=p.arms[..., 1:],
+        stiffness=p.friction * p.stiffness * loads, grip=p.friction * loads, drive=jnp.stack([p.mass[0], 0, 0]),
+        drive_max=jnp.full(1, jnp.inf), front_share=zero, rolling=jnp.zeros(2), towed_mass=zero,
+        steer_max=p.steer[..., 1:], steer_rate_max=p.steer_rate[..., 1:], steer_bandwidth=zero,
+        slip_speed=jnp.full(1, SLIP_SPEED), trailer=None,
+    )  # fmt: skip
+    vel = speed * jnp.concatenate([jnp.cos(slip), jnp.sin(slip)])
+    found = single_track(CarState(jnp.zeros(3), x[4:5], vel, x[5:6], x[2:3], zero), limited[3:4], car)
+    acc, turn = found.body_vel, (vel[:1] * found.body_vel[1:] - vel[1:] * found.body_vel[:1]) / speed**2
+    along = (vel @ acc)[None] / speed
+    return jnp.concatenate([found.pos[:2], limited[2:3], along, found.yaw, found.yaw_rate, turn])
+
+
+def lane_change(t: float, rate: float) -> list[float]:
+    """Return rate of the steering angle, rad/s, and acceleration, m/s^2, of a lane change and braking."""
+    steps = ((0.0, 0.0), (1.0, rate), (1.5, -rate), (2.0, 0.0), (2.5, -rate), (3.0, rate), (3.5, 0.0))
+    return [next(r for start, r in reversed(steps) if t >= start), 1.0 if t < 4 else -1.0]
+
+
+def drive(f: Callable[[NDArray, list[float]], ArrayLike], start: NDArray, rate: float) -> NDArray:
+    """Return the state after a lane change, by Runge-Kutta of order 4.
+
+    Args:
+        f: Rates of a state under a command.
+        start: State at the start.
+        rate: Rate of the steering angle, rad/s.
+    """
+    x = start
+    for k in range(round(DURATION / STEP)):
+        command = lane_change(k * STEP, rate)
+        k1 = np.asarray(f(x, command))
+        k2 = np.asarray(f(x + STEP / 2 * k1, command))
+        k3 = np.asarray(f(x + STEP / 2 * k2, command))
+        x = x + STEP / 6 * (k1 + 2 * k2 + 2 * k3 + np.asarray(f(x + STEP * k3, command)))
+    return x
+
+
+def of_commonroad() -> Iterable[Row]:
+    """Yield differences from CommonRoad's single-track model, of rates and of drives under the same commands."""
+    model = importlib.import_module("vehiclemodels.vehicle_dynamics_st").vehicle_dynamics_st
+    car = importlib.import_module("vehiclemodels.parameters_vehicle2").parameters_vehicle2()
+    rng, n = np.random.default_rng(0), 500
+    top, stop = car.longitudinal.v_max, car.steering.max
+    x = rng.uniform([-9, -9, -stop, 0.5, -3, -1, -0.3], [9, 9, stop, top, 3, 1, 0.3], (n, 7))
+    x[:25, 2], x[25:50, 3] = stop, top  # at the stops of the steering angle and of the speed
+    u = rng.uniform([-2, -2], [2, 2], (n, 2)) * [car.steering.v_max, car.longitudinal.a_max]
+    theirs = np.array([model(list(row), list(command), car) for row, command in zip(x, u, strict=True)])
+    with jax.enable_x64(True):
+        params = parameters(car)
+        ours = np.asarray(rates(x, u, params))
+        # rounding of float64 in differences of terms up to 1,000 times as large
+        apart = float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
+        yield Row("rates of 500 states, commands beyond the limits", REFERENCE, apart, "", (0, 1e-11))
+        laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (rates, own_rates)]
+        start = np.array([0.0, 0, 0, SPEED, 0, 0, 0])
+        for rate in (0.03, 0.12):
+            known = drive(lambda x, u: model(list(x), list(u), car), start, rate)
+            same, own = (drive(law, start, rate) for law in laws)
+            what = f"lane change, steering at {rate:g} rad/s, {DURATION:g} s"
+            apart = float(np.linalg.norm((same - known)[:2]))
+            yield Row(f"{what}: `commonroad_single_track`, position", REFERENCE, apart, "m", (0, 1e-9))
+            for k, way in enumerate(("along", "across")):
+                yield Row(f"{what}: `single_track`, position {way}", REFERENCE, float(abs(own - known)[k]), "m",
+                          other=f"of {known[k]:.3g} m")  # fmt: skip

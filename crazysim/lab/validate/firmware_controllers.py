@@ -1,0 +1,169 @@
+"""The firmware's controllers against recorded outputs of its compiled C sources."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+import crazysim
+from crazysim.control import Control, Setpoint
+from crazysim.control.mellinger import Mellinger
+from crazysim.control.pid import PID
+from crazysim.core.airframes import AirframeSource
+from crazysim.drones import load_airframe
+from crazysim.dynamics.rotor import curve
+from crazysim.lab.validate.rows import Row
+
+RATE, POSITION_EVERY = 500, 5
+VECTORS = Path(crazysim.__file__).parents[1] / "tests"
+"""Folder with the recorded outputs; it exists in a checkout of the sources only."""
+FILTERED = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
+CASES: dict[str, tuple[Any, str, AirframeSource]] = {
+    "pid-state": (PID(hold_yaw=True), "state", "cf2x_L250"),
+    "pid-brushless": (PID(hold_yaw=True), "state", "cf21B_500"),
+    "pid-filters": (PID(hold_yaw=True), "state", FILTERED),
+    "pid-attitude": (PID(hold_yaw=True), "attitude", "cf2x_L250"),
+    "pid-rate": (PID(hold_yaw=True), "body_rate", "cf2x_L250"),
+    "mellinger": (Mellinger(), "state", "cf2x_L250"),
+    "m-attitude": (Mellinger(), "attitude", "cf2x_L250"),
+    "m-heavy": (Mellinger(), "state", "cf21B_500"),
+}
+"""Controller, command level and airframe, by name of the recording."""
+TRUNCATED = 5.0
+"""Most that the firmware's integers take from a motor, PWM: roll, pitch, yaw and motor lose less than one each, and
+where all motors are lowered by the excess of the highest, the difference of two motors counts."""
+FLOAT32 = 3.0
+"""Rounding, PWM: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
+
+
+def recorded(name: str) -> NDArray:
+    """Return the PWM of the motors by the compiled firmware. (n_ticks, n, 4)"""
+    with np.load(VECTORS / "control" / "firmware_motors.npz") as file:
+        return file[name].astype(float)
+
+
+def difference(name: str, whole_numbers: bool = False) -> NDArray:
+    """Return the differences from the compiled firmware in 8 flights of 240 ticks, PWM. (240, 8, 4)
+
+    Args:
+        name: Name of the recording.
+        whole_numbers: True to compute in integers where the firmware does.
+    """
+    controller, mode, drone = CASES[name]
+    states, commands = (x.astype(np.float32) for x in flights(mode, 8, 240, seed=11))
+    controller = dataclasses.replace(controller, whole_numbers=whole_numbers)
+    return np.abs(law(controller, mode, states, commands, drone) - recorded(name))
+
+
+def of_controllers() -> Iterable[Row]:
+    """Yield the largest differences of the motors from those of the compiled firmware."""
+    for name, (controller, mode, drone) in CASES.items():
+        flown = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
+        for whole, bound in ((False, TRUNCATED + FLOAT32), (True, 1.0 + FLOAT32)):
+            numbers = "integers as the firmware" if whole else "real numbers"
+            what = f"{type(controller).__name__} on {mode} commands, {flown}, {numbers}: motors"
+            yield Row(what, "compiled C, 240 ticks", float(difference(name, whole).max()), "PWM", (0, bound))
+
+
+def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArray]:
+    """Return states (n_ticks, n, 13) and commands (n_ticks, n, k): from gentle to wild, across yaw +-180 degrees.
+
+    A state is pos, vel, quat, ang_vel. Thrust is in PWM, and zero for a while in some flights. State commands change
+    at the ticks of the position loop.
+    """
+    rng = np.random.default_rng(seed)
+    size = np.geomspace(0.02, 1.0, n)[:, None]  # the last flights turn upside down
+
+    def smooth(k: int, scale: Any, period: float) -> NDArray:
+        phase, slow = rng.uniform(0, 2 * np.pi, (3, n, k)), rng.uniform(0.3, 1.7, (3, n, k))
+        t = np.arange(n_ticks)[:, None, None, None] / RATE
+        return scale * np.sum(np.sin(2 * np.pi * t * slow / period + phase), axis=1) / 1.7
+
+    pos, vel = smooth(3, 2 * size, 1.0), smooth(3, 3 * size, 0.7)
+    # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
+    tilt, yaw = smooth(2, 1.2 * size, 0.5) * [1.0, 0.5], 3.0 + smooth(1, 2.0, 0.9)
+    quat = np.array([[of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)])
+    ang_vel = smooth(3, 10 * size, 0.3)
+    states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
+    if mode == "state":
+        held = POSITION_EVERY * (np.arange(n_ticks) // POSITION_EVERY)
+        desired_yaw = (yaw + smooth(1, size, 0.4))[held, :, 0]
+        quat_des = np.stack([0 * desired_yaw, 0 * desired_yaw, np.sin(desired_yaw / 2), np.cos(desired_yaw / 2)], -1)
+        parts = [pos + smooth(3, 1.5 * size, 0.6), vel + smooth(3, size, 0.4), smooth(3, 4 * size, 0.5)]
+        rates = smooth(3, 3 * size, 0.3)
+        commands = np.concatenate([*(part[held] for part in parts), quat_des, rates[held]], axis=-1)
+    else:
+        thrust = np.clip(38000 + 40000 * size * smooth(1, 1.0, 0.5), 1000, 65535)
+        thrust[n_ticks // 3 : n_ticks // 3 + 20, ::3] = 0
+        angles = np.concatenate([tilt, yaw], axis=-1) + smooth(3, size, 0.4)
+        commands = np.concatenate([angles if mode == "attitude" else smooth(3, 8 * size, 0.3), thrust], axis=-1)
+    return states, commands
+
+
+def of_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
+    """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), xyzw."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(np.array([roll, pitch, yaw]) / 2), np.sin(np.array([roll, pitch, yaw]) / 2)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def law(controller: Any, mode: str, states: NDArray, commands: NDArray, drone: AirframeSource = "cf2x_L250") -> NDArray:
+    """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
+    return np.asarray(_compiled(controller, mode)(numbers_of(controller, drone), states, commands))
+
+
+@functools.cache
+def _compiled(controller: Any, mode: str) -> Any:
+    return jax.jit(functools.partial(_flown, controller, mode))
+
+
+def numbers_of(controller: Any, drone: AirframeSource) -> tuple:
+    """Return parameters and memory of a controller for an airframe, N of full PWM, and the curve of the thrust."""
+    airframe = load_airframe(drone)
+    newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
+    return controller.params(airframe), controller.memory(airframe), newton, airframe.value("rotors.thrust_curve")[None]
+
+
+def law_of(controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250") -> Array:
+    """Return the same as ``law``, traceable."""
+    return _flown(controller, mode, numbers_of(controller, drone), states, commands)
+
+
+def _flown(controller: Any, mode: str, numbers: tuple, states: Any, commands: Any) -> Array:
+    params, rest, newton, thrust_curve = numbers
+    rest = jax.tree.map(jnp.asarray, rest)
+    if mode != "state":
+        commands = commands * jnp.asarray([1, 1, 1, newton], commands.dtype)
+
+    def tick(memory: Any, row: tuple) -> tuple[Any, Array]:
+        k, s, c = row
+        controls = SimpleNamespace(mode=Control(mode), state=SimpleNamespace(cmd=c))
+        states = SimpleNamespace(pos=s[:3], vel=s[3:6], quat=s[6:10], ang_vel=s[10:13])
+        data = SimpleNamespace(states=states, controls=controls)
+        command = Setpoint.of_command(c) if mode == "state" else c
+        if mode == "state" and controller.has_outer:
+            after = controller.outer(data, command, memory, params)
+            memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_EVERY == 0, new, old), after, memory)
+        rotor_vel, memory = controller.update(data, command, memory, params)
+        thrust = jnp.where(rotor_vel > 0, curve(rotor_vel, thrust_curve), 0.0)
+        return memory, 4 * thrust / newton
+
+    def fly(states: Array, commands: Array) -> Array:
+        ticks = jnp.arange(len(states))
+        return jax.lax.scan(tick, rest, (ticks, states, commands))[1]
+
+    return jax.vmap(fly, 1, 1)(states, commands)

@@ -1,0 +1,137 @@
+"""The firmware's filters against recorded outputs of its compiled C sources."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from crazysim import rotation
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.lab.validate.firmware_controllers import VECTORS
+from crazysim.lab.validate.rows import Row
+from crazysim.plugins.estimators import complementary as law
+from crazysim.plugins.estimators import error_state, updates
+
+FOLDER = VECTORS / "plugins" / "estimators"
+KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range", "sweep")
+"""Measurements of the recordings of the Kalman filter."""
+ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
+"""Positions of the anchors, m."""
+DIODE = np.array([0.015, 0.0075, 0.0], np.float32)
+NOISE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
+
+
+def measured(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
+    """Return the estimate after the measurements of a loop, as tests/plugins/estimators/record_filter.py takes them."""
+    if kind in ("position", "ground"):
+        return error_state.select(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
+    if kind == "pose":
+        after = updates.update_quat(updates.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
+        return error_state.select(k % 10 == 0, after, estimate)
+    if kind in ("flow", "range"):
+        after = updates.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
+        estimate = error_state.select(k % 10 == 0, after, estimate)
+        sees = (k % 25 == 10) & (kind == "range")
+        return error_state.select(sees, updates.update_range(estimate, rot, m[2], 0.02), estimate)
+    if kind == "sweep":
+        estimate = error_state.select(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
+        station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
+        for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
+            after = updates.update_sweep(estimate, rot, jnp.asarray(DIODE), station, tilt, m[0], 0.001)
+            estimate = error_state.select(k % 8 == first, after, estimate)
+        return estimate
+    anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
+    if kind == "distance":
+        after = updates.update_distance(estimate, anchors[a], m[0], 0.25)
+    else:
+        after = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
+    return error_state.select(k % 5 == 0, after, estimate)
+
+
+def kalman(kind: str) -> tuple[NDArray, NDArray]:
+    """Return states and covariances of the Kalman filter in flights of 4 s, every 0.1 s, ours and the firmware's.
+
+    Args:
+        kind: One of ``KINDS``; ``"ground"`` is a drone at rest, the others fly fast.
+
+    Returns:
+        Position, m, velocity, m/s, error of attitude, rad, quaternion wxyz, and covariance. (40, n)
+    """
+    level = jnp.array([0.0, 0.0, 0.0, 1.0])
+    with np.load(FOLDER / "firmware_filter.npz") as file:
+        inertial = jnp.asarray(file[f"inertial/{'ground' if kind == 'ground' else 'air'}"])[1:]
+        inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
+        stations = jnp.asarray(file["sweep/places"]), jnp.asarray(file["sweep/frames"])
+
+    def loop(carry: Any, x: Any) -> tuple[Any, Array]:
+        (estimate, rot), (k, inert, m) = carry, x
+        accel, gyro = inert[:3], inert[3:]
+        predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
+        estimate = error_state.add_noise(error_state.select(k % 10 == 0, predicted, estimate), jnp.asarray(NOISE))
+        estimate = error_state.finalize(measured(kind, k, m, gyro, estimate, rot, stations))
+        state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
+        return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
+
+    start = error_state.start(jnp.array([0.05, -0.05, 1.25]), jnp.zeros(3), level, (100, 100, 1, *[0.01] * 6))
+    loops = jnp.arange(1, len(inputs) + 1), inertial, inputs
+    run = jax.jit(lambda start, x: jax.lax.scan(loop, (start, jnp.eye(3)), x)[1])
+    return np.asarray(run(start, loops))[99::100], recorded
+
+
+def complementary(kind: str) -> tuple[NDArray, NDArray]:
+    """Return states of the complementary filter in 2 s of 1 ms, every 20 ms, ours and the firmware's.
+
+    Args:
+        kind: Source of the height: ``"pressure"`` or ``"ground"``.
+
+    Returns:
+        Quaternion xyzw, height, m, and climb rate, m/s. (100, 6)
+    """
+    with np.load(FOLDER / "firmware_complementary.npz") as file:
+        inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
+
+    def tick(carry: Any, x: Any) -> tuple[Any, Array]:
+        (quat, integral, climb, height, rate, over), (k, row) = carry, x
+        gyro, accel = jnp.radians(row[:3]), GRAVITY_MAGNITUDE * row[3:6]
+        turned = law.mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
+        turned = *turned, law.inertial_climb(climb, turned[0], accel, 0.004)
+        quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))
+        shift = 0.01 * climb
+        by_pressure = law.filtered_height(height, row[6:7], shift)
+        useful = row[8:] <= 1000 * law.OLDEST
+        risen, above = law.height_over_surface(height, by_pressure, row[7:8], useful, over, shift)
+        rises = k % 10 == 0
+        rate, over = jnp.where(rises, (risen - height) / 0.01, rate), jnp.where(rises, above, over)
+        height = jnp.where(rises, risen, height)
+        return (quat, integral, climb, height, rate, over), jnp.concatenate([quat, height, rate])
+
+    zero = jnp.zeros(1)
+    start = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.zeros(3), zero, inputs[0, 6:7], zero, zero
+    run = jax.jit(lambda start, x: jax.lax.scan(tick, start, (jnp.arange(len(x)), x))[1])
+    return np.asarray(run(start, inputs))[19::20], recorded
+
+
+def of_filters() -> Iterable[Row]:
+    """Yield the largest differences of states from those of the compiled firmware."""
+    for kind in KINDS:
+        found, recorded = kalman(kind)
+        difference = np.abs(found - recorded)
+        # rounding of float32, which 4,000 loops add up
+        yield Row(f"Kalman filter, {kind}: position, velocity, attitude error", "compiled C, 4 s",
+                  float(difference[:, :9].max()), "m, m/s, rad", (0, 2e-4))  # fmt: skip
+        yield Row(f"Kalman filter, {kind}: quaternion", "compiled C, 4 s",
+                  float(difference[:, 9:13].max()), "", (0, 5e-6))  # fmt: skip
+        relative = difference[:, 13:] / (1e-5 + np.abs(recorded[:, 13:]))
+        yield Row(f"Kalman filter, {kind}: covariance", "compiled C, 4 s", float(relative.max()), "",
+                  (0, 5e-3))  # fmt: skip
+    for kind in ("pressure", "ground"):
+        found, recorded = complementary(kind)
+        yield Row(f"complementary filter, {kind}: quaternion, height in m", "compiled C, 2 s",
+                  float(np.abs(found - recorded)[:, :5].max()), "", (0, 5e-6))  # fmt: skip

@@ -1,0 +1,77 @@
+"""Real flights: open-loop prediction and closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from numpy.typing import NDArray
+
+from crazysim.drones import load_airframe
+from crazysim.errors import ConfigError
+from crazysim.lab.identify import Model, aligned, fast_rotation, prediction_errors, read_log
+from crazysim.lab.identify.prediction import HORIZONS
+from crazysim.lab.validate.closed_loop import compare, laboratory, read_flight
+from crazysim.lab.validate.rows import Row
+
+PUBLISHED = {
+    "position": {"rigid body at constant body rates": (0.0126, 0.1269), "hybrid model": (0.0166, 0.1119)},
+    "attitude": {"rigid body at constant body rates": (1.175, 14.58), "hybrid model": (2.154, 13.21)},
+}
+"""Mean errors over the melon flights after 0.1 and 0.5 s, m and degrees, of IDSIA's rigid body and of its learned model
+with the least error of position: rows Physics and Hybrid of the last table in ``results/model_comparison.ipynb``,
+repository idsia-robotics/nanodrone-sysid-benchmark at commit 2d921b5; angles there in rad."""
+MASS = 0.045
+"""Mass of IDSIA's drone, kg."""
+
+
+def logs(folder: Path, pattern: str) -> list[Path]:
+    """Return the logs of a folder, ``.npz`` and ``.csv``, sorted.
+
+    Raises:
+        ConfigError: If there are none.
+    """
+    found = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
+    if not found:
+        raise ConfigError(
+            f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/validation.md has them."
+        )
+    return found
+
+
+def open_loop(folder: Path) -> Iterable[Row]:
+    """Yield mean errors of predictions of melon from measured rotor speeds, over ``HORIZONS``, and published ones."""
+    path = logs(folder, "melon*")[0]
+    log = read_log(path)
+    found: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
+    errors: dict[str, NDArray] = {}
+    for name in ("cf21B_500", "cf21B_500_idsia"):
+        model = Model.create(load_airframe(name), MASS)
+        flight = aligned(log, fast_rotation([log], model.params).delays[0])
+        errors = prediction_errors([flight], model)
+        errors = {key.removesuffix(" (mean)"): x for key, x in errors.items() if key.endswith("(mean)")}
+        found["position"][f"`{name}`"] = errors["position"]
+        found["position"][f"`{name}` at constant body rates"] = errors["position at constant body rates"]
+        found["attitude"][f"`{name}`"] = errors["attitude"]
+    found["position"]["constant velocity"] = errors["position at constant velocity"]
+    found["attitude"]["constant body rates"] = errors["attitude at constant body rates"]
+    found["attitude"]["unchanged"] = errors["attitude unchanged"]
+    for what, unit in (("position", "m"), ("attitude", "degrees")):
+        known = {f"published {name}": figures for name, figures in PUBLISHED[what].items()}
+        for series, figures in (found[what] | known).items():
+            at, of = ((0.1, 0.5), "three melon flights") if series in known else (HORIZONS, path.stem)
+            for h, figure in zip(at, figures, strict=True):
+                label = f"{what}, {series}, after {h:g} s"
+                yield Row(label, of, float(figure), unit, series=series.replace("`", ""), at=h)
+
+
+def closed_loop(folder: Path) -> Iterable[Row]:
+    """Yield simulated over logged tracking errors, flight by flight."""
+    paths = [path for name in ("circle", "figure8", "trefoil") for path in logs(folder, f"*{name}*")]
+    for row in compare([read_flight(path) for path in paths], estimator=laboratory()):
+        other = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"
+        if row.failed:
+            yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, other=other)
+            continue
+        kind = " ".join(part for part in row.name.split("_")[1:] if not part.startswith("rep"))
+        yield Row(row.name, "its log", row.ratio, "", (0.7, 1.4), other, series="one flight", at=kind)

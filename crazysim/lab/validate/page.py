@@ -1,0 +1,94 @@
+"""The page of comparisons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from crazysim.lab.validate.rows import Row, Section
+
+INTRODUCTION = """
+# Validation
+
+Comparisons of crazysim with closed forms, other simulators, the Crazyflie's firmware and real flights. Rows with bad
+figures stay. This page is written, in a checkout of the sources, by
+
+```sh
+pip install -e {packages}
+crazysim validate --data FOLDER --out docs/validation.md
+```
+
+and each section names the command that repeats it, which writes `validation.md`. Sections whose package is not
+installed are left out. In Python `crazysim.lab.validate.validate(only=["mujoco"])` returns the rows.
+
+FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim:
+
+- `idsia/melon_20251017_run1.csv` is a flight of IDSIA's benchmark (arXiv 2512.14450) as it was recorded. In a clone of
+  [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark), with pandas and pyarrow,
+
+    ```sh
+    git checkout b0cf4b3
+    python -c "import pandas
+    log = pandas.read_parquet('control_engineering_practice/data/real/new/parquets/melon_20251017_run1.parquet')
+    log[250:6750].to_csv('melon_20251017_run1.csv', index=False)"
+    ```
+
+    writes it. Figures of this page are of the same samples rounded to float32, and differ by up to 2%.
+- `nanobench/` holds the logs of NanoBench (arXiv 2603.09908) that the rows name, from `datasets/dataset` of
+  [its repository](https://github.com/syediu/nanobench-iros2026) at commit d45bc5a. More of its logs make more rows.
+
+A figure passes if it is within the range in its row; rows without a range report what was found.
+"""
+"""Beginning of the page."""
+COLUMNS: Mapping[str, Callable[[Row], str]] = {
+    "Quantity": lambda row: row.what,
+    "Reference": lambda row: row.against,
+    "Figure": lambda row: f"**{row.text}**" if row.failed else row.text,
+    "Passes": lambda row: bound_text(row.bound),
+    "For comparison": lambda row: row.other,
+}
+"""Cells of a row by the heading of their column."""
+
+
+def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: Mapping[str, str]) -> str:
+    """Return the page in Markdown.
+
+    Args:
+        sections: Sections, in the order of the page.
+        rows: Their rows.
+        made: Sentence with date, commit, machine and versions.
+        pictures: Paths of pictures, relative to the page, by the name of the section.
+    """
+    bounded = [row for row in rows if row.bound is not None or row.problem]
+    bad = [row for row in bounded if row.failed]
+    summary = f" {len(bounded) - len(bad)} of {len(bounded)} figures with a range are within it." if bounded else ""
+    if bad:
+        summary += " Outside: " + "; ".join(row.what for row in bad) + "."
+    packages = dict.fromkeys(name for section in sections for name in section.packages.values())
+    parts = [INTRODUCTION.format(packages=" ".join(['".[demo]"', *packages])).strip(), made + summary]
+    for section in sections:
+        repeat = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.logs}`"
+        if section.packages:
+            repeat = f"`pip install {' '.join(section.packages.values())}` and {repeat}"
+        parts += [f"## {section.title}", section.text, f"Repeat: {repeat}."]
+        if section.missing:
+            parts.append(f"Not measured: {section.missing}.")
+            continue
+        if section.name in pictures:
+            parts.append(f"![{section.axes[1]}]({pictures[section.name]})")
+        own = [row for row in rows if row.section == section.name]
+        cells = {name: [cell(row) for row in own] for name, cell in COLUMNS.items()}
+        cells = {name: column for name, column in cells.items() if any(column)}
+        lines = [list(cells), ["---"] * len(cells), *zip(*cells.values(), strict=True)]
+        parts.append("\n".join(f"| {' | '.join(line)} |".replace("  ", " ") for line in lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def bound_text(bound: tuple[float, float] | None) -> str:
+    """Return the bound in words, or an empty text."""
+    if bound is None:
+        return ""
+    low, high = bound
+    if low <= 0:
+        return f"at most {high:.2g}"
+    return f"at least {low:.3g}" if high == math.inf else f"{low:.3g} to {high:.3g}"

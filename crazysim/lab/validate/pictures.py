@@ -1,0 +1,63 @@
+"""Pictures of comparisons."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from crazysim.errors import not_installed
+from crazysim.lab.validate.rows import Row, Section
+from crazysim.storage import replacing
+
+
+def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
+    """Write a picture of the rows with a series, one panel for each unit.
+
+    Numbers along the horizontal axis make lines over it, with a logarithmic axis of errors; names make groups of
+    points, with the range of figures that pass.
+
+    Args:
+        section: Section with labels of the axes.
+        rows: Rows of that section.
+        path: File to write, ``.png``.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(not_installed("pictures need", "matplotlib", "demo")) from error
+    from PIL import Image
+
+    rows = [row for row in rows if row.series and not row.problem]
+    units = list(dict.fromkeys(row.unit for row in rows))
+    colours = {series: f"C{k}" for k, series in enumerate(dict.fromkeys(row.series for row in rows))}
+    named = isinstance(rows[0].at, str)
+    figure = Figure(figsize=(9, 4 if named else 4.8), layout="constrained")
+    for axis, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
+        own = [row for row in rows if row.unit == unit]
+        places = list(dict.fromkeys(row.at for row in own))
+        for series in dict.fromkeys(row.series for row in own):
+            points = [(places.index(row.at) if named else row.at, row.figure) for row in own if row.series == series]
+            line = "" if named else "--" if series.startswith("published") else "-"
+            style = {"marker": "o", "linestyle": line, "markersize": 4, "linewidth": 1.2}
+            axis.plot(*zip(*points, strict=True), label=series, color=colours[series], **style)
+        if named:
+            axis.set_xticks(range(len(places)), places, rotation=90 if len(places) > 12 else 20, fontsize=7)
+            low, high = next(row.bound for row in own if row.bound is not None)
+            axis.axhspan(max(low, 0), high, color="0.93", zorder=0, label="passes")
+            axis.legend(fontsize=7)
+        else:
+            axis.set(yscale="log", xticks=places, xticklabels=[f"{place:g}" for place in places])
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+            axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15))
+        axis.set(xlabel=section.axes[0], ylabel=f"{section.axes[1]}, {unit}".removesuffix(", "))
+        axis.grid(alpha=0.3)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=110)
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path) as file:
+        Image.open(buffer).convert("RGB").quantize(64).save(file, format="PNG", optimize=True)

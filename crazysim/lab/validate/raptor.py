@@ -1,0 +1,269 @@
+"""Flights of the foundation policy RAPTOR with late commands, here and in the simulator that it was trained in.
+
+The policy (Eschmann, Albani and Loianno, arXiv 2509.11481; package ``foundation-policy``) commands rotor speeds from
+position, rotation matrix, velocity, body rates and its previous action.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from crazysim import rotation
+from crazysim.drones import load_airframe
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.lab.validate.closed_forms import with_states
+from crazysim.lab.validate.rows import Row
+from crazysim.plugins.effects import Latency
+from crazysim.sim.sim import Sim
+
+AIRFRAMES = ("cf21B_500", "cf2x_L250", "crazyflie", "bumblebee")
+"""Airframes that RAPTOR flies."""
+STEP = 2
+"""Step of both simulators, ms."""
+PERIODS = (10, STEP)
+"""Times between two calls of the policy, ms: that of its training, and one as on flight controllers.
+
+The authors' firmware calls it every 2.5 ms on PX4, 1 ms on the Crazyflie and 0.5 ms on Betaflight.
+"""
+SECONDS = 10
+"""Duration of a flight, s."""
+STARTS = 20
+"""Starts of each airframe at each latency."""
+DELAYS = (0, 2, 4, 6, 8, 10, 12)
+"""Latencies of the commands, ms."""
+
+
+class Pilot:
+    """RAPTOR for a batch of drones, called as the authors' firmware calls it.
+
+    Its recurrent state advances every 10 ms, as in training, and calls in between leave it unchanged; the previous
+    action that it observes is the mean since the last advance (rl-tools, ``inference/executor`` and
+    ``inference/applications/l2f``).
+
+    Args:
+        period: Time between two calls, ms.
+        action: Action before the first call, from -1 to 1. (n, 4)
+    """
+
+    def __init__(self, period: int, action: np.ndarray) -> None:
+        self._policy = importlib.import_module("foundation_policy").Raptor()
+        self._policy.reset()
+        self._memory = next(layer for layer in self._policy.layers if hasattr(layer, "state"))
+        self._calls, self._made = 10 // period, 0
+        self._mean = self._action = action
+
+    def action(self, state: np.ndarray) -> np.ndarray:
+        """Return the commanded speeds from -1, the least, to 1, the largest. (n, 4)
+
+        Args:
+            state: Position from the goal, m, rotation matrix, row by row, velocity, m/s, and angular velocity, body
+                frame, rad/s. (n, 18)
+        """
+        weight = (self._made - 1) % self._calls
+        self._mean = (weight * self._mean + self._action) / (weight + 1)
+        kept = self._memory.state
+        self._action = self._policy.evaluate_step(np.concatenate([state, self._mean], axis=-1))
+        if self._made % self._calls:
+            self._memory.state = kept
+        self._made += 1
+        return self._action
+
+
+def held(pilot: Pilot, period: int, observe: Callable[[], np.ndarray], fly: Callable[[np.ndarray], None]) -> np.ndarray:
+    """Return which drones stay within 0.3 m of their goal in the last second of a flight. (n,)
+
+    Args:
+        pilot: Policy.
+        period: Time between two calls, ms.
+        observe: Function that returns the state as `Pilot.action` takes it.
+        fly: Function that flies for the period with an action.
+    """
+    away: Any = 0.0
+    for time in range(0, 1000 * SECONDS, period):
+        state = observe()
+        if time >= 1000 * (SECONDS - 1):
+            away = np.maximum(away, np.linalg.norm(state[:, :3], axis=-1))
+        fly(pilot.action(state))
+    return away < 0.3  # a NaN is not held
+
+
+def held_here(sim: Sim, top: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int) -> np.ndarray:
+    """Return which drones of a simulation, one a world, RAPTOR holds. (n_worlds,)
+
+    Args:
+        sim: Simulation with rotor commands, whose drones start within 0.5 m of the goal along each axis.
+        top: Largest rotor speed, rpm. (n_worlds, 1) or ()
+        action: Action before the first, at whose speeds the rotors turn. (n_worlds, 4)
+        delay: Delay of the commands, steps. (n_worlds, 1) or ()
+        period: Time between two calls of the policy, ms.
+    """
+    n, goal = sim.n_worlds, np.array([0, 0, 3.0])
+    start = np.random.default_rng(0).uniform(-0.5, 0.5, (STARTS, 1, 3))
+
+    def speeds(action: np.ndarray) -> np.ndarray:
+        return np.asarray(top * (action + 1) / 2, np.float32)[:, None]
+
+    def observe() -> np.ndarray:
+        s = sim.data.states
+        parts = (s.pos, rotation.matrix(s.quat), s.vel, s.ang_vel)
+        pos, *others = (np.asarray(x, np.float64).reshape(n, -1) for x in parts)
+        return np.concatenate([pos - goal, *others], axis=-1)
+
+    def fly(action: np.ndarray) -> None:
+        sim.rotor_vel_control(speeds(action))
+        sim.step(period // STEP)
+
+    sim.data = with_states(sim.data, pos=np.resize(start, (n, 1, 3)) + goal, rotor_vel=speeds(action))
+    sim.rotor_vel_control(speeds(action))
+    sim.add(Latency(delay))
+    return held(Pilot(period, action), period, observe, fly)
+
+
+def of_airframes() -> Iterable[Row]:
+    """Yield the longest latency at which RAPTOR holds all drones of an airframe."""
+    for drone in AIRFRAMES:
+        top = load_airframe(drone).rotor_vel_limits[1].max()
+        for period in PERIODS:
+            sim = Sim(STARTS * len(DELAYS), drone=drone, control="rotor_vel", integrator="rk4")
+            delay = np.repeat(np.array(DELAYS) // STEP, STARTS)[:, None]
+            shares = held_here(sim, top, np.zeros((sim.n_worlds, 4)), delay, period)
+            shares = 100 * np.mean(shares.reshape(-1, STARTS), axis=-1)
+            whole = int(np.argmin(np.append(shares == 100, False)))
+            listed = ", ".join(f"{share:.0f}" for share in shares)
+            yield Row(f"`{drone}`, called every {period} ms: longest latency with all drones held",
+                      f"{STARTS} starts within 0.5 m", DELAYS[max(whole - 1, 0)], "ms",
+                      None, f"held with 0 to 12 ms, in steps of 2: {listed} %")  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Quadrotors:
+    """Quadrotors whose thrust is proportional to the square of the rotor speed."""
+
+    mass: np.ndarray
+    """Mass, kg. (n,)"""
+    thrust: np.ndarray
+    """Largest thrust of a rotor, N. (n,)"""
+    arm: np.ndarray
+    """Distance of each rotor from both axes, m. (n,)"""
+    inertia: np.ndarray
+    """Moments of inertia, kg m^2. (n, 3)"""
+    lag: np.ndarray
+    """Time constants of rising and of falling rotor speeds, s. (n, 2)"""
+    torque: np.ndarray
+    """Drag torque of a rotor per thrust, m. (n,)"""
+
+    @staticmethod
+    def sample(n: int = 256) -> Quadrotors:
+        """Return quadrotors of the ranges that RAPTOR was trained on.
+
+        rl-tools at commit e43ae4bc, ``src/foundation_policy/pre_training/sample_dynamics_parameters.cpp``, about the
+        Crazyflie of ``rl/environments/l2f/parameters/dynamics/crazyflie.h``.
+        """
+        draw = np.random.default_rng(0).uniform
+        mass = draw(0.02 ** (1 / 3), 5 ** (1 / 3), n) ** 3
+        thrust = draw(1.5, 5, n) * mass * GRAVITY_MAGNITUDE / 4
+        arm = 0.028 * np.cbrt(mass / 0.0306) * draw(0.9, 1.1, n)
+        inertia = np.sqrt(2) * arm * thrust / draw(40, 1200, n)
+        ratio = np.array([9.416556729130406e-06, 9.644051701582312e-06, 1.745951732253285e-05]) / 9.416556729130406e-06
+        lag = np.stack([draw(0.03, 0.1, n), draw(0.03, 0.3, n)], axis=-1)
+        return Quadrotors(mass, thrust, arm, inertia[:, None] * ratio, lag, draw(0.005, 0.05, n))
+
+    @property
+    def hover(self) -> np.ndarray:
+        """Action, from -1 to 1, of rotors that carry the weight. (n, 4)"""
+        return np.repeat((2 * np.sqrt(self.mass * GRAVITY_MAGNITUDE / (4 * self.thrust)) - 1)[:, None], 4, axis=1)
+
+
+def trained_here(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
+    """Return which quadrotors RAPTOR holds in crazysim. (n,)
+
+    Args:
+        quadrotors: Quadrotors, one a world.
+        delay: Delay of the commands, steps.
+        period: Time between two calls of the policy, ms.
+    """
+    q, n, top = quadrotors, len(quadrotors.mass), 20_000.0
+    sim = Sim(n, drone="cf21B_500", control="rotor_vel", integrator="rk4")
+    params, world = sim.data.params, (n, 1)
+    square = np.zeros((n, 1, 1, 3))
+    square[..., 2] = (q.thrust / top**2)[:, None, None]
+    inertia = np.eye(3) * q.inertia[:, None, None]
+    lag = np.zeros((n, 1, 1, 4))
+    lag[..., ::2] = 1 / q.lag[:, None, None]
+    changes = {
+        "mass": q.mass.reshape(*world, 1), "L": q.arm.reshape(*world, 1), "J": inertia, "J_inv": np.linalg.inv(inertia),
+        "rpm2thrust": square, "rpm2torque": square * q.torque[:, None, None, None], "rotor_dyn_coef": lag,
+        "drag_matrix": np.zeros((3, 3)), "prop_inertia": np.zeros(1), "rotor_vel_min": np.zeros(1),
+        "rotor_vel_max": np.full(1, top),
+    }  # fmt: skip
+    sim.data = sim.data.replace(params=params.replace(**{k: np.asarray(x, np.float32) for k, x in changes.items()}))
+    return held_here(sim, np.asarray(top), q.hover, delay, period)
+
+
+def trained_there(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
+    """Return which quadrotors RAPTOR holds in l2f, the simulator of its training. (n,)
+
+    Args:
+        quadrotors: As many quadrotors as one of l2f's batches has.
+        delay: Delay of the commands, steps.
+        period: Time between two calls of the policy, ms.
+    """
+    q, n = quadrotors, len(quadrotors.mass)
+    l2f: Any = importlib.import_module("l2f")
+    batch = l2f.vector_selector[n]
+    device, rng, world = l2f.Device(), batch.VectorRng(), batch.VectorEnvironment()
+    parameters, state, later = batch.VectorParameters(), batch.VectorState(), batch.VectorState()
+    batch.initialize_rng(device, rng, 0)
+    batch.initialize_environment(device, world)
+    batch.initial_parameters(device, world, parameters)
+    batch.initial_state(device, world, parameters, state)
+    start = np.resize(np.random.default_rng(0).uniform(-0.5, 0.5, (STARTS, 3)), (n, 3))
+    for i in range(n):
+        one = json.loads(l2f.parameters_to_json(device, world.environments[i], parameters.parameters[i]))
+        one["integration"]["dt"] = STEP / 1000
+        signs = np.sign(one["dynamics"]["rotor_positions"])
+        own = {
+            "mass": q.mass[i], "rotor_positions": q.arm[i] * signs, "J": np.diag(q.inertia[i]),
+            "J_inv": np.diag(1 / q.inertia[i]), "rotor_thrust_coefficients": np.tile([0, 0, q.thrust[i]], (4, 1)),
+            "rotor_torque_constants": np.full(4, q.torque[i]), "rotor_time_constants_rising": np.full(4, q.lag[i, 0]),
+            "rotor_time_constants_falling": np.full(4, q.lag[i, 1]),
+        }  # fmt: skip
+        one["dynamics"] |= {name: np.asarray(value).tolist() for name, value in own.items()}
+        l2f.parameters_from_json(device, world.environments[i], json.dumps(one), parameters.parameters[i])
+        drone = state.states[i]
+        drone.position, drone.orientation, drone.rpm = start[i].tolist(), [1, 0, 0, 0], ((q.hover[i] + 1) / 2).tolist()
+        drone.linear_velocity = drone.angular_velocity = [0, 0, 0]
+    seen = np.zeros((n, world.OBSERVATION_DIM), np.float32)
+    sent = [q.hover] * delay
+
+    def observe() -> np.ndarray:
+        batch.observe(device, world, parameters, state, seen, rng)
+        return seen[:, :18].astype(np.float64)
+
+    def fly(action: np.ndarray) -> None:
+        for _ in range(period // STEP):
+            sent.append(action)
+            batch.step(device, world, parameters, state, sent.pop(0).astype(np.float32), later, rng)
+            state.assign(later)
+
+    return held(Pilot(period, q.hover), period, observe, fly)
+
+
+def of_trained() -> Iterable[Row]:
+    """Yield by how much the shares of held quadrotors of its training differ here and in the simulator of it."""
+    quadrotors = Quadrotors.sample()
+    for period in PERIODS:
+        for delay in (0, 2, 6, 10):
+            here, there = (
+                100 * np.mean(fly(quadrotors, delay // STEP, period)) for fly in (trained_here, trained_there)
+            )
+            # rounding decides over quadrotors at the edge of stability: 5 of 256 are 2 points
+            yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim beside l2f",
+                      "256 quadrotors of the training", float(abs(here - there)), "points", (0, 2),
+                      f"{here:.1f} % here, {there:.1f} % in l2f")  # fmt: skip

@@ -1,0 +1,175 @@
+"""Wrenches and flights of RotorPy's Crazyflie 2.0 at the same rotor speeds."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from crazysim.core.plugin import Plugin
+from crazysim.core.stage import stage
+from crazysim.drones.airframe import GRAVITY_MAGNITUDE
+from crazysim.dynamics.rotor import RPM_TO_RAD_S
+from crazysim.lab.validate.closed_forms import angle_between, state_of, with_states
+from crazysim.lab.validate.rows import Row
+from crazysim.plugins.effects import RotorAerodynamics, Wind
+from crazysim.sim.sim import Sim
+
+FREQ, PERIOD = 1000, 0.1
+"""Steps of our flights per second, Hz, and time between two commands, s."""
+WIND = np.array([3.0, -1.0, 0.5])
+"""Wind of the flights in moving air, world frame, m/s."""
+START = {"pos": np.array([0.0, 0.0, 50.0]), "vel": np.array([0.5, -0.3, 0.2]), "ang_vel": np.array([0.2, -0.1, 0.3])}
+"""States at the start, m, m/s, rad/s."""
+
+States = list[dict[str, NDArray]]
+"""States at several times, by the names of ours."""
+
+
+def hover_speed(params: dict[str, Any]) -> float:
+    """Return the rotor speed of hover, rad/s."""
+    return math.sqrt(params["mass"] * GRAVITY_MAGNITUDE / (params["num_rotors"] * params["k_eta"]))
+
+
+def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> Sim:
+    """Return a simulation of an airframe with RotorPy's parameters.
+
+    Args:
+        params: RotorPy's parameters of a multirotor without parasitic drag and translational lift.
+        n_worlds: Number of worlds.
+        drag: True for a linear drag of the size that the drag of the rotors has in hover, False for none.
+    """
+    hubs, rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
+    linear = -len(hubs) * hover_speed(params) * np.array([params["k_d"], params["k_d"], params["k_z"]])
+    rotors = {
+        "position": hubs,
+        "yaw_torque_sign": params["rotor_directions"],
+        "thrust_curve": [0.0, 0.0, params["k_eta"] * RPM_TO_RAD_S**2],
+        "torque_curve": [0.0, 0.0, params["k_m"] * RPM_TO_RAD_S**2],
+        "lag": [rate, 0.0, rate, 0.0],
+        "thrust_max": params["k_eta"] * params["rotor_speed_max"] ** 2,
+    }
+    tables: dict[str, Any] = {"base": "cf2x_L250", "rigid_body": {"mass": params["mass"]}, "rotors": rotors}
+    tables["drag"] = {"coefficients": linear * drag}
+    sim = Sim(n_worlds, drone=tables, control="rotor_vel", integrator="rk4", freq=FREQ)
+    p, inertia = sim.data.params, np.diag([params["Ixx"], params["Iyy"], params["Izz"]])
+    # As parameters: in an airframe they are a warning, since the largest moment exceeds the sum of the others.
+    changes = {"J": inertia, "J_inv": np.linalg.inv(inertia), "prop_inertia": np.zeros_like(p.prop_inertia)}
+    sim.data = sim.data.replace(params=p.replace(**{k: np.asarray(x, p.J.dtype) for k, x in changes.items()}))
+    return sim
+
+
+def moving_air(params: dict[str, Any]) -> RotorAerodynamics:
+    """Return the effect with the coefficients of RotorPy's rotors."""
+    return RotorAerodynamics(drag=params["k_d"], inflow=params["k_z"], hub_height=0.0)
+
+
+def flight(params: dict[str, Any], commands: NDArray, effects: Sequence[Plugin] = (), drag: bool = False) -> States:
+    """Return our states after each command.
+
+    Args:
+        params: Parameters.
+        commands: Speeds of the rotors, rad/s. (n, 4)
+        effects: Effects of the air.
+        drag: See ``simulation``.
+    """
+    sim = simulation(params, drag=drag)
+    for effect in effects:
+        sim.add(effect)
+    sim.data = with_states(sim.data, **START, rotor_vel=np.full(4, hover_speed(params) / RPM_TO_RAD_S))
+    states = []
+    for command in commands:
+        sim.rotor_vel_control(command[None, None] / RPM_TO_RAD_S)
+        sim.step(round(PERIOD * FREQ))
+        states.append(state_of(sim))
+    return states
+
+
+def flight_of_rotorpy(params: dict[str, Any], commands: NDArray, aero: bool = False) -> States:
+    """Return RotorPy's states after each command, in our names and units; with ``aero`` in ``WIND``."""
+    multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
+    drone = multirotor(params, aero=aero, integrator_kwargs={"rtol": 1e-10, "atol": 1e-12})
+    state = {"x": START["pos"], "v": START["vel"], "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": START["ang_vel"]}
+    state |= {"wind": WIND * aero, "rotor_speeds": np.full(4, hover_speed(params))}
+    states = []
+    for command in commands:
+        state = drone.step(state, {"cmd_motor_speeds": command}, PERIOD)
+        names = {"pos": "x", "vel": "v", "quat": "q", "ang_vel": "w", "rotor_vel": "rotor_speeds"}
+        states.append({ours: np.asarray(state[name]) for ours, name in names.items()})
+        states[-1]["rotor_vel"] = states[-1]["rotor_vel"] / RPM_TO_RAD_S
+    return states
+
+
+def differences(one: dict[str, NDArray], other: dict[str, NDArray]) -> dict[str, float]:
+    """Return the differences of two states: of ``quat`` the angle, degrees, of others the length."""
+    found = {name: float(np.linalg.norm(one[name] - other[name])) for name in one}
+    return found | {"quat": math.degrees(angle_between(one["quat"], other["quat"]))}
+
+
+def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArray, NDArray]:
+    """Return what forces of the air add to the thrusts and torques of rotors in ``n`` states, ours and RotorPy's.
+
+    Args:
+        params: Parameters.
+        speed: Largest velocity along each axis, m/s. Body rates reach 3 rad/s, rotor speeds 10% from hover.
+        n: Number of states.
+
+    Returns:
+        Force, N, and torque, N m, body frame. (n, 6)
+    """
+    rng = np.random.default_rng(1)
+    vel, rate = rng.uniform(-speed, speed, (n, 3)), rng.uniform(-3, 3, (n, 3))
+    speeds = hover_speed(params) * rng.uniform(0.9, 1.1, (n, 4))
+    sim = simulation(params, n)
+    plugin = sim.add(moving_air(params))
+    moving = with_states(sim.data, vel=vel[:, None], ang_vel=rate[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S)
+    s = stage("drone")(plugin.influence)(moving).states
+    drag = vel @ np.asarray(sim.data.params.drag_matrix).reshape(3, 3)
+    ours = np.concatenate([np.asarray(s.force)[:, 0] + drag, np.asarray(s.torque)[:, 0]], axis=-1)
+    multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
+    with_air, without = multirotor(params), multirotor(params, aero=False)
+    theirs = [
+        np.concatenate(with_air.compute_body_wrench(*x)) - np.concatenate(without.compute_body_wrench(*x))
+        for x in zip(rate, speeds, vel, strict=True)
+    ]
+    return ours, np.stack(theirs)
+
+
+def of_rotorpy() -> Iterable[Row]:
+    """Yield differences of flights under the same commands of the rotors, and of wrenches in moving air."""
+    params = importlib.import_module("rotorpy.vehicles.crazyflie_params").quad_params
+    commands = hover_speed(params) * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (20, 4)))
+    with jax.enable_x64(True):
+        ours, theirs = flight(params, commands[:10]), flight_of_rotorpy(params, commands[:10])
+        apart = differences(ours[-1], theirs[-1])
+        drag_only = flight(params, commands, [Wind(WIND)], drag=True)
+        ours = flight(params, commands, [Wind(WIND), moving_air(params)], drag=True)
+        theirs = flight_of_rotorpy(params, commands, aero=True)
+        slow, fast = (wrenches(params, speed) for speed in (0.1, 3.0))
+    # RotorPy's integrator keeps 1e-10 of each state in each of some 100 steps
+    for name, what, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
+                                    ("ang_vel", "angular velocity", "rad/s", 1e-8),
+                                    ("rotor_vel", "rotor speeds", "rpm", 1e-4)):  # fmt: skip
+        yield Row(f"flight without air, 1 s: {what}", "RotorPy", apart[name], unit, (0, bound))
+    mine, known = fast
+    for what, at, unit in (("force across the rotors", [0, 1], "N"), ("yaw torque", [5], "N m")):
+        size = f"RotorPy: up to {np.abs(known[:, at]).max():.2g} {unit}"
+        yield Row(
+            f"air at up to 3 m/s: {what}", "RotorPy", float(np.abs(mine - known)[:, at].max()), unit, (0, 1e-15), size
+        )
+    for speed, (mine, known) in ((0.1, slow), (3.0, fast)):
+        for what, at, unit in (("force along the rotors", [2], "N"), ("roll and pitch torque", [3, 4], "N m")):
+            size = f"RotorPy: up to {np.abs(known[:, at]).max():.2g} {unit}"
+            apart_at = float(np.abs(mine - known)[:, at].max())
+            yield Row(f"air at up to {speed:g} m/s: {what}", "RotorPy", apart_at, unit, None, size)
+    for seconds in (1, 2):
+        k = round(seconds / PERIOD) - 1
+        apart, simple = differences(ours[k], theirs[k]), differences(drag_only[k], theirs[k])
+        for name, what, unit in (("pos", "position", "m"), ("quat", "attitude", "degrees")):
+            other = f"linear drag alone: {simple[name]:.3g} {unit}"
+            yield Row(f"flight in wind, {seconds} s: {what}", "RotorPy", apart[name], unit, None, other)

@@ -1,0 +1,139 @@
+"""The sections of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from crazysim.lab.validate import (
+    closed_forms,
+    commonroad_cars,
+    firmware_controllers,
+    firmware_filters,
+    flights,
+    logged_filter,
+    peers,
+    raptor,
+    rotorpy_flights,
+)
+from crazysim.lab.validate.rows import Section
+
+NAMES = (
+    "closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "raptor",
+    "l2f",
+)  # fmt: skip
+"""Names of the sections."""
+RAPTOR = {"foundation_policy": "foundation-policy==1.0.2"}
+"""Package of the foundation policy."""
+
+
+def sections(data: Path | None = None) -> Sequence[Section]:
+    """Return the sections of the page.
+
+    Args:
+        data: Folder with logs in ``idsia`` and ``nanobench``; None for none.
+    """
+    idsia, nanobench = ((data or Path()) / name for name in ("idsia", "nanobench"))
+
+    def absent(folder: Path) -> str:
+        if data is None:
+            return "give `--data FOLDER`"
+        return "" if folder.is_dir() else f"FOLDER has no folder {folder.name}"
+
+    return (
+        Section(
+            "closed", "Closed forms and orders", "In float64, at 500 Hz.", closed_forms.CHECKS,
+        ),
+        Section(
+            "mujoco", "C MuJoCo", "In float64, steps of 1 ms.", (peers.of_mujoco,),
+        ),
+        Section(
+            "firmware", "The Crazyflie's firmware",
+            "Recorded outputs of its compiled C sources, on the same inputs, in float32; the recordings are in "
+            "tests/control and tests/plugins/estimators of a checkout. Figures are the largest differences: of motors "
+            "in 8 flights, where full thrust is 65,535, and of filters over whole flights, in which rounding adds up. "
+            "Those of the Kalman filter last 4 s, with up to 5.4 m/s and tilts of up to 62 degrees, except on the "
+            "ground; `flow` has no other sensor, `range` has flow and time of flight. Differences of covariances are "
+            "relative to their size plus 1e-5.",
+            (firmware_controllers.of_controllers, firmware_filters.of_filters),
+            absent="" if firmware_controllers.VECTORS.is_dir() else "run it in a checkout of the sources",
+        ),
+        Section(
+            "crazyflow", "Crazyflow", "In float32, Crazyflow's controllers in both programs.", (peers.of_crazyflow,),
+            packages={"crazyflow": "crazyflow==0.4.0"},
+        ),
+        Section(
+            "rotorpy", "RotorPy",
+            "RotorPy's Crazyflie 2.0, in float64, with commands of the rotors within 2% of hover that change every 0.1 "
+            "s. In moving air ours has `RotorAerodynamics` with RotorPy's coefficients. Forces across the rotors are "
+            "the same. Along them RotorPy's thrust falls linearly with the velocity, and ours follows momentum theory, "
+            "with the lift of forward flight. The wind is (3, -1, 0.5) m/s.",
+            (rotorpy_flights.of_rotorpy,), packages={"rotorpy": "rotorpy==3.0.0"},
+        ),
+        Section(
+            "commonroad", "CommonRoad",
+            "The single-track car of CommonRoad's vehicle models, in float64: `commonroad_single_track` has the same "
+            "equations above 0.5 m/s (slower, CommonRoad's model becomes kinematic at 0.1 m/s). `single_track` is the "
+            "model of our cars, whose tyres have limited grip and loads that do not shift. The lane changes begin at "
+            "15 m/s.",
+            (commonroad_cars.of_commonroad,), packages={"vehiclemodels": "commonroad-vehicle-models==3.0.2"},
+        ),
+        Section(
+            "idsia", "Real flights, open loop",
+            "A Crazyflie 2.1 Brushless of 45 g predicted from its measured rotor speeds: flight melon of IDSIA's "
+            "benchmark, starts every 0.05 s, mean distances and angles. The published figures are of the same measure, "
+            "over three such flights, from `results/model_comparison.ipynb` of the benchmark's repository at commit "
+            "2d921b5. Its rigid body keeps the body rates of the start, since `models/models.py` multiplies the "
+            "angular acceleration by zero: compare it with our rows at constant body rates, where the airframe gives "
+            "the forces alone.\n\n"
+            "With its own torques `cf21B_500` loses the attitude within 0.25 s. In these flights the torque of the "
+            "rotors about x and y is, below 1 Hz, 15 to 27 times what the angular acceleration takes, 2 to 3 times "
+            "in those of squares: it balances a torque of the air that grows with the velocity, which that airframe "
+            "does not have, so that its prediction turns over. "
+            "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
+            "`cf21B_500_idsia` is off, too.",
+            (partial(flights.open_loop, idsia),), absent=absent(idsia), logs=True,
+            axes=("prediction over, s", "mean error"),
+        ),
+        Section(
+            "nanobench", "Real flights, closed loop",
+            "A Crazyflie 2.1: NanoBench. The simulated drone `cf2x_L250` follows the logged setpoints with the "
+            "firmware's controller and filter. The figure is its RMS distance from the setpoint over that of the real "
+            "drone.",
+            (partial(flights.closed_loop, nanobench),), absent=absent(nanobench), logs=True,
+            axes=("", "error of the simulation over that of the flight"),
+        ),
+        Section(
+            "filter", "Real flights, the filter",
+            "The firmware's Kalman filter, with its default deviations of motion capture (0.01 m, 0.0045 rad), on the "
+            "logged accelerometer, gyroscope and motion capture of NanoBench. The figure is its RMS error against "
+            "motion capture over that of the filter on board, whose deviations are not published. Here the attitude of "
+            "motion capture is a measurement, too. Flights more than 2 m from their setpoint are left out.\n\n"
+            "The z axis of the tracked body is off the axis of the thrust by 0.4 to 4.2 degrees, 1.1 in the median, "
+            "differently in each flight. Attitudes of motion capture are turned by this angle before they are measured "
+            "and before both filters are compared with them, which lowers the attitude error of the filter on board in "
+            "each flight, from 2.1 to 1.6 degrees in the median. The angle is that of the mean thrust over the whole "
+            "flight, which no filter in flight has: with that of the first 3 s in the air the largest ratio is 1.17.",
+            (partial(logged_filter.of_filter, nanobench),), absent=absent(nanobench), logs=True,
+            axes=("", "error over that of the filter on board"),
+        ),
+        Section(
+            "raptor", "The foundation policy RAPTOR",
+            "`foundation-policy`, unchanged, commands rotors. It is called every 10 ms, as in its training, or "
+            "every 2 ms, with a recurrent state that advances every 10 ms; the authors' firmware calls it every 0.5 to "
+            "2.5 ms. A drone is held if it stays within 0.3 m of its goal from 9 to 10 s. Method of Runge-Kutta of "
+            "order 4, steps of 2 ms. The latency is added to the lag of the motors. The policy was trained without "
+            "latency, on thrusts of 1.5 to 5 weights and time constants of rising rotor speeds of 30 to 100 ms. Only "
+            "`cf21B_500` is within these ranges: `cf2x_L250` has 1.49 weights and 136 ms, `crazyflie` 20 ms, "
+            "`bumblebee` 10.1 weights.",
+            (raptor.of_airframes,), packages=RAPTOR,
+        ),
+        Section(
+            "l2f", "l2f, the simulator of RAPTOR's training",
+            "RAPTOR flies the same 256 quadrotors, drawn from the ranges of its training, in crazysim and in `l2f`, "
+            "with methods of Runge-Kutta of order 4 and steps of 2 ms in both. The figure is the difference of "
+            "the shares that it holds; latency costs as many quadrotors in the one as in the other.",
+            (raptor.of_trained,), packages=RAPTOR | {"l2f": "l2f==2.0.18"},
+        ),
+    )  # fmt: skip

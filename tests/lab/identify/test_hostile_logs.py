@@ -1,0 +1,312 @@
+"""Damaged and hostile logs: each is read, or refused with one error of crazysim, silently and within bounds."""
+
+import io
+import os
+import random
+import re
+import signal
+import struct
+import tracemalloc
+import warnings
+from zlib import crc32
+
+import numpy as np
+import pytest
+from log_files import COLUMNS, N, T, bag, blackbox, crazyflie, drift, mocap, swing, ulog
+
+from crazysim.errors import ConfigError
+from crazysim.lab.identify import Columns, read_log
+
+MUTATIONS = 25 if os.environ.get("CRAZYSIM_HYPOTHESIS") != "explore" else 500
+"""Mutated files of each kind."""
+MEMORY = 64 * 2**20
+"""Most memory that reading a file of some 200 kB takes, bytes."""
+HANG = 60
+"""Processor time after which a reader counts as hanging, s: a valid file takes a tenth of a second."""
+INTEGERS = [0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1]
+CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-1", "x", '"', "1" * 400, "\x00", "1,2", "é"]
+
+
+class HangError(BaseException):
+    """Raised by the alarm; no ``Exception``, which readers turn into errors of their own."""
+
+
+def table():
+    """Return the columns of a flight by name."""
+    columns = mocap() | {"vx": np.ones(N), "vy": drift(T)[1], "vz": T, "wx": swing(T)[1], "wy": 0 * T, "wz": 0 * T}
+    return columns | {f"rpm{k}": 1000.0 + 10 * np.sin(7 * T + k) for k in range(1, 5)}
+
+
+def csv(path):
+    columns = table()
+    rows = [",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n")
+
+
+def packed_bag(storage):
+    """Return the function that writes a bag of one file."""
+
+    def write(path):
+        if storage == "bag":
+            return bag(path, storage=storage, seconds=1.0)
+        folder = bag(path.parent / f"{path.name}-folder", storage=storage, seconds=1.0)
+        (made,) = folder.glob(f"*{path.suffix}")
+        path.write_bytes(made.read_bytes())
+        return path
+
+    return write
+
+
+READERS = {
+    "sd": ("log00", crazyflie, COLUMNS, None),
+    "ulog": ("a.ulg", ulog, None, None),
+    "csv": ("a.csv", csv, None, None),
+    "angles": ("b.csv", csv, Columns(rpy=("qx", "qy", "qz")), None),
+    "npz": ("a.npz", lambda path: np.savez(path, **table()), None, None),
+    "deflated": ("b.npz", lambda path: np.savez_compressed(path, **table()), None, None),
+    "blackbox": ("c.csv", blackbox, None, mocap(offset=1234.56)),
+    "ros1": ("a.bag", packed_bag("bag"), None, None),
+    "mcap": ("a.mcap", packed_bag("mcap"), None, None),
+    "db3": ("a.db3", packed_bag("sqlite3"), None, None),
+}
+"""Name of the file, its writer, its columns and its motion capture by kind."""
+
+
+def place(rng, n):
+    """Return an offset, half of the time near one of the ends, where most formats have their structure."""
+    near = min(n, 1500)
+    return rng.choice([rng.randrange(n), rng.randrange(n), rng.randrange(near), n - 1 - rng.randrange(near)])
+
+
+def damaged(rng, data):
+    """Return the bytes with one damage."""
+    at, length = place(rng, len(data)), rng.choice([1, 2, 4, 8, 100, 3000])
+    how = rng.randrange(8)
+    if how == 0:
+        return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+    if how == 1:
+        return data[:at] + rng.randbytes(length) + data[at + length :]
+    if how in (2, 3):
+        layout = rng.choice(["<B", "<H", "<I", "<Q", ">I", "<d", "<f"])
+        limit = struct.calcsize(layout)
+        value = rng.choice([np.nan, np.inf, 1e30, -1.0]) if layout[1] in "df" else rng.choice(INTEGERS) % 256**limit
+        return data[:at] + struct.pack(layout, value) + data[at + limit :]
+    if how == 4:
+        return data[:at]
+    if how == 5:
+        return data[:at] + data[at + length :]
+    if how == 6:
+        return data[:at] + data[at : at + length] + data[at:]
+    other = place(rng, len(data))
+    return data[:at] + data[other : other + length] + data[at + length :]
+
+
+def miswritten(rng, text):
+    """Return a table with one cell, row or column that is wrong."""
+    lines = text.splitlines()
+    k = rng.choice([0, rng.randrange(len(lines))])
+    cells = lines[k].split(",")
+    j = rng.randrange(len(cells))
+    how = rng.randrange(5)
+    if how == 0:
+        cells[j] = rng.choice(CELLS)
+    elif how == 1:
+        value, step = rng.choice(CELLS), rng.choice([1, 2, 50])  # in many rows
+        for i in range(1, len(lines), step):
+            row = lines[i].split(",")
+            row[min(j, len(row) - 1)] = value
+            lines[i] = ",".join(row)
+        return "\n".join(lines)
+    elif how == 2:
+        del cells[j]
+    elif how == 3:
+        cells[j] = rng.choice(cells)
+    else:
+        other = rng.randrange(len(lines))
+        lines[k], lines[other] = lines[other], lines[k]
+        return "\n".join(lines)
+    lines[k] = ",".join(cells)
+    return "\n".join(lines)
+
+
+def repacked(rng):
+    """Return the archive of a table with one array that is wrong."""
+    columns, file = table(), io.BytesIO()
+    key = rng.choice(list(columns))
+    x = columns[key]
+    columns[key] = rng.choice([
+        x[: rng.randrange(N)], x[None], x * 1e300, x * np.nan, x.astype("U8"), x.astype("c16"), x.astype("f2"), x > 6,
+        np.array(3.0), x[::-1], x * 0, np.full(N, np.inf), x.astype("M8[s]"), np.zeros((N, 0)), x.astype(">f8"),
+    ])  # fmt: skip
+    np.savez(file, **columns)
+    return file.getvalue()
+
+
+def mutated(rng, kind, k, data):
+    """Return the file of a kind after one to three mutations; the number says which kind of them."""
+    if kind == "npz" and k % 2:
+        return repacked(rng)
+    for _ in range(rng.randint(1, 3)):
+        if READERS[kind][0].endswith(".csv") and k % 4:
+            data = miswritten(rng, data.decode()).encode()
+        else:
+            data = damaged(rng, data) or b"\0"
+    return data
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    """Return a valid file of each kind, which is read."""
+    pytest.importorskip("rosbags")
+    folder, seeds = tmp_path_factory.mktemp("seeds"), {}
+    for kind, (name, write, columns, motion) in READERS.items():
+        write(folder / name)
+        read_log(folder / name, columns if kind != "angles" else None, motion)
+        seeds[kind] = (folder / name).read_bytes()
+    return seeds
+
+
+def refusal(path, columns, motion):
+    """Return the message with which a log is refused, None if it is read; fail for anything else."""
+
+    def hang(*_):
+        raise HangError
+
+    before = signal.signal(signal.SIGVTALRM, hang)
+    signal.setitimer(signal.ITIMER_VIRTUAL, HANG)
+    tracemalloc.reset_peak()
+    start, _ = tracemalloc.get_traced_memory()
+    message = None
+    try:
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            read_log(path, columns, motion)
+    except ConfigError as error:
+        message = str(error)
+        assert path.stem in message
+        assert len(message) < 3000
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
+    assert not warned, str(warned[0])
+    assert tracemalloc.get_traced_memory()[1] - start < MEMORY
+    return message
+
+
+@pytest.fixture
+def traced():
+    """Trace allocations."""
+    tracemalloc.start()
+    yield
+    tracemalloc.stop()
+
+
+@pytest.mark.long("reads mutated files with their allocations traced")
+@pytest.mark.parametrize("kind", READERS)
+def test_a_mutated_log_is_read_or_refused(kind, seeds, tmp_path, capfd, traced):
+    name, _, columns, motion = READERS[kind]
+    seed = int(os.environ.get("CRAZYSIM_FUZZ_SEED", "0"))
+    outcomes = {True: 0, False: 0}
+    for k in range(MUTATIONS):
+        rng = random.Random(f"{kind} {seed} {k}")
+        path = tmp_path / f"{k}-{name}"
+        path.write_bytes(mutated(rng, kind, k, seeds[kind]))
+        try:
+            outcomes[refusal(path, columns, motion) is None] += 1
+        except BaseException as error:
+            error.add_note(f"of the mutation {k} of {kind} with CRAZYSIM_FUZZ_SEED={seed}")
+            raise
+        path.unlink()
+    assert outcomes[False], "some mutations must be bad enough"
+    assert capfd.readouterr() == ("", "")
+
+
+def archive(data=b"", method=0, flags=0):
+    """Return an archive with one member ``t.npy``, whose headers state a method and flags (PKWARE's APPNOTE.TXT)."""
+    sizes = struct.pack("<III", crc32(data), len(data), len(data))
+    local = b"PK\3\4" + struct.pack("<HHHHH", 20, flags, method, 0, 0) + sizes + struct.pack("<HH", 5, 0) + b"t.npy"
+    central = b"PK\1\2" + struct.pack("<HHHHHH", 20, 20, flags, method, 0, 0) + sizes + struct.pack("<H", 5)
+    central += bytes(16) + b"t.npy"
+    end = b"PK\5\6" + struct.pack("<HHHHIIH", 0, 0, 1, 1, len(central), len(local) + len(data), 0)
+    return local + data + central + end
+
+
+def npy(header):
+    """Return an array of eight bytes below a header of its own."""
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode() + bytes(8)
+
+
+HOSTILE = {
+    "foreign compression": ("a.npz", archive(method=99), "compression method is not supported"),
+    "encryption": ("a.npz", archive(flags=1), "is encrypted"),
+    "40 TB": (
+        "a.npz",
+        archive(npy("{'descr': '<f8', 'fortran_order': False, 'shape': (5000000000000,), }\n")),
+        r"an array of the 8 bytes that follow its header, got a header of shape \(5000000000000,\) in .*a\.npz: t\.npy",
+    ),
+    "negative": (
+        "a.npz",
+        archive(npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }\n")),
+        r"got a header of shape \(-1,\)",
+    ),
+    "columns": ("a.csv", b"t," * 200_000 + b"x\n" + b"1," * 200_000 + b"1\n", "at most 10000 columns, got 200001"),
+    "empty variable": ("log00", b"\xbc" + struct.pack("<HH", 2, 1) + b"\1\0a\0\1\0\0" + bytes(20), "such as 'gyro.x"),
+    "mcap": ("a.mcap", b"\x89MCAP0\r\n\1" + struct.pack("<Q", 2**40) + bytes(50), "1099511627776 bytes, got 50"),
+    "self": (
+        "a.ulg",
+        b"ULog\1\x12\x35\1" + bytes(8)
+        + b"".join(
+            struct.pack("<HB", len(x), k) + x
+            for k, x in (
+                (ord("F"), b"vehicle_attitude:vehicle_attitude[60000] q;"),
+                (ord("A"), b"\0\0\0vehicle_attitude"),
+                (ord("D"), bytes(20)),
+            )
+        ),
+        "over 8 within each other",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_crafted_log_is_refused_with_its_name_and_a_remedy(case, tmp_path, capfd, traced):
+    if case == "mcap":
+        pytest.importorskip("rosbags")
+    name, data, expected = HOSTILE[case]
+    (tmp_path / name).write_bytes(data)
+    message = refusal(tmp_path / name, None, None)
+    assert re.search(expected, message), message
+    assert message.endswith(".")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["log00", "a.ulg", "a.csv", "a.npz"])
+def test_a_log_without_an_end_is_refused_before_it_is_read(name, tmp_path, traced):
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(2**40)  # takes no room on the disk
+    assert "expected a log of at most 2147483648 bytes, got 1099511627776" in refusal(tmp_path / name, None, None)
+
+
+def test_a_blackbox_log_without_a_motor_or_with_a_strange_setting_is_refused_or_read(seeds, tmp_path):
+    text, path = seeds["blackbox"].decode(), tmp_path / "a.csv"
+    path.write_text(text.replace("motor[2]", "other", 1))
+    with pytest.raises(ConfigError, match=r"expected columns motor\[2\], got"):
+        read_log(path, motion=mocap())
+    path.write_text('"blackbox_high_resolution",inf\n' + text)
+    assert read_log(path, motion=mocap()).ang_vel.shape[1] == 3
+
+
+def test_a_bag_whose_description_is_not_text_is_refused(tmp_path):
+    pytest.importorskip("rosbags")
+    folder = bag(tmp_path / "flight", seconds=0.1)
+    (folder / "metadata.yaml").write_bytes(b"rosbag2_bagfile_information: \xff\xfe")
+    with pytest.raises(ConfigError, match=r"expected text in .*metadata\.yaml, got bytes that are not UTF-8"):
+        read_log(folder)
+
+
+def test_a_ulog_that_counts_more_motors_than_it_has_is_refused(seeds, tmp_path):
+    data = seeds["ulog"]
+    path = tmp_path / "a.ulg"
+    path.write_bytes(data.replace(b"\xa0\x0f\0\0\4", b"\xa0\x0f\0\0\5"))  # the speed of the last motor, and the count
+    with pytest.raises(ConfigError, match=r"a\.ulg: esc_status: expected a field esc\[4\]\.esc_rpm, got timestamp,"):
+        read_log(path)

@@ -1,0 +1,516 @@
+"""Identification finds the airframe that made a log, and refuses or repairs bad logs."""
+
+import re
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crazysim.__main__ import main
+from crazysim.drones import load_airframe
+from crazysim.errors import ConfigError
+from crazysim.lab.identify import (
+    Columns,
+    Model,
+    errors_table,
+    fast_rotation,
+    fit_residual,
+    identify,
+    prediction_errors,
+    read_log,
+)
+from crazysim.lab.identify.readers import Stream, at_equal_times
+from crazysim.plugins.effects import Residual
+from crazysim.rotation import to_rpy
+from crazysim.sim import Sim
+
+FACTORS = {"inertia x": 1.3, "inertia y": 1.2, "thrust factor": 1.05}
+DRAG = (-0.03, -0.025, -0.02)
+N_FLIGHTS = 6
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """Columns of simulated flights of a drone that differs from cf21B_500, sampled at 250 Hz."""
+    base = load_airframe("cf21B_500")
+    inertia = np.diag(base.inertia) * [FACTORS["inertia x"], FACTORS["inertia y"], 1]
+    curve = base.value("rotors.thrust_curve") * FACTORS["thrust factor"]
+    drone = {
+        "base": "cf21B_500",
+        "rigid_body": {"inertia": inertia.tolist()},
+        "rotors": {"thrust_curve": curve.tolist()},
+        "drag": {"coefficients": list(DRAG)},
+    }
+    sim = Sim(n_worlds=N_FLIGHTS, drone=drone, control="attitude", integrator="rk4")
+    high = sim.data.states.pos + np.array([0, 0, 20.0], np.float32)
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=high))
+    rng, rows = np.random.default_rng(0), []
+    weight = float(base.value("rigid_body.mass")) * 9.81
+    for k in range(600):
+        if k % 25 == 0:
+            cmd = np.zeros((N_FLIGHTS, 1, 4), np.float32)
+            cmd[:, 0, :3] = rng.uniform(-0.5, 0.5, (N_FLIGHTS, 3))
+            cmd[:, 0, 3] = weight * rng.uniform(0.9, 1.2, N_FLIGHTS)
+        sim.attitude_control(cmd)
+        sim.step(2)
+        s = sim.data.states
+        rows.append(np.concatenate([np.asarray(x)[:, 0] for x in (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)], -1))
+    names = "x y z qx qy qz qw vx vy vz wx wy wz rpm1 rpm2 rpm3 rpm4".split()
+    table = np.stack(rows[100:], axis=1).astype(np.float64)
+    return [{"t": 0.004 * np.arange(len(x)), **dict(zip(names, x.T, strict=True))} for x in table]
+
+
+@pytest.fixture(scope="module")
+def result(flights):
+    return identify([read_log(x) for x in flights[:-1]])
+
+
+def test_identification_finds_the_airframe_of_the_logs(result):
+    # Interpolated rotor speeds between samples bias the moments by up to 3%.
+    for name, true in FACTORS.items():
+        assert abs(result.values[name] - true) < 0.03 * true, name
+    # Slow flights tell linear and quadratic drag apart only roughly; their sum at the flights' speed is the drag.
+    for axis, true in zip("xyz", DRAG, strict=True):
+        drag = result.values[f"drag {axis}"] + result.values[f"quadratic drag {axis}"]
+        assert abs(drag - true) < 0.15 * abs(true), axis
+    assert max(map(abs, result.delays.values())) < 2e-3
+    assert not result.doubtful, result.values
+
+
+@pytest.mark.long("compiles predictions of flights")
+def test_identified_model_predicts_held_out_flights(flights, result):
+    errors = prediction_errors([read_log(flights[-1])], result.model)
+    assert np.all(errors["position"] < 0.1 * errors["position at constant velocity"])
+    for name in ("unchanged", "at constant body rates"):
+        assert np.all(errors["attitude"] < 0.1 * errors[f"attitude {name}"])
+    assert "attitude, degrees" in errors_table(errors)
+
+
+def test_constant_body_rates_are_those_of_a_body_that_no_torque_turns(flights, result):
+    """Equal moments of inertia of 1,000 kg m^2: no gyroscopic torque, and 1e-9 rad/s^2 by the rotors."""
+    heavy = jnp.asarray(1e3 * np.eye(3), jnp.float32)
+    params = result.model.params.replace(J=heavy, J_inv=heavy / 1e6)
+    errors = prediction_errors([read_log(flights[-1])], result.model.replace(params=params))
+    for name in ("position", "attitude"):
+        np.testing.assert_allclose(errors[f"{name} at constant body rates"], errors[name], rtol=1e-4)
+
+
+def test_of_one_prediction_the_mean_is_the_root_mean_square(flights, result):
+    """The root mean square is of the chord 2 sin(a / 2) of an angle."""
+    log = read_log(flights[-1])
+    n = round(0.5 / log.dt) + 4  # one window and a sample beside each end
+    fields = ("t", "pos", "quat", "vel", "ang_vel", "rotor_vel")
+    log = replace(log, **{key: getattr(log, key)[:n] for key in fields})
+    errors = prediction_errors([log], result.model)
+    for name in (key for key in errors if not key.endswith("(mean)")):
+        mean = errors[f"{name} (mean)"]
+        chord = np.degrees(2 * np.sin(np.radians(mean) / 2)) if "attitude" in name else mean
+        np.testing.assert_allclose(chord, errors[name], rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.long("identifies, trains and predicts as the command does")
+def test_command_writes_an_airframe(flights, tmp_path, capsys):
+    table = {k: x for k, x in flights[0].items() if k != "t"} | {"seconds": flights[0]["t"]}
+    # Commands that these speeds follow with a lag of first order of 25 1/s.
+    table |= {f"command{k}": table[f"rpm{k}"] + np.gradient(table[f"rpm{k}"], 0.004) / 25 for k in range(1, 5)}
+    path, out = tmp_path / "flight.csv", tmp_path / "mine.toml"
+    options = ["--network", "4", "--iterations", "3", "--plot", str(tmp_path / "errors.png")]
+    np.savetxt(path, np.stack(list(table.values()), -1), delimiter=",", header=",".join(table), comments="")
+    status = main(
+        ["identify", f"{path}@:2", "--test", f"{path}@0:", "--columns", "time=seconds", "--out", str(out), *options]
+    )
+    assert status == 0, capsys.readouterr().err
+    assert main(["identify", f"{path}@5:6", "--columns", "time=seconds", "--out", str(tmp_path / "other.toml")]) == 2
+    printed = capsys.readouterr()
+    assert "between 5 and 6 s, got 0" in printed.err
+    assert "held-out logs" in printed.out
+    assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+    # One block of 10 s.
+    assert re.search(r"^drag z +-[0-9.]+ \+- unknown N s/m$", printed.out, re.MULTILINE)
+    sim = Sim(drone=out, control="rotor_vel")
+    sim.add(Residual())
+    assert sim.data.plugins["residual"].output.shape == (6, 4)
+    assert load_airframe(out).value("rigid_body.mass") == load_airframe("cf21B_500").value("rigid_body.mass")
+    np.testing.assert_allclose(load_airframe(out).value("rotors.lag"), [25, 0, 25, 0], rtol=0.05)
+
+
+def test_missing_columns_are_named(flights):
+    with pytest.raises(ConfigError, match="qw"):
+        read_log({k: x for k, x in flights[0].items() if k != "qw"})
+
+
+def test_times_of_few_digits_are_refused(flights):
+    with pytest.raises(ConfigError, match="expected a time of its own for each sample, got 21 times of 500"):
+        read_log(flights[0] | {"t": np.round(flights[0]["t"], 1)})
+
+
+def test_time_that_goes_back_is_dropped(flights):
+    log = {k: np.insert(x, 100, x[50]) for k, x in flights[0].items()}
+    read = read_log(log)
+    assert np.all(np.diff(read.t) > 0)
+    assert "dropped 1 samples" in read.repairs[0]
+    backwards = flights[0] | {"t": -flights[0]["t"]}
+    with pytest.raises(ConfigError, match="time increases"):
+        read_log(backwards)
+
+
+def test_gaps_are_reported(flights):
+    read = read_log({k: np.delete(x, np.arange(200, 230)) for k, x in flights[0].items()})
+    assert read.gaps.tolist() == [200]
+    assert "1 gap, the longest" in read.repairs[0]
+
+
+def test_nan_is_interpolated_or_refused(flights):
+    x = flights[0]["x"].copy()
+    x[10] = np.nan
+    read = read_log(flights[0] | {"x": x})
+    np.testing.assert_allclose(read.pos[10, 0], (x[9] + x[11]) / 2)
+    assert "not finite" in read.repairs[0]
+    with pytest.raises(ConfigError, match="finite pos"):
+        read_log(flights[0] | {"x": np.full_like(x, np.nan)})
+
+
+def test_offset_of_quaternions_is_found(flights):
+    moved = flights[0] | {"qw": flights[0]["qw"] + 0.04, "qx": flights[0]["qx"] - 0.01}
+    read = read_log(moved)
+    np.testing.assert_allclose(read.quat[:, 0], flights[0]["qx"], atol=1e-3)
+    assert "subtracted" in read.repairs[0]
+
+
+def test_spikes_of_rotor_speeds_are_interpolated(flights):
+    x = flights[0]["rpm3"].copy()
+    x[40] = 1e6
+    read = read_log(flights[0] | {"rpm3": x})
+    assert read.rotor_vel[40, 2] < 4e4
+    assert "interpolated 1 rotor speeds" in read.repairs[0]
+
+
+def test_lost_values_are_gaps(flights):
+    """0.08 s of NaN, and of zero quaternions, as of a lost motion capture; 0.008 s are interpolated."""
+    for names, value in (("x",), np.nan), (("qx", "qy", "qz", "qw"), 0.0):
+        log = {k: x.copy() for k, x in flights[0].items()}
+        for name in names:
+            log[name][[*range(2), 60, *range(200, 220)]] = value
+        read = read_log(log)
+        assert len(read.t) == len(log["t"]) - 22
+        assert read.gaps.tolist() == [198]
+        assert [x.split(" of")[0].split(",")[0] for x in read.repairs[:2]] == [
+            "interpolated 1 samples",
+            "dropped 22 samples",
+        ]
+        np.testing.assert_allclose(read.quat[58], [flights[0][k][60] for k in ("qx", "qy", "qz", "qw")], atol=1e-3)
+    with pytest.raises(ConfigError, match="finite quat that is not zero"):
+        read_log(flights[0] | dict.fromkeys(("qx", "qy", "qz", "qw"), 0 * flights[0]["x"]))
+
+
+def test_jumps_of_the_time_cost_their_samples_alone(flights):
+    t = flights[0]["t"].copy()
+    t[[0, 150, 300, -1]] = -1e9, 1e6, -5.0, 1e9
+    read = read_log(flights[0] | {"t": t})
+    assert len(read.t) == len(t) - 4
+    assert "dropped 4 samples" in read.repairs[0]
+    assert read.gaps.tolist() == [149, 298]  # those of 0.008 s that are left
+
+
+def test_jitter_is_no_gap_and_lost_time_beside_it_is_one(flights):
+    rng, n = np.random.default_rng(0), len(flights[0]["t"])
+    t = flights[0]["t"] + rng.uniform(-0.0015, 0.0015, n)
+    assert np.sum(np.diff(t) > 0.006) > 20
+    read = read_log(flights[0] | {"t": t + np.where(np.arange(n) < 100, 0, 0.02)})
+    assert read.gaps.tolist() == [100]
+    assert "as jitter" in read.repairs[0]
+
+
+UNITS = [
+    ({"t": 1e3}, "in ms: give seconds_per_unit=0.001"),
+    ({"t": 1e6}, "in us: give seconds_per_unit=1e-06"),
+    (dict.fromkeys("xyz", 1e3), "position seems to be in mm: give metres_per_unit=0.001"),
+    (dict.fromkeys(("vx", "vy", "vz"), 1e3), "velocity seems to be in mm/s: give speed_per_unit=0.001"),
+    (dict.fromkeys(("wx", "wy", "wz"), 180 / np.pi), "degrees per second: give rad_per_unit=0.0174533"),
+    ({"vx": -1}, "velocity fits as vel=-vx,vy,vz"),
+    ({"wy": -1}, "angular velocity fits as ang_vel=wx,-wy,wz, with"),
+    (
+        {"wx": 180 / np.pi, "wy": -180 / np.pi, "wz": -180 / np.pi},
+        "fits as ang_vel=wx,-wy,-wz and rad_per_unit=0.0174533",
+    ),
+    ({"z": -1, "vz": -1}, "pos=x,y,-z vel=vx,vy,-vz"),
+    (dict.fromkeys("y z vy vz qy qz wy wz".split(), -1), "z seems to point down, in world and body"),
+    (dict.fromkeys(("qx", "qy", "qz"), -1), "world to body"),
+]
+"""Factors of columns, and the remedy that the error names."""
+
+
+@pytest.mark.parametrize(("factors", "remedy"), UNITS, ids=[x[1][-24:] for x in UNITS])
+def test_wrong_units_and_signs_are_refused(flights, factors, remedy):
+    for flight in flights[:2]:
+        with pytest.raises(ConfigError, match=remedy):
+            read_log(flight | {key: x * flight[key] for key, x in factors.items()})
+
+
+def test_factors_of_columns_are_applied(flights):
+    """Those that the errors name."""
+    log = {
+        k: x * {"t": 1e3, "x": 1e3, "y": 1e3, "z": 1e3, "vx": 10, "vy": 10, "vz": 10}.get(k, 1)
+        for k, x in flights[0].items()
+    }
+    read = read_log(log, Columns(seconds_per_unit=1e-3, metres_per_unit=1e-3, speed_per_unit=0.1))
+    for key, name in (("t", "t"), ("pos", "x"), ("vel", "vx")):
+        np.testing.assert_allclose(
+            np.reshape(getattr(read, key), (len(read.t), -1))[:, 0], flights[0][name], atol=1e-12
+        )
+
+
+def test_several_mistakes_are_named_in_turn(flights):
+    quat = ("qw", "qx", "qy", "qz")
+    log = {
+        k: x * (1e3 if k in "xyz" else 100 if k[0] == "v" else 57.3 if k[0] == "w" else 1)
+        for k, x in flights[0].items()
+    }
+    columns = Columns(quat=quat)
+    for message, change in (
+        ("order w, x, y, z", {"quat": (*quat[1:], "qw")}),
+        ("in mm and cm/s: give metres_per_unit=0.001 and speed", {"metres_per_unit": 1e-3, "speed_per_unit": 1e-2}),
+        ("rad_per_unit=0.0174533", {"rad_per_unit": 0.0174533}),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            read_log(log, columns)
+        columns = replace(columns, **change)
+    np.testing.assert_allclose(read_log(log, columns).pos, read_log(flights[0]).pos)
+
+
+def test_columns_that_cannot_be_are_refused(capsys):
+    for wrong, message in (
+        ({"pos": "px,py,pz"}, "3 names of columns as pos, got 'px,py,pz'"),
+        ({"quat": ("a", "b", "c")}, "4 names of columns as quat, got 3. Give x, y, z, w, in this order"),
+        ({"rad_per_unit": 0}, "not zero as rad_per_unit, got 0"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            Columns(**wrong)
+    for text, message in (("pos", "got 'pos'"), ("place=a,b,c", "such as pos=px"), ("rad_per_unit=deg", "got 'deg'")):
+        assert main(["identify", "log.csv", "--out", "none.toml", "--columns", text]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_wrong_columns_are_refused(flights):
+    """Orders of quaternions, axes, positions alone, and rotors."""
+    quat = dict(zip(("qx", "qy", "qz", "qw"), (flights[0][k] for k in ("qw", "qx", "qy", "qz")), strict=True))
+    slow = {k: x for k, x in flights[0].items() if k[0] not in "vw"}
+    for log in (flights[0], slow):
+        with pytest.raises(ConfigError, match="order w, x, y, z"):
+            read_log(log | quat)
+    with pytest.raises(ConfigError, match="fits as vel=vy,vx,vz"):
+        read_log(flights[0] | {"vx": flights[0]["vy"], "vy": flights[0]["vx"]})
+    with pytest.raises(ConfigError, match="position seems to be in mm"):
+        read_log(slow | {k: 1e3 * slow[k] for k in "xyz"})
+    with pytest.raises(ConfigError, match="each rotor near"):
+        identify([read_log(flights[0] | {"rpm1": 0 * flights[0]["rpm1"]})])
+    radians = flights[0] | {f"rpm{k}": flights[0][f"rpm{k}"] * 2 * np.pi / 60 for k in range(1, 5)}
+    with pytest.raises(ConfigError, match="rpm_per_unit"):
+        identify([read_log(radians)])
+
+
+def test_angles_are_read_in_place_of_quaternions(flights):
+    log, angles = read_log(flights[0]), [f"angle{k}" for k in range(3)]
+    rpy = np.degrees(np.asarray(to_rpy(jnp.asarray(log.quat)), np.float64)) * [1, -1, 1]
+    table = {k: x for k, x in flights[0].items() if k[0] != "q"} | dict(zip(angles, rpy.T, strict=True))
+    columns = Columns(rpy=("angle0", "-angle1", "angle2"), rad_per_angle=np.pi / 180)
+    # float32 of the conversions.
+    np.testing.assert_allclose(np.abs(np.sum(read_log(table, columns).quat * log.quat, axis=-1)), 1, atol=1e-5)
+    with pytest.raises(ConfigError, match=r"seem to be rpy=roll,-pitch,yaw, with names of your columns\."):
+        read_log(table, replace(columns, rpy=tuple(angles)))
+    degrees = table | {k: np.degrees(table[k]) for k in ("wx", "wy", "wz")}
+    with pytest.raises(ConfigError, match=r"rpy=roll,-pitch,yaw.* and the angular velocity in degrees per second"):
+        read_log(degrees, replace(columns, rpy=tuple(angles)))
+    with pytest.raises(ConfigError, match=r"pitch of at most pi/2 rad.* rad_per_angle=0\.0174533"):
+        read_log(table, replace(columns, rad_per_angle=1.0))
+    with pytest.raises(ConfigError, match="expected columns angle3"):
+        read_log(table, replace(columns, rpy=("angle0", "angle1", "angle3")))
+
+
+def test_angles_that_wrap_are_interpolated_across_the_wrap(flights):
+    yaw = np.degrees(np.linspace(0, 20, 500))
+    streams = {
+        "fast": Stream(0.004 * np.arange(500), {"x": yaw}),
+        "slow": Stream(0.02 * np.arange(100), {"yaw": (yaw[::5] + 180) % 360 - 180}),
+    }
+    table = at_equal_times("log", streams, [], Columns(rpy=("r", "p", "-yaw"), rad_per_angle=np.pi / 180))
+    np.testing.assert_allclose(table["yaw"], yaw[: len(table["t"])], atol=1e-9)
+
+
+def in_a_row(flights):
+    """Return three flights as one of 6 s."""
+    parts = range(3)
+    return {k: np.concatenate([flights[i][k] + (2.0 * i if k == "t" else 0) for i in parts]) for k in flights[0]}
+
+
+def test_time_on_the_ground_is_left_out(flights):
+    """Three seconds before a flight of 6 s and two after it, with rotors at 0.3 of their speeds, and a spike."""
+    flight, table = in_a_row(flights), {}
+    for key, x in flight.items():
+        rest = {"t": 0.004 * np.arange(1, 751), "qw": np.ones(750)}.get(key, np.zeros(750))
+        before, after = (x[0] - rest[::-1], x[-1] + rest) if key == "t" else (rest, rest)
+        if key in "xyz" or key.startswith("rpm"):
+            before, after = ((0.3 if key not in "xyz" else 1) * x[k] + rest for k in (0, -1))
+        table[key] = np.r_[before, x, after[:500]]
+    table["rpm1"][100] = 1e6
+    log = read_log(table)
+    assert (log.t[0], log.t[-1]) == pytest.approx((1.0, 5.0), abs=0.15)  # a second beside the ground, too
+    assert "on the ground" in log.repairs[0]
+    rotors = {k: (0 * x if k.startswith("rpm") else x) for k, x in table.items()}
+    with pytest.raises(ConfigError, match="rotors at rest"):
+        read_log(rotors)
+    assert len(read_log(flights[0]).t) == 500
+
+
+def test_a_part_of_a_log_is_read(flights):
+    log = read_log(flights[0], between=(0.4, 1.2))
+    np.testing.assert_allclose(log.t, flights[0]["t"][100:301])
+    with pytest.raises(ConfigError, match=r"between 5 and 6 s, got 0 of a log of 2 s"):
+        read_log(flights[0], between=(5.0, 6.0))
+
+
+def test_drift_at_rest_is_no_wrong_unit(flights):
+    """A drone on the ground, whose estimator drifts by centimetres and has another velocity."""
+    log = {k: x for k, x in flights[0].items() if k[0] not in "rw"} | dict.fromkeys(("qx", "qy", "qz"), np.zeros(500))
+    log |= {
+        "qw": np.ones(500),
+        "z": np.zeros(500),
+        "x": 0.1 * np.sin(log["t"]),
+        "vx": 1e3 * log["vx"],
+        "y": np.zeros(500),
+    }
+    with pytest.raises(ConfigError, match=r"spans 0\.1 m: take a log of a flight"):
+        read_log(log)
+
+
+def test_a_gyroscope_that_fails_is_left_out(flights):
+    """A rate that grows to 200 rad/s in the last 0.4 s, of pieces of 2 s of three flights in a row."""
+    log = in_a_row(flights)
+    log["wx"][1000:] += np.linspace(50, 200, 500)
+    read = read_log(log)
+    assert "without an angular velocity that turns the attitude" in read.repairs[0]
+    assert read.t[-1] == pytest.approx(log["t"][999], abs=0.2)
+
+
+def test_factors_that_no_body_explains_are_refused(flights):
+    with pytest.raises(ConfigError, match=r"thrust factor 18\.\d, inertia x"):
+        identify([read_log(x) for x in flights[:2]], mass=0.75)
+
+
+FILES = {
+    "": "expected names of columns in the first line",
+    "t;x;y\n0;1;2": "semicolons between them",
+    "0,1,2\n1,2,3": "got numbers: 0,1,2",
+    "t,x,x\n1,2,3": "got 'x' twice",
+    "t,x,y\n0,1,2\n0,1\n": "got 1 such rows and 1 others, the first with 2 in line 3. Export",
+    "t,x\nnoon,1\nlater,2\n": "one number a sample in column t, got noon in its first row",
+}
+
+
+@pytest.mark.parametrize("text", FILES, ids=lambda x: x[:6].strip())
+def test_bad_csv_files_are_refused_in_a_line(tmp_path, text):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(ConfigError, match=FILES[text]):
+        read_log(tmp_path / "log.csv")
+
+
+def test_csv_files_with_few_faults_are_repaired(flights, tmp_path):
+    """A byte order mark, a column of text, an empty cell and a torn last line."""
+    rows = [[f"{x:.9g}" for x in row] for row in np.stack(list(flights[0].values()), -1)]
+    rows[30][1] = ""
+    lines = [",".join(["mode", *flights[0]]), *(",".join(["ANGLE", *row]) for row in rows)]
+    lines[-1] = lines[-1][:30]
+    (tmp_path / "log.csv").write_text("\ufeff" + "\n".join(lines), encoding="utf-8")
+    read = read_log(tmp_path / "log.csv")
+    assert len(read.t) == len(rows) - 1
+    assert [" ".join(x.split()[:3]) for x in read.repairs] == ["dropped 1 rows", "interpolated 1 samples"]
+    with pytest.raises(ConfigError, match="one number a sample in column mode, got ANGLE"):
+        read_log(tmp_path / "log.csv", Columns(voltage=("mode",)))
+
+
+def test_arrays_that_are_no_columns_are_refused(flights, tmp_path):
+    with pytest.raises(ConfigError, match="equal length, got t of 500, x of 499"):
+        read_log(flights[0] | {"x": flights[0]["x"][1:]})
+    with pytest.raises(ConfigError, match=r"one number a sample in column rpm1, got shape \(500, 1\)"):
+        read_log(flights[0] | {"rpm1": flights[0]["rpm1"][:, None]})
+    (tmp_path / "log.npz").write_bytes(b"PK torn")
+    with pytest.raises(ConfigError, match=r"which is damaged or a file of another kind .* Copy or export it again\."):
+        read_log(tmp_path / "log.npz")
+
+
+def test_logs_without_rotor_speeds_are_refused(flights):
+    log = read_log({k: x for k, x in flights[0].items() if not k.startswith("rpm")})
+    with pytest.raises(ConfigError, match=r"speeds of 4 rotors, got 0\. Name their columns"):
+        identify([log])
+
+
+def test_other_order_of_rotors_is_refused(flights):
+    other = flights[0] | {"rpm1": flights[0]["rpm2"], "rpm2": flights[0]["rpm1"]}
+    with pytest.raises(ConfigError, match=r"order \[2, 1, 3, 4\]"):
+        identify([read_log(other)])
+
+
+@pytest.mark.long("fits 15 flights with commands and without")
+def test_poor_telemetry_does_not_make_the_moments_of_inertia_larger(flights):
+    """Rotor speeds that are noisy, quantised and late by another delay in each flight; commands are exact.
+
+    A second of a flight leaves an error of some 5%, so each flight is logged three times.
+    """
+    rng, logs, late = np.random.default_rng(1), [], 3 * [0.004, 0.012, 0.0, 0.008, 0.004]
+    for flight, delay in zip(3 * flights[:-1], late, strict=True):
+        t, columns = flight["t"], {}
+        for k in range(1, 5):
+            columns[f"cmd{k}"] = flight[f"rpm{k}"]
+            read = np.interp(t + delay, t, flight[f"rpm{k}"]) + rng.normal(scale=1000, size=len(t))
+            columns[f"rpm{k}"] = 17 * np.round(read / 17)
+        logs.append(read_log(flight | columns, Columns(command=("cmd1", "cmd2", "cmd3", "cmd4"))))
+    params = Model.create(load_airframe("cf21B_500")).params
+    with_commands = fast_rotation(logs, params, FACTORS["thrust factor"])
+    without = fast_rotation([replace(log, command=None) for log in logs], params, FACTORS["thrust factor"])
+    true = np.array([FACTORS["inertia x"], FACTORS["inertia y"]])
+    deviations = with_commands.deviations[:2]
+    assert np.all(np.abs(with_commands.values[:2] - true) < 3 * deviations), with_commands
+    assert np.all(deviations < 0.05 * true), deviations
+    delays = np.median(np.reshape(with_commands.delays, (3, 5)), axis=0)
+    np.testing.assert_allclose(delays, late[:5], atol=3e-3)
+    assert np.all(without.values[:2] > 1.07 * true), without.values
+
+
+@pytest.mark.long("compiles the gradient of a flight of 0.5 s, and trains")
+def test_training_a_residual_lowers_the_errors_of_predictions(flights, result):
+    """Rotor speeds that are 5% too high in the log: the residual takes the thrust away."""
+    logs = [read_log(x | {f"rpm{k}": 1.05 * x[f"rpm{k}"] for k in range(1, 5)}) for x in flights[:3]]
+    before = prediction_errors(logs, result.model)
+    for n_hidden in (0, 4):
+        steps = {"iterations": 30, "batch_size": 8, "learning_rate": 1e-2}
+        trained = fit_residual(logs, result.model, n_hidden=n_hidden, validation=logs[:1], **steps)
+        assert prediction_errors(logs, trained)["position"][-1] < 0.5 * before["position"][-1], n_hidden
+
+
+def test_results_are_plain_numbers(result):
+    assert all(isinstance(x, float) for x in jax.tree.leaves(result.values))
+
+
+def test_mass_that_is_not_positive_is_refused(flights):
+    with pytest.raises(ConfigError, match="expected mass to be positive"):
+        identify([read_log(flights[0])], mass=-0.03)
+
+
+def test_logs_shorter_than_a_window_are_refused(flights):
+    short = {key: x[:60] for key, x in flights[0].items()}
+    with pytest.raises(ConfigError, match="Use longer logs"):
+        identify([read_log(short)])
+
+
+@pytest.mark.parametrize("dynamics", ["first_principles", "so_rpy"])
+def test_a_log_that_excites_nothing_is_refused(tmp_path, capsys, dynamics):
+    n, zero, one = 500, np.zeros(500), np.ones(500)
+    names = "x y z qx qy qz qw vx vy vz wx wy wz roll_command pitch_command yaw_command thrust_command".split()
+    table = {"t": 0.01 * np.arange(n)} | dict.fromkeys(names, zero) | {"qw": one, "z": one, "thrust_command": 0.4 * one}
+    np.savez(tmp_path / "hover.npz", **table, **{f"rpm{k}": 15000 * one for k in range(1, 5)})
+    out = tmp_path / "out.toml"
+    assert main(["identify", str(tmp_path / "hover.npz"), "--out", str(out), "--dynamics", dynamics]) == 2
+    assert "expected a flight that turns about x and y, got body rates whose" in capsys.readouterr().err
+    assert not out.exists()

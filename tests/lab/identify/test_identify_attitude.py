@@ -1,0 +1,134 @@
+"""Fitted dynamics are found in logs with attitude commands."""
+
+import numpy as np
+import pytest
+
+from crazysim.__main__ import main
+from crazysim.drones import load_airframe
+from crazysim.dynamics.utils.data_utils import derivatives_svf, preprocessing, state_variable_filter
+from crazysim.dynamics.utils.identification import sys_id_rotation, sys_id_translation
+from crazysim.errors import ConfigError
+from crazysim.lab.identify import FittedModel, identify_attitude, prediction_errors, read_log
+from crazysim.sim import Sim
+
+MODEL = "so_rpy_rotor_drag"
+RATE, SECONDS = 100, 30
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """Columns of a simulated flight of cf2x_L250 with the fitted model, that starts in hover."""
+    sim = Sim(drone="cf2x_L250", dynamics=MODEL, control="attitude", freq=1000, attitude_freq=RATE, integrator="rk4")
+    airframe, rng = load_airframe("cf2x_L250"), np.random.default_rng(0)
+    hover = float(airframe.value("rigid_body.mass")) * 9.81 / float(airframe.value(f"fitted.{MODEL}.cmd_f_coef"))
+    states = sim.data.states
+    high = states.pos + np.array([0, 0, 50.0], np.float32)
+    sim.data = sim.data.replace(states=states.replace(pos=high, rotor_vel=np.full_like(states.rotor_vel, hover)))
+    cmd, rows = np.array([0, 0, 0, hover]), []
+    for k in range(SECONDS * RATE):
+        states = sim.data.states
+        pos, quat, vel = (np.asarray(x)[0, 0] for x in (states.pos, states.quat, states.vel))
+        if k >= RATE and k % 25 == 0:
+            back = np.clip([0.1 * vel[1], -0.1 * vel[0]], -0.2, 0.2)
+            lift = rng.uniform(0.8, 1.25) - np.clip(0.15 * vel[2] + 0.02 * (pos[2] - 50), -0.25, 0.25)
+            cmd = np.array([*rng.uniform(-0.35, 0.35, 2) + back, rng.uniform(-0.5, 0.5), hover * lift])
+        rows.append([k / RATE, *pos, *quat, *cmd])
+        sim.attitude_control(cmd[None, None])
+        sim.step(1000 // RATE)
+    names = "t x y z qx qy qz qw roll_command pitch_command yaw_command thrust_command".split()
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def columns(flight, *names):
+    return np.stack([flight[name] for name in names], axis=-1)
+
+
+def test_names_of_crazyflow_find_the_parameters(flight):
+    data = {"time": flight["t"], "cmd_f": flight["thrust_command"], "pos": columns(flight, *"xyz")}
+    data |= {"quat": columns(flight, "qx", "qy", "qz", "qw")}
+    data |= {"cmd_rpy": columns(flight, "roll_command", "pitch_command", "yaw_command")}
+    log, airframe = derivatives_svf(preprocessing(data)), load_airframe("cf2x_L250")
+    found = sys_id_translation(MODEL, float(airframe.value("rigid_body.mass")), log)
+    true = {key: airframe.value(f"fitted.{MODEL}.{key}") for key in ("cmd_f_coef", "thrust_dyn_coef")}
+    drag = airframe.value(f"fitted.{MODEL}.drag_coefficients")
+    assert found["cmd_f_coef"] == pytest.approx(true["cmd_f_coef"], rel=0.005)
+    # Products of attitude, thrust and velocity are formed after the filter, which biases lag and drag below a percent.
+    assert found["thrust_dyn_coef"] == pytest.approx(true["thrust_dyn_coef"], rel=0.01)
+    assert found["drag_xy_coef"] == pytest.approx(drag[0], rel=0.01)
+    assert found["drag_z_coef"] == pytest.approx(drag[2], rel=0.01)
+    turn = sys_id_rotation(log)
+    for key, x in turn.items():
+        np.testing.assert_allclose(x, airframe.value(f"fitted.{MODEL}.{key}"), rtol=0.01, err_msg=key)
+
+
+def test_command_writes_the_fitted_model(flight, tmp_path, capsys):
+    path, out, plot = tmp_path / "flight.npz", tmp_path / "mine.toml", tmp_path / "errors.png"
+    np.savez(path, **flight)
+    options = ["--airframe", "cf2x_L250", "--dynamics", MODEL, "--out", str(out)]
+    assert main(["identify", str(path), *options, "--test", str(path), "--plot", str(plot)]) == 0
+    printed = capsys.readouterr().out
+    assert "held-out logs, cf2x_L250\n" in printed
+    assert "held-out logs, identified\n" in printed
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    mine, base = load_airframe(out), load_airframe("cf2x_L250")
+    for key in ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef"):
+        np.testing.assert_allclose(mine.value(f"fitted.{MODEL}.{key}"), base.value(f"fitted.{MODEL}.{key}"), rtol=0.02)
+    Sim(drone=out, dynamics=MODEL, control="attitude").step()
+
+
+def test_the_true_model_predicts_its_own_flight(flight):
+    """Velocities and rates of the log are derivatives over 0.06 s, which leaves errors where predictions start."""
+    model = FittedModel.create(load_airframe("cf2x_L250"), MODEL)
+    errors = prediction_errors([read_log(flight)], model)
+    assert np.all(errors["position"] < 0.03 * errors["position at constant velocity"])
+    assert np.all(errors["attitude"] < 0.01 * errors["attitude unchanged"])
+    # RMSE, and mean, of one distribution.
+    for name in ("position", "attitude"):
+        assert np.all(errors[f"{name} (mean)"] < errors[name])
+
+
+def test_a_residual_of_a_fitted_model_is_refused(flight, tmp_path, capsys):
+    path, out = tmp_path / "flight.npz", tmp_path / "a.toml"
+    np.savez(path, **flight)
+    assert main(["identify", str(path), "--dynamics", MODEL, "--out", str(out), "--network", "0"]) != 0
+    assert "Leave --network out" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_the_longest_piece_without_gaps_is_named(flight):
+    log = read_log({key: np.delete(x, [*range(300, 330), *range(900, 940)]) for key, x in flight.items()})
+    first, last = flight["t"][[940, -1]]
+    with pytest.raises(ConfigError, match=f"expected no gaps, got 2.*from t = {first:.6g} to {last:.6g} s"):
+        identify_attitude([log], "cf2x_L250", MODEL, "flight")
+
+
+def test_logs_without_commands_and_other_models_are_refused(flight, tmp_path, capsys):
+    path = tmp_path / "flight.npz"
+    np.savez(path, **{key: x for key, x in flight.items() if not key.endswith("command")})
+    assert main(["identify", str(path), "--dynamics", "so_rpy", "--out", str(tmp_path / "a.toml")]) != 0
+    assert "attitude_command" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="so_rpy_rotor"):
+        sys_id_translation("first_principles", 0.03, {})
+    with pytest.raises(ConfigError, match="cmd_f"):
+        preprocessing({"time": flight["t"]})
+
+
+def test_outliers_are_interpolated_and_fast_turns_are_not():
+    """A circle of 1 m in 1 s, as in Crazyflow's tests of these functions."""
+    t = np.linspace(0, 1, 100)
+    pos = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t), t], axis=-1)
+    data = {"time": t, "quat": np.tile([0.0, 0, 0, 1], (100, 1)), "cmd_rpy": np.zeros((100, 3)), "cmd_f": np.ones(100)}
+    np.testing.assert_array_equal(preprocessing(data | {"pos": pos})["pos"], pos)
+    spoiled = pos.copy()
+    spoiled[40:42] += 1.0
+    # Straight lines over three intervals of 10 ms at 40 m/s^2.
+    np.testing.assert_allclose(preprocessing(data | {"pos": spoiled})["pos"], pos, atol=40 * 0.03**2 / 8)
+
+
+def test_filter_keeps_slow_signals_and_their_derivatives():
+    t = np.arange(0, 6, 0.01)
+    found = state_variable_filter(np.sin(2 * t), t, f_c=6, N_deriv=2)
+    inner = slice(100, -100)
+    # Twice a Butterworth low-pass at 1/19 of its cutoff: flat to (1/19)^8; linear interpolation costs 4e-5.
+    for x, true in zip(found, (np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)), strict=True):
+        np.testing.assert_allclose(x[inner], true[inner], atol=1e-3)

@@ -1,0 +1,147 @@
+"""Messages in a stream: split, joined, and hostile."""
+
+import json
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazysim.lab.live import framing
+from crazysim.lab.live.framing import Frames, FramingError, Message, Request, ShowFile
+
+TRICKY = {"name": '_EOF "quoted\\" {', "odd": '" {', "a_b": {"points": [[0.0, [1, 2, 3], []]]}, "SKYC": "START"}
+JSON = json.dumps(TRICKY).encode()
+ARCHIVE = (
+    b"PK\x03\x04 data with SKYC and PK\x05\x06 inside" + bytes(30) + b"PK\x05\x06" + bytes(16) + b"\x04\x00" + b"note"
+)
+STREAM = [
+    (b"07_CMDSTART_upload_" + JSON + b"_EOF", Message(7, "upload", "", JSON)),
+    (b"07_CMDSTART_takeoff_0.5000_EOF", Message(7, "takeoff", "0.5000")),
+    (b"07_CMDSTART_land_EOF\n", Message(7, "land", "")),
+    (b"00_CMDSTART_start_absolute_EOF", Message(0, "start", "absolute")),
+    (b"00_CMDSTART_show_EOF", Message(0, "show", "")),
+    (b"START", Message(None, "show", "")),
+    (ARCHIVE + b"SKYC", ShowFile(ARCHIVE)),
+    (b"REQ_06", Request(6)),
+    (b"CMDSTART_param_stabilizer.controller=1_EOF", Message(None, "param", "stabilizer.controller=1")),
+    (b"CMDSTART_param_ctrl_mel.kp_xy=0.4_EOF", Message(None, "param", "ctrl_mel.kp_xy=0.4")),
+    (b"CMDSTART_4_traj_relative_" + JSON + b"_EOF", Message(4, "traj", "relative", JSON)),
+    (b"CMDSTART_hover_EOF", Message(None, "hover", "")),
+]
+"""Messages of the lab's programs, and their meaning."""
+BYTES = b"".join(message for message, _ in STREAM)
+EXPECTED = [expected for _, expected in STREAM]
+
+
+@pytest.mark.parametrize(("message", "expected"), STREAM, ids=[repr(m[:24]) for m, _ in STREAM])
+def test_every_message(message, expected):
+    frames = Frames()
+    assert list(frames.feed(message)) == [expected]
+    assert not frames.pending or message.endswith(b"\n")
+
+
+def test_joined_and_byte_by_byte():
+    assert list(Frames().feed(BYTES)) == EXPECTED
+    frames = Frames()
+    assert [frame for k in range(len(BYTES)) for frame in frames.feed(BYTES[k : k + 1])] == EXPECTED
+
+
+@given(st.lists(st.integers(0, len(BYTES)), max_size=12), st.permutations(range(len(STREAM))))
+def test_any_split_and_order(cuts, order):
+    stream = b"".join(STREAM[k][0] for k in order)
+    frames, found, begin = Frames(), [], 0
+    for end in [*sorted(cuts), len(stream)]:
+        found += frames.feed(stream[begin:end])
+        begin = end
+    assert found == [EXPECTED[k] for k in order]
+
+
+def feed_all(frames, parts):
+    return [frame for part in parts for frame in frames.feed(part)]
+
+
+GARBAGE = {
+    "text": b"hello",
+    "HTTP": b"GET / HTTP/1.1\r\n",
+    "zeros and more": bytes(10) + b"\x01",
+    "ID without command": b"07_LAND_EOF",
+    "capitals": b"07_CMDSTART_LAND_EOF",
+    "long ID": b"12345_CMDSTART_land_EOF",
+    "request without number": b"REQ_xy",
+    "no end": b"07_CMDSTART_takeoff_" + b"0" * 300,
+    "no end of JSON": b'07_CMDSTART_upload_{"a": 1}_ENDE',
+    "much after JSON": b'07_CMDSTART_upload_{"a": 1}' + b" " * 20,
+}
+
+
+@pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE)
+def test_garbage_is_refused(garbage):
+    with pytest.raises(FramingError):
+        list(Frames().feed(garbage))
+    frames = Frames()
+    with pytest.raises(FramingError):
+        feed_all(frames, [garbage[k : k + 1] for k in range(len(garbage))])
+
+
+def test_messages_in_front_of_garbage_count():
+    frames = Frames().feed(b"07_CMDSTART_land_EOFhello")
+    assert next(frames) == Message(7, "land", "")
+    with pytest.raises(FramingError):
+        next(frames)
+
+
+def test_sizes_are_bounded(monkeypatch):
+    monkeypatch.setattr(framing, "MAX_JSON", 1000)
+    monkeypatch.setattr(framing, "MAX_SHOW", 1000)
+    for begin in (b"07_CMDSTART_upload_{", b"PK\x03\x04"):
+        with pytest.raises(FramingError, match="at most 1000"):
+            feed_all(Frames(), [begin, *[b"a" * 50] * 30])
+
+
+def test_long_messages_in_small_parts():
+    """A megabyte of brackets, quotes and false ends."""
+    body = b'{"a": "' + b'_EOF\\"PK\x05\x06' * 100_000 + b'"}'
+    message, frames = b"07_CMDSTART_upload_" + body + b"_EOF", Frames()
+    found = [frame for k in range(0, len(message), 1000) for frame in frames.feed(message[k : k + 1000])]
+    assert found == [Message(7, "upload", "", body)]
+
+
+parts = st.sampled_from(
+    [
+        b"07_",
+        b"CMDSTART_",
+        b"upload_",
+        b"{",
+        b"}",
+        b'"',
+        b"\\",
+        b"_EOF",
+        b"SKYC",
+        b"START",
+        b"REQ_",
+        b"0",
+        b"\xff",
+        b" ",
+    ]
+    + [b"PK\x03\x04", b"PK\x05\x06", bytes(22)]
+)
+
+
+@given(st.lists(parts, max_size=40), st.integers(0, 10**6))
+def test_any_bytes_are_messages_or_refused_however_they_are_split(pieces, seed):
+    stream, pick = b"".join(pieces), random.Random(seed)
+
+    def read(size):
+        frames, found, begin = Frames(), [], 0
+        try:
+            while begin < len(stream):
+                n = size()
+                for frame in frames.feed(stream[begin : begin + n]):
+                    found.append(frame)
+                begin += n
+        except FramingError:
+            found.append(FramingError)
+        return found
+
+    assert read(lambda: len(stream)) == read(lambda: pick.randint(1, 5))

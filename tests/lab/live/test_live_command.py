@@ -1,0 +1,71 @@
+"""The command crazysim live, as a user runs it."""
+
+import socket
+
+import numpy as np
+import pytest
+
+from crazysim.__main__ import main
+from crazysim.lab.live.circles import CLIMB, HEIGHT, PERIOD, RADIUS, circling
+from crazysim.media import Flight
+
+
+def test_headless_it_flies_and_prints_the_factor(tmp_path, capsys):
+    path = tmp_path / "f.journal"
+    arguments = ["--drones", "3", "--seconds", "4", "--headless", "--speed", "max", "--record", str(path)]
+    assert main(["live", *arguments]) == 0
+    out = capsys.readouterr().out
+    assert "times real time" in out
+    assert f"recording to {path}" in out
+    flight = Flight.load(path)
+    assert len(flight.time) == 201
+    late = flight.pos[100:, 0]
+    assert np.abs(late[..., 2] - HEIGHT).max() < 0.3
+    assert np.ptp(late[..., :2], axis=0).min() > 0.8 * RADIUS
+
+
+def test_circles_are_consistent():
+    """Velocity and acceleration are derivatives of position once the drones have risen, and the start is at rest."""
+    places = np.array([[[1.0, 2.0, 0.0]]])
+    t, h = CLIMB + 0.3 * PERIOD, 1e-4
+    before, now, after = (circling(places, t + k * h)[0, 0] for k in (-1, 0, 1))
+    np.testing.assert_allclose(now[3:6], (after[:3] - before[:3]) / (2 * h), atol=1e-6)
+    np.testing.assert_allclose(now[6:9], (after[:3] - 2 * now[:3] + before[:3]) / h**2, atol=1e-5)
+    start = circling(places, 0.0)[0, 0]
+    np.testing.assert_allclose(start[:3], places[0, 0])
+    assert not start[3:9].any()
+
+
+def test_piloted_and_commanded(capsys):
+    assert main(["live", "--drones", "2", "--seconds", "0.5", "--headless", "--speed", "max", "--pilot"]) == 0
+    assert "pilot" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--headless"], "expected --seconds with --headless"),
+        (["--headless", "--browser", "--seconds", "1"], "expected --headless or --browser, got both"),
+        (["--headless", "--seconds", "1", "--speed", "fast"], "positive speed or max, got 'fast'"),
+        (["--headless", "--seconds", "1", "--speed", "-2"], "positive speed or 'max', got -2.0"),
+        (
+            ["--headless", "--seconds", "1", "--control-freq", "33"],
+            "state_freq is 33 Hz, which does not divide freq = 500 Hz",
+        ),
+        (["--headless", "--seconds", "1", "--record", "nowhere/f"], "file that can be created"),
+        (["--headless", "--seconds", "1", "--pilot", "--commands"], "or a pilot, got both"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(arguments, message, capsys):
+    assert main(["live", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert "\n" not in error
+
+
+def test_a_port_in_use_is_refused_in_one_line(viser, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert main(["live", "--browser", "--seconds", "1", "--port", str(taken.getsockname()[1])]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "expected a free address" in error
+    assert "\n" not in error

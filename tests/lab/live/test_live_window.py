@@ -1,0 +1,157 @@
+"""A live window on a virtual screen: what it shows, what keys and clicks do, and that it may be closed or killed."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from screens import screen_pixels, virtual_screen
+
+from crazysim.errors import ConfigError, RenderError
+from crazysim.lab.live import Live, Window
+from crazysim.lab.live.scene_bodies import SceneBodies
+from crazysim.lab.live.window_program import Leds, Program
+from crazysim.plugins.vehicles import Cars
+from crazysim.sim import Sim
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory):
+    yield from virtual_screen(tmp_path_factory.mktemp("screen"))
+
+
+WATCHED = textwrap.dedent("""
+    import sys, threading, time
+    import numpy as np
+    from crazysim import Sim
+    from crazysim.lab.live import Live, Window
+
+    sim = Sim(n_worlds=2, n_drones=1, control="state")
+    sim.spec.visual.quality.shadowsize = sim.spec.visual.quality.offsamples = 0  # drawn sooner without a GPU
+    pos = np.array([[[0.0, 0.0, 1.0]], [[0.3, 0.0, 1.0]]])
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    live = Live(sim, fps=10)
+    live.selected = None
+    live.paused = True
+    camera = {"lookat": [0, 0, 1], "distance": 2.0, "azimuth": 90, "elevation": -90}
+    window = live.show(Window(worlds=(0, 1), width=400, height=200, cam_config=camera, setpoints=False, trail=0.0))
+    other = live.show(Window(width=64, height=48))
+    thread = threading.Thread(target=live.run)
+    thread.start()
+    print("shown", flush=True)
+    for line in sys.stdin:
+        if line.strip() == "select":
+            live.post(lambda live: live.select(1, 0))
+        if line.strip() == "kill":
+            window._process.kill()
+            window._process.wait()
+        if line.strip() == "close":
+            other._process.kill()
+            thread.join(300)
+            assert not thread.is_alive() and not other.is_open, "the run ends with its last window"
+        time.sleep(0.1)
+        print(line.strip(), live.step, window.is_open, flush=True)
+    live.close()
+""")
+
+
+def marked(pixels):
+    """Return the columns of pixels, in the right tile, of the mark of the selected drone."""
+    tile = pixels[:200, 200:400].astype(int)
+    return 200 + np.nonzero(tile[..., 2] > tile[..., 0] + 25)[1]
+
+
+def test_a_window_shows_worlds_and_its_end_is_no_end(screen, opengl):
+    display, path = screen
+    environment = os.environ | {"DISPLAY": display, "MUJOCO_GL": "egl", "PYTHONPATH": ":".join(sys.path)}
+    command = [sys.executable, "-c", WATCHED]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as program:
+
+        def do(what):
+            program.stdin.write(what + "\n")
+            program.stdin.flush()
+            return program.stdout.readline().split()
+
+        assert program.stdout.readline().strip() == "shown"
+        for _ in range(20):
+            do("select")
+            columns = marked(screen_pixels(path))
+            if len(columns) > 50:
+                break
+        # The right tile shows world 1, whose drone is 0.3 m beside the middle, and is selected. From 2 m with 45
+        # degrees of height for 200 pixels a metre has 200 / (2 * 2 * tan 22.5) = 121 pixels: 36 beside the middle.
+        assert len(columns) > 50, "no mark of the selected drone"
+        np.testing.assert_allclose(columns.mean(), 200 + 100 + 36, atol=6)
+        assert do("kill") == ["kill", "0", "False"]
+        assert do("close")[0] == "close"
+        program.stdin.close()
+        assert program.wait(300) == 0
+
+
+def test_without_a_screen_a_window_is_refused(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if sys.platform != "linux":
+        pytest.skip("screens are known by name on Linux only")
+    with Live(Sim()) as live, pytest.raises(RenderError, match="expected a screen"):
+        live.show(Window())
+
+
+def test_wrong_settings(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":54321")
+    with pytest.raises(ConfigError, match="positive integers as width"):
+        Window(width=0)
+    with pytest.raises(ConfigError, match="trail of 0 s or more"):
+        Window(trail=-1.0)
+    with Live(Sim()) as live:
+        with pytest.raises(ConfigError, match="a world from 0 to 0, got 1"):
+            live.show(Window(worlds=[1]))
+        with pytest.raises(ConfigError, match="camera of the scene"):
+            live.show(Window(camera="front"))
+
+
+def test_a_screen_that_cannot_be_reached_is_refused(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":54321")
+    with Live(Sim()) as live, pytest.raises(RenderError, match="can open a window"):
+        live.show(Window())
+
+
+def test_leds_have_the_colours_of_the_picture():
+    model = Sim(n_drones=2).mj_model
+    before = model.mat_rgba.copy()
+    leds = Leds(model)
+    leds.color(np.array([[0.0, 0.0, 0.0], [0.2, 0.6, 0.0]]))
+    for name in ("led_top", "led_bot"):
+        np.testing.assert_allclose(model.material(f"{name}:1").rgba, [0.2, 0.6, 0.0, 1.0])
+        assert model.material(f"{name}:1").emission[0] == pytest.approx(0.6)
+    changed = np.flatnonzero((model.mat_rgba != before).any(-1))
+    assert {model.material(int(k)).name for k in changed} == {"led_top:1", "led_bot:1"}
+    leds.color(np.zeros((2, 3)))
+    np.testing.assert_array_equal(model.mat_rgba, before)
+
+
+def test_a_double_click_reports_the_body_below_it():
+    """A wheel is its car, and what does not move is the ground."""
+    sim = Sim(n_drones=2, control="state")
+    sim.add(Cars(2))
+    sim.scene.compile_if_edited()
+    program, said = Program.__new__(Program), []
+    program._model, program._bodies = sim.mj_model, SceneBodies(sim)
+    program._say = lambda *message: said.append(message)
+    picture = SimpleNamespace(worlds=np.array([3, 5]))
+
+    def geom_of(body):
+        return int(sim.mj_model.body_geomadr[sim.mj_model.body(body).id])
+
+    for body in ("cars_wheel:7", "cars:0", "drone:1"):
+        program._report(picture, (1, geom_of(body), np.zeros(3)))
+    program._report(picture, (0, geom_of("world"), np.array([1.0, 2.0, 0.0])))
+    program._report(picture, None)
+    assert said == [
+        ("follow", 5, "cars", 1), ("follow", 5, "cars", 0), ("follow", 5, "drone", 1), ("click", 3, [1.0, 2.0, 0.0]),
+    ]  # fmt: skip

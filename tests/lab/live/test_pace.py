@@ -1,0 +1,89 @@
+"""When control steps are due, by a clock of the test, and what is said about how well that was kept."""
+
+import numpy as np
+import pytest
+
+from crazysim.errors import ConfigError
+from crazysim.lab.live.pace import BIN, MAX_LAG, Pace
+
+
+class Clock:
+    def __init__(self):
+        self.now = 10.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def test_steps_are_due_at_their_times_whatever_the_work_takes(clock):
+    pace = Pace(0.01, 0.5, clock)
+    for k in range(5):
+        np.testing.assert_allclose(10.0 + 0.02 * k - clock.now, pace.due_in(), atol=1e-12)
+        clock.now += max(pace.due_in(), 0.0)
+        pace.begin(0.01 * k)
+        clock.now += 0.013
+    assert pace.steps == 5
+    assert pace.late == 0
+    assert pace.worst < 1e-9
+
+
+def test_a_late_step_is_counted_and_caught_up(clock):
+    pace = Pace(0.01, 1.0, clock)
+    pace.begin(0.0)
+    clock.now += 0.025
+    np.testing.assert_allclose(pace.begin(0.01), 0.015)
+    assert pace.due_in() < 0, "the next one is due at once"
+    np.testing.assert_allclose(pace.begin(0.02), 0.005)
+    assert pace.due_in() > 0
+    assert (pace.late, pace.lost) == (2, 0.0)
+    np.testing.assert_allclose((pace.worst, pace.worst_at), (0.015, 0.01))
+
+
+def test_a_long_lag_is_given_up(clock):
+    pace = Pace(0.01, 1.0, clock)
+    pace.begin(0.0)
+    clock.now += 1.01
+    pace.begin(0.01)
+    np.testing.assert_allclose(pace.lost, 1.0)
+    np.testing.assert_allclose(pace.due_in(), 0.01)
+    assert MAX_LAG < 1.0
+
+
+def test_quantiles_of_lateness(clock):
+    """999 of 1000 steps on time, one 7 ms late."""
+    pace = Pace(1.0, 1.0, clock)
+    for k in range(1000):
+        clock.now = 10.0 + k + (0.007 if k == 500 else 0.0)
+        pace.begin(k)
+    assert pace.quantile(0.999) <= BIN + 1e-9
+    np.testing.assert_allclose(pace.quantile(1.0), 0.007, atol=1e-9)
+
+
+def test_as_fast_as_possible_nothing_is_late(clock):
+    pace = Pace(0.01, "max", clock)
+    for k in range(10):
+        assert pace.due_in() == 0
+        clock.now += 1.0
+        pace.begin(k)
+    assert (pace.late, pace.worst, pace.quantile(0.999)) == (0, 0.0, 0.0)
+
+
+def test_a_change_of_speed_begins_now(clock):
+    pace = Pace(0.01, 1.0, clock)
+    pace.begin(0.0)
+    clock.now += 0.004
+    pace.speed = 0.1
+    assert pace.due_in() == 0
+    pace.begin(0.01)
+    np.testing.assert_allclose(pace.due_in(), 0.1)
+
+
+@pytest.mark.parametrize("speed", [0, -1, float("nan"), float("inf"), "fast", True])
+def test_wrong_speeds(speed):
+    with pytest.raises(ConfigError, match="positive speed or 'max'"):
+        Pace(0.01, speed)

@@ -1,0 +1,391 @@
+"""Swarms: commanders with the meaning of the firmware's commands, and the simulation that follows them."""
+
+import contextlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazysim import Sim
+from crazysim.control import Control
+from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.paths import Path, paths_of
+from crazysim.lab.live.swarm import Commander, DroneState, Swarm
+from crazysim.lab.live.swarm.plan import Plan, move, nearest_yaw
+from crazysim.trajectories import Trajectory, circle, line, minimum_snap
+
+OFFSET = 0.02
+"""Distance that a drone may still be from its setpoint shortly after a move, m."""
+
+
+def flying(control="state", **commands):
+    """Return a commander in flight at (1, 2, 1)."""
+    commander = Commander(Control(control))
+    tick(commander, 10.0)
+    for name, arguments in commands.items():
+        getattr(commander, name)(*arguments)
+    return commander
+
+
+def tick(commander, now, pos=(1.0, 2.0, 1.0), yaw=0.5):
+    return commander.tick(now, np.array(pos), np.zeros(3), yaw)
+
+
+# Plans --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_move_begins_and_ends_as_it_must():
+    rng = np.random.default_rng(0)
+    begin, goal = rng.normal(size=(3, 4)), rng.normal(size=4)
+    path = move(begin, goal, 2.5)
+    np.testing.assert_allclose(path.derivatives(0.0, 2), begin, atol=1e-12)
+    end = path.derivatives(2.5, 3)
+    np.testing.assert_allclose(end, [goal, [0] * 4, [0] * 4, [0] * 4], atol=1e-10)
+    np.testing.assert_allclose(path.derivatives(0.0, 3)[3], 0, atol=1e-10)
+    straight = move(begin, goal, 2.5, linear=True)
+    np.testing.assert_allclose(straight.at(1.25), (begin[0] + goal) / 2)
+
+
+def test_a_reversed_slow_plan():
+    path = Path.of(line([0, 0, 1], [2, 0, 1], 4.0))
+    plan = Plan(path, 1.0, timescale=2.0, reversed=True)
+    np.testing.assert_allclose(plan.at(1.0)[0, :3], [2, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(plan.at(5.0)[0, :3], [1, 0, 1], atol=1e-6)
+    ahead = (plan.at(5.01)[0] - plan.at(4.99)[0]) / 0.02
+    np.testing.assert_allclose(plan.at(5.0)[1], ahead, atol=1e-5)
+    np.testing.assert_allclose(plan.at(5.0)[2], (plan.at(5.01)[1] - plan.at(4.99)[1]) / 0.02, atol=1e-5)
+    assert not plan.finished(8.9)
+    assert plan.finished(9.0)
+
+
+def test_paths_equal_trajectories():
+    trajectories = [circle(radius=0.5, period=3.0), minimum_snap([[0, 0, 1], [1, 0, 2], [2, 1, 1]], [1.0, 2.0])]
+    for path, trajectory in zip(paths_of(trajectories), trajectories, strict=True):
+        for t in (-1.0, 0.0, 0.7, 1.0, 2.9, 4.1):
+            s = trajectory.evaluate(t)
+            expected = [[*s.pos, *s.yaw], [*s.vel, *s.yaw_rate], [*s.acc, *s.yaw_acc]]
+            np.testing.assert_allclose(path.derivatives(t, 2), expected, atol=2e-3)
+    assert len(paths_of(Trajectory.stack(trajectories))) == 2
+    assert len(paths_of(trajectories[0])) == 1
+
+
+def test_the_nearest_yaw():
+    assert nearest_yaw(3.0, -3.0) == pytest.approx(2 * np.pi - 3.0)
+    assert nearest_yaw(7.0, 0.5) == pytest.approx(2 * np.pi + 0.5)
+
+
+# Commander ----------------------------------------------------------------------------------------------------------
+
+
+def test_motors_are_off_before_take_off_and_after_landing():
+    commander = Commander()
+    assert tick(commander, 0.0) is None
+    commander.take_off(1.5, 2.0, yaw=0.0)
+    np.testing.assert_allclose(tick(commander, 2.0)[:3], [1, 2, 1.5])
+    commander.land(0.1, 1.0)
+    assert tick(commander, 2.99, pos=(1, 2, 0.1)) is not None
+    assert tick(commander, 3.0, pos=(1, 2, 0.1)) is None
+
+
+def test_a_landing_goes_on_where_the_drone_is_still_too_high():
+    """A controller with an offset, a load, or a pad that is higher than the target."""
+    commander = flying(land=(0.04, 1.0))
+    above = np.array([1.0, 2.0, 0.13])
+    heights = [commander.tick(now, above, np.array([0, 0, -0.2]), 0.5)[2] for now in (11.0, 11.1, 11.3, 20.0)]
+    np.testing.assert_allclose(heights, [0.04, 0.01, -0.05, -0.96], atol=1e-9)
+    assert commander.tick(20.1, above * [1, 1, 0.05 / 0.13], np.array([0, 0, -0.2]), 0.5) is None
+    standing = flying(land=(0.04, 1.0))
+    assert standing.tick(11.4, above, np.zeros(3), 0.5) is not None
+    assert standing.tick(11.6, above, np.zeros(3), 0.5) is None
+
+
+def test_commands_are_in_the_frame_of_the_estimate():
+    """A drone at (1, 2) with yaw 0.5 whose estimate is (5, 5) with yaw 0.5 + pi / 2: forward is to the left there."""
+    commander = flying()
+    commander.place_estimate(np.array([1.0, 2.0, 1.0]), 0.5, np.array([5.0, 5.0, 0.0, 0.5 + np.pi / 2]))
+    commander.go_to([5.0, 6.0, 0.5], 0.5 + np.pi / 2, 1.0)
+    tick(commander, 11.0)
+    command = tick(commander, 13.0)
+    np.testing.assert_allclose(command[:3], [2.0, 2.0, 1.5], atol=1e-9)
+    np.testing.assert_allclose(command[9:13], [0, 0, np.sin(0.25), np.cos(0.25)], atol=1e-9)
+    state = DroneState(0.0, np.array([2.0, 2.0, 1.0]), command[9:13], np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3))
+    found = commander.estimate(state)
+    np.testing.assert_allclose([*found.pos, *found.vel], [5, 6, 0, 0, 1, 0], atol=1e-9)
+    assert found.rpy[2] == pytest.approx(0.5 + np.pi / 2)
+    level = flying("attitude")
+    level.place_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
+    level.command("attitude", [0.1, 0.2, 1.3, 0.4])
+    np.testing.assert_allclose(tick(level, 10.1), [0.1, 0.2, 0.3, 0.4])
+    commander.reset()
+    assert commander.estimate(state) is state
+
+
+def test_parameters_have_an_effect_or_are_refused():
+    swarm = Swarm(Sim(control="state"))
+    values = swarm.parameters[0]
+    kept = dict(values)
+    for name, value in {"stabilizer.controller": 2, "ring.effect": 6, "pid_attitude.pitch_kd": 0.1234}.items():
+        with pytest.raises(ConfigError, match="expected a value whose effect is simulated"):
+            swarm.set_parameter(0, name, value)
+    for name, value in {"deck.bcFlow2": 0, "ring.fadeTime": np.nan}.items():
+        with pytest.raises(ConfigError, match="can be written"):
+            swarm.set_parameter("cf1", name, value)
+    for name in ("sound.freq", "no.thing"):
+        with pytest.raises(ConfigError, match=r"has, got .*lists the parameters"):
+            swarm.set_parameter(0, name, 1)
+        with pytest.raises(ConfigError, match="lists the parameters"):
+            values.get_value(name)
+    for name, value in kept.items():
+        if not values.kinds[name].read_only:
+            swarm.set_parameter(0, name, np.float32(value))
+    assert dict(values) == pytest.approx(kept)
+    assert {"pid_attitude.roll_kp": 6.0, "pid_attitude.yaw_kd": 0.35}.items() <= kept.items()
+
+
+def test_lights_fade_and_shine_by_their_effect():
+    swarm = Swarm(Sim(control="state"))
+    swarm.set_parameter(0, "ring.solidRed", 255)
+    np.testing.assert_array_equal(swarm.colors[0], 0)
+    swarm.set_parameter(0, "ring.effect", 7)
+    np.testing.assert_allclose(swarm.colors[0], [1, 20 / 255, 20 / 255])
+    swarm.set_parameter(0, "ring.fadeTime", 0.0)
+    swarm.set_parameter(0, "ring.fadeColor", 0x000000)
+    swarm.set_parameter(0, "ring.effect", 14)
+    swarm.set_parameter(0, "ring.fadeTime", 1.0)
+    swarm.set_parameter(0, "ring.fadeColor", 0xFF3300)
+    np.testing.assert_array_equal(swarm.colors[0], 0)
+    swarm.advance(0.5)
+    np.testing.assert_allclose(swarm.colors[0], [0.5, 0.1, 0], atol=0.011)  # of a control step
+    swarm.advance(1.0)
+    np.testing.assert_allclose(swarm.colors[0], [1, 0.2, 0], atol=1e-12)
+    swarm.set_parameter(0, "colorLedBot.wrgb8888", 0x10200000)
+    np.testing.assert_allclose(swarm.colors[0], np.array([48, 16, 16]) / 255)
+    swarm.colors[0] = 0.5  # of a program
+    swarm.advance(0.1)
+    np.testing.assert_array_equal(swarm.colors[0], 0.5)
+    swarm.set_parameter(0, "ring.effect", 13)
+    swarm.set_leds(0, np.array([0xF800] * 6 + [0x001F] * 6))
+    np.testing.assert_allclose(swarm.colors[0], [0.5, 0, 0.5])
+
+
+def test_moves_continue_from_the_setpoint_in_force():
+    commander = flying(go_to=([2, 2, 1], 0.5, 2.0))
+    command = tick(commander, 11.0, pos=(9, 9, 9))
+    velocity = command[3:6].copy()
+    assert velocity[0] > 0.5
+    commander.go_to([0, 0, 1], 0.0, 3.0, relative=True)
+    again = tick(commander, 11.0, pos=(9, 9, 9))
+    np.testing.assert_allclose(again[3:6], velocity)
+    assert tick(commander, 20.0)[0] == pytest.approx(command[0])
+
+
+def test_groups():
+    commander = Commander()
+    commander.group = 0b101
+    assert [commander.in_group(mask) for mask in (0, 1, 2, 4, 6)] == [True, True, False, True, True]
+
+
+def test_trajectories_start_where_they_must():
+    path = Path.of(line([0, 0, 1], [2, 0, 1], 4.0))
+    commander = flying(upload=(3, path), take_off=(1.0, 1.0))
+    tick(commander, 12.0)
+    commander.start_trajectory(3)
+    np.testing.assert_allclose(tick(commander, 16.0)[:3], [3, 2, 1])
+    commander.start_trajectory(3, relative=False)
+    np.testing.assert_allclose(tick(commander, 20.0)[:3], [2, 0, 1], atol=1e-6)
+    commander.start_trajectory(3, relative=True, relative_yaw=True)
+    assert commander.goal()[0, 3] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_streamed_setpoints_come_first_until_they_stop():
+    commander = flying(go_to=([5, 0, 1], 0.0, 1.0))
+    commander.position([1, 1, 1], 0.1)
+    np.testing.assert_allclose(tick(commander, 10.1)[:3], [1, 1, 1])
+    commander.go_to([5, 0, 1], 0.0, 1.0)
+    np.testing.assert_allclose(tick(commander, 10.2)[:3], [1, 1, 1])  # the stream is still in force
+    commander.notify_setpoints_stop(0.1)
+    np.testing.assert_allclose(tick(commander, 10.25)[:3], [1, 1, 1])
+    assert tick(commander, 11.5)[0] == pytest.approx(5.0)
+
+
+def test_high_level_commands_begin_at_the_drone_while_setpoints_stream():
+    reports = []
+    commander = Commander(report=reports.append)
+    tick(commander, 10.0, pos=(2.0, -1.0, 1.0), yaw=0.3)
+    commander.position([5, 5, 5], 1.0)
+    commander.notify_setpoints_stop()
+    np.testing.assert_allclose(commander.goal()[0], [2, -1, 1, 0.3])  # the stream has set no setpoint yet
+    commander.land(0.0, 2.0)
+    np.testing.assert_allclose(tick(commander, 12.0, pos=(2.0, -1.0, 0.5))[:3], [2, -1, 0], atol=1e-9)
+    assert not reports
+
+    commander.position([5, 5, 5], 1.0)
+    tick(commander, 12.1, pos=(3.0, 0.0, 1.0))
+    commander.go_to([1, 0, 0], 0.0, 1.0, relative=True)
+    assert len(reports) == 1
+    assert "before go_to" in reports[0]
+    assert "notify_setpoints_stop" in reports[0]
+    np.testing.assert_allclose(tick(commander, 12.2)[:3], [5, 5, 5])
+    commander.notify_setpoints_stop()
+    np.testing.assert_allclose(tick(commander, 13.2)[:3], [4, 0, 1], atol=1e-9)
+
+
+def test_a_stream_that_ends_keeps_the_place_and_then_stops_the_motors():
+    commander = flying(velocity=([1, 0, 0], 0.0))
+    assert tick(commander, 10.4)[0] == pytest.approx(1.4)
+    stays = tick(commander, 10.6, pos=(3, 3, 3))
+    np.testing.assert_allclose(stays[:6], [3, 3, 3, 0, 0, 0])
+    np.testing.assert_allclose(tick(commander, 11.9, pos=(4, 4, 4))[:3], [3, 3, 3])
+    assert tick(commander, 12.1) is None
+
+
+def test_hover_setpoints_turn_with_the_drone():
+    commander = flying(hover=(0.5, 0.0, 0.0, 1.7))
+    command = tick(commander, 10.2)
+    np.testing.assert_allclose(command[:3], [1 + 0.1 * np.cos(0.5), 2 + 0.1 * np.sin(0.5), 1.7])
+    np.testing.assert_allclose(command[3:6], [0.5 * np.cos(0.5), 0.5 * np.sin(0.5), 0], atol=1e-12)
+
+
+def test_attitudes_integrate_the_yaw_rate():
+    commander = flying("attitude", attitude=(0.1, 0.2, 1.0, 0.4))
+    np.testing.assert_allclose(tick(commander, 10.2), [0.1, 0.2, 0.7, 0.4])
+    np.testing.assert_allclose(tick(commander, 10.9), [0.0, 0.0, 0.7, 0.4])
+
+
+def test_emergency_and_disarming():
+    commander = flying(go_to=([2, 2, 1], 0.5, 2.0))
+    commander.arm(False)
+    assert tick(commander, 10.1) is None
+    with pytest.raises(ConfigError, match="disarmed"):
+        commander.take_off(1.0, 1.0)
+    commander.arm()
+    commander.take_off(1.0, 1.0)
+    commander.emergency()
+    assert tick(commander, 10.2) is None
+    with pytest.raises(ConfigError, match="locked"):
+        commander.take_off(1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    "name, arguments, error",
+    [
+        ("take_off", (np.nan, 1.0), "finite numbers"),
+        ("take_off", (1.0, 0.0), "positive duration"),
+        ("land", (0.0, -1.0), "positive duration"),
+        ("go_to", ([0, 0], 0.0, 1.0), "3 finite numbers"),
+        ("go_to", ([0, 0, 1e9], 0.0, 1.0), "3 finite numbers"),
+        ("go_to", ("abc", 0.0, 1.0), "3 numbers for goal"),
+        ("start_trajectory", (7,), "one of the trajectories"),
+        ("upload", (300, None), "from 0 to 255"),
+        ("full_state", ([0] * 3, [0] * 3, [0] * 3, [0] * 4, [0] * 3), "unit quaternion"),
+        ("attitude", (0, 0, 0, 0.4), "of level 'attitude'"),
+        ("command", ("attitude", [0, 0, 0, 0.4]), "of level 'attitude'"),
+    ],
+)
+def test_wrong_commands(name, arguments, error):
+    commander = flying()
+    with pytest.raises(ConfigError, match=error):
+        getattr(commander, name)(*arguments)
+    assert tick(commander, 10.1) is None
+
+
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+calls = st.one_of(
+    st.tuples(st.sampled_from(["take_off", "land"]), st.tuples(numbers, numbers)),
+    st.tuples(st.just("go_to"), st.tuples(st.tuples(numbers, numbers, numbers), numbers, numbers, st.booleans())),
+    st.tuples(st.just("velocity"), st.tuples(st.tuples(numbers, numbers, numbers), numbers)),
+    st.tuples(st.just("hover"), st.tuples(numbers, numbers, numbers, numbers)),
+    st.tuples(st.just("position"), st.tuples(st.tuples(numbers, numbers, numbers), numbers)),
+    st.tuples(st.just("start_trajectory"), st.tuples(st.integers(0, 2), numbers)),
+    st.tuples(st.just("stop"), st.just(())),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(sequence=st.lists(st.tuples(st.floats(0.01, 3.0), calls), max_size=8))
+def test_setpoints_stay_finite_whatever_is_commanded(sequence):
+    commander = flying(upload=(1, Path.of(circle(radius=0.5, period=2.0))))
+    now = 10.0
+    for dt, (name, arguments) in sequence:
+        with contextlib.suppress(ConfigError):
+            getattr(commander, name)(*arguments)
+        now += dt
+        found = tick(commander, now)
+        assert found is None or np.isfinite(found.astype(np.float32)).all()
+
+
+# Swarm --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def swarm():
+    return Swarm(Sim(n_drones=2, control="state"), ["a", "b"])
+
+
+def test_a_swarm_reports_a_command_that_a_stream_keeps_from_taking_effect(swarm):
+    swarm["b"].position([0, 0, 1], 0.0)
+    swarm["b"].take_off(1.0, 1.0)
+    assert [(r.name, "before take_off" in r.text) for r in swarm.reports.latest] == [("b", True)]
+    swarm["b"].reset()
+
+
+def test_a_swarm_flies(swarm):
+    swarm.sim.reset()
+    swarm.advance(0.1)
+    home = swarm.home("a")
+    swarm["a"].take_off(1.0, 2.0)
+    swarm.advance(3.0)
+    np.testing.assert_allclose(swarm.state("a").pos, [*home[:2], 1.0], atol=OFFSET)
+    np.testing.assert_allclose(swarm.state("b").pos, swarm.home("b"), atol=0.01)
+    np.testing.assert_allclose(swarm.state("a").acc, [0, 0, 9.81], atol=0.3)
+    swarm["a"].go_to([0.5, 0.0, 0.0], np.pi / 2, 2.0, relative=True)
+    swarm.advance(3.0)
+    np.testing.assert_allclose(swarm.state("a").pos[:2], home[:2] + [0.5, 0.0], atol=0.05)
+    assert swarm.state("a").rpy[2] == pytest.approx(np.pi / 2, abs=0.05)
+    swarm["a"].land(0.0, 2.0)
+    swarm.advance(3.0)
+    assert swarm.state("a").pos[2] < 0.02
+    assert not swarm["a"].motors_on
+    rotor = np.asarray(swarm.sim.data.states.rotor_vel)[0]
+    assert rotor.max() < 2000  # rpm: the rotors run down
+
+
+def test_a_reset_returns_to_the_floor(swarm):
+    swarm["b"].take_off(1.0, 1.0)
+    swarm.advance(1.0)
+    swarm.sim.reset()
+    swarm.advance(0.1)
+    assert not swarm["b"].motors_on
+    assert swarm.time == pytest.approx(0.1)
+
+
+def test_a_thread_flies_in_real_time(swarm):
+    swarm.sim.reset()
+    swarm.advance(0.1)
+    with swarm.start(speed=4.0):
+        before = swarm.time
+        swarm.sleep(0.5)
+        assert swarm.time - before >= 0.5 - 1e-6
+        with pytest.raises(ConfigError, match="running one"):
+            swarm.advance(0.1)
+    swarm.advance(0.1)
+
+
+def test_a_loop_calls_the_swarm_and_shows_its_colours(swarm):
+    swarm.colors[0] = (1.0, 0.5, 0.0)
+    live = Live(swarm.sim)
+    swarm(live)
+    np.testing.assert_array_equal(live.lights[0], swarm.colors)
+    with pytest.raises(ConfigError, match="that of another"):
+        swarm(Live(Sim(control="state")))
+
+
+def test_wrong_swarms(swarm):
+    with pytest.raises(ConfigError, match="one world"):
+        Swarm(Sim(n_worlds=2, control="state"))
+    with pytest.raises(ConfigError, match="1 different names"):
+        Swarm(Sim(control="state"), ["a", "b"])
+    with pytest.raises(UnknownNameError, match="expected one of the drones"):
+        swarm["c"]

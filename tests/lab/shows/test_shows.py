@@ -1,0 +1,272 @@
+"""Flying shows: closest approaches, collisions and tracking errors by hand, films, pages, the command."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from screens import screen_pixels, virtual_screen
+
+from crazysim.__main__ import main
+from crazysim.errors import ConfigError
+from crazysim.lab.show_files import Lights, Show, save_show
+from crazysim.lab.shows import (
+    collisions,
+    film,
+    fly,
+    live_show,
+    page,
+    report,
+    sampled_approaches,
+    summary,
+    tracking_rms,
+)
+from crazysim.trajectories import Trajectory, line
+
+LIGHTS = [
+    Lights.of_pieces([0.0, 1.0], [(1, 0, 0), (0, 0, 1)]),
+    Lights.of_pieces([0.0, 2.0], [(0, 0, 0), (1, 1, 1)], [(1, 1, 1), (1, 1, 1)]),
+    Lights.constant((0, 1, 0)),
+]
+SHOW = Show(
+    names=("a", "b", "c"),
+    trajectories=Trajectory.stack(
+        [
+            line((0, 0, 1), (1, 0, 1), 2.0),
+            line((1, 0.02, 1), (0, 0.02, 1), 2.0),
+            line((0.5, 2, 0.5), (0.5, 2, 1.5), 2.0),
+        ]
+    ),
+    lights=Lights.stack(LIGHTS),
+    settings={"validation": {"minDistance": 0.3}},
+)
+"""Two drones that meet head-on after 1 s, 2 cm beside each other, and a third beside them."""
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return fly(SHOW)
+
+
+def test_closest_approach_of_straight_lines():
+    """Between samples: two drones at 1 m/s each, which pass 0.3 m beside each other at 1.234 s."""
+    t = np.arange(0.0, 3.0, 0.1)
+    x = t - 1.234
+    pos = np.stack([np.stack([x, 0 * x, 0 * x], -1), np.stack([-x, 0 * x + 0.3, 0 * x], -1)], axis=1)
+    distance, when = sampled_approaches(t, pos)
+    assert distance[0, 1] == distance[1, 0] == pytest.approx(0.3, abs=1e-6)
+    assert when[0, 1] == pytest.approx(1.234, abs=1e-6)
+    assert np.all(np.isinf(np.diag(distance)))
+
+
+@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(2, 5))
+def test_closest_approach_is_at_most_the_closest_sample(seed, n, n_drones):
+    pos = np.random.default_rng(seed).normal(size=(n, n_drones, 3)).cumsum(axis=0)
+    distance, when = sampled_approaches(0.5 * np.arange(n), pos)
+    between = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1).min(0)
+    off = ~np.eye(n_drones, dtype=bool)
+    assert np.all(distance[off] <= between[off] + 1e-12)
+    assert np.all((when >= 0) & (when <= 0.5 * (n - 1)))
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory):
+    yield from virtual_screen(tmp_path_factory.mktemp("screen"))
+
+
+PLAYED = """
+import sys
+from crazysim.__main__ import main
+from crazysim.scene.window import Window
+from crazysim.lab.shows import fly, view
+from crazysim.lab.show_files import load_show
+
+opened, frames = Window.__init__, []
+
+def open_coarse(self, model, *settings):
+    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
+    opened(self, model, *settings)
+
+Window.__init__ = open_coarse
+view.MAX_FPS = 10.0
+
+def close(sim, world):
+    frames.append(sim.time)
+    if len(frames) == 3:
+        window = sim.viewer._windows[0]
+        window._glfw.set_window_should_close(window._window, True)
+
+assert main(["show", sys.argv[1], "--window"]) == 0
+view.play(fly(load_show(sys.argv[1])), speed=0.0015, draw=close, width=64, height=48)
+print("frames", len(frames))
+"""
+
+
+def test_a_window_plays_the_show_from_its_start_until_it_is_closed(screen, tmp_path, opengl):
+    """A drone is lit red, then blue: both are seen, although opening the window takes as long as the show.
+
+    The second window would stay open for 1,333 s.
+    """
+    slow = Trajectory.stack([line((0, 0, 1), (1, 0, 1), 2.0)])
+    lights = Lights.stack([Lights.of_pieces([0.0, 1.0], [(1, 0, 0), (0, 0, 1)])])
+    save_show(Show(names=("a",), trajectories=slow, lights=lights), tmp_path / "show.skyc")
+    cache = {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
+    environment = os.environ | cache | {"DISPLAY": screen[0], "MUJOCO_GL": "glfw"}
+    arguments = [sys.executable, "-c", PLAYED, str(tmp_path / "show.skyc")]
+    program = subprocess.Popen(arguments, stdout=subprocess.PIPE, env=environment, text=True)
+    deadline, seen = time.monotonic() + 300, []
+    while program.poll() is None and time.monotonic() < deadline:
+        picture = screen_pixels(screen[1], wait=False)[::2, ::2].astype(np.int16)
+        red = np.all(picture[..., :1] > picture[..., 1:] + 180, axis=-1).sum()
+        blue = np.all(picture[..., 2:] > picture[..., :2] + 180, axis=-1).sum()
+        seen += [name for name, n in (("red", red), ("blue", blue)) if n > 12 and name not in seen]
+        time.sleep(0.1)
+    out = program.communicate(timeout=300)[0]
+    assert program.returncode == 0
+    assert " 2.0 s, computed in" in out
+    assert out.endswith("frames 3\n")
+    assert seen == ["red", "blue"]
+
+
+def test_planned_is_the_show(flight):
+    assert flight.times[0] == 0.0
+    assert flight.duration == pytest.approx(2.0)
+    np.testing.assert_allclose(flight.planned[0], [[0, 0, 1], [1, 0.02, 1], [0.5, 2, 0.5]], atol=1e-6)
+    np.testing.assert_allclose(flight.planned[-1], [[1, 0, 1], [0, 0.02, 1], [0.5, 2, 1.5]], atol=1e-6)
+    np.testing.assert_allclose(flight.pos[0], flight.planned[0], atol=1e-6)
+    at = np.searchsorted(flight.times, [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(flight.colors[at, 0], [(1, 0, 0), (0, 0, 1), (0, 0, 1)])
+    np.testing.assert_allclose(flight.colors[at, 1, 0], [0.25, 0.5, 0.75], atol=1e-6)
+
+
+def test_report(flight):
+    figures = json.loads(json.dumps(report(flight)))
+    assert set(figures) == {"planned", "flown"}
+    assert set(figures["planned"]) == {"closest", "duration"}
+    assert set(figures["flown"]) == {"closest", "tracking_rms", "duration"}
+    for kind in figures.values():
+        assert kind["duration"] == pytest.approx(2.0)
+        assert sorted(sorted(pair["drones"]) for pair in kind["closest"]) == [["a", "b"], ["a", "c"], ["b", "c"]]
+        distances = [pair["distance"] for pair in kind["closest"]]
+        assert distances == sorted(distances)
+    nearest = figures["planned"]["closest"][0]
+    assert nearest["drones"] == ["a", "b"]
+    assert nearest["distance"] == pytest.approx(0.02, abs=1e-4)
+    assert nearest["time"] == pytest.approx(1.0, abs=1e-3)
+    flown = figures["flown"]["closest"][0]
+    assert flown["drones"] == ["a", "b"]
+    assert flown["time"] == pytest.approx(1.0, abs=0.4)
+    assert flown["distance"] != nearest["distance"]
+    errors = np.linalg.norm(flight.pos - flight.planned, axis=-1)
+    assert figures["flown"]["tracking_rms"]["a"] == pytest.approx(np.sqrt(np.mean(errors[:, 0] ** 2)), rel=1e-5)
+    assert 0.001 < figures["flown"]["tracking_rms"]["a"] < 0.3
+    assert tracking_rms(flight)["c"] < 0.3
+
+
+def test_collisions_are_listed(flight):
+    (found,) = collisions(flight)
+    assert found["drones"] == ["a", "b"]
+    assert 0.5 < found["time"] < 1.4
+    text = summary(flight, report(flight))
+    assert "a and b" in text
+    assert "1 of 3 pairs closer than the show's 0.3 m" in text
+    assert "collisions        1: a and b" in text
+
+
+def test_part_of_a_show_and_wrong_settings():
+    short = fly(SHOW, seconds=0.5)
+    assert short.duration == pytest.approx(0.5)
+    assert len(short.times) == len(short.pos) == len(short.planned) == len(short.colors)
+    for seconds in (0.0, -1.0, float("nan")):
+        with pytest.raises(ConfigError, match="positive duration"):
+            fly(SHOW, seconds=seconds)
+    with pytest.raises(ConfigError, match="different names"):
+        SHOW.replace(names=("a", "a", "c"))
+    with pytest.raises(ConfigError, match="one entry for each of 2 drones"):
+        SHOW.replace(names=("a", "b"))
+
+
+def test_film_has_the_colours_of_the_lights(flight, tmp_path, opengl):
+    from crazysim.lab.shows.view import media_flight, view_of
+    from crazysim.media.flight_recorder import put
+
+    view = view_of(flight, width=320, height=240, text=None)
+    data = flight.sim.data
+    images = []
+    for now in (0.3, 1.95):  # not while a collision is marked
+        put(flight.sim, media_flight(flight), now)
+        images.append(view.render(flight.sim).astype(int))
+    flight.sim.data = data
+    reddish = [int(((x[..., 0] > 150) & (x[..., 1:].max(-1) < 90)).sum()) for x in images]
+    bluish = [int(((x[..., 2] > 150) & (x[..., :2].max(-1) < 90)).sum()) for x in images]
+    assert reddish[0] > reddish[1]
+    assert bluish[1] > bluish[0]
+    flight.sim.close()
+    assert film(flight, tmp_path / "show.mp4", fps=2, width=320, height=240) == 5
+    put(flight.sim, media_flight(flight), 1.95)
+    night = view.render(flight.sim).astype(int)
+    flight.sim.data = data
+    assert np.median(night) < 0.5 * np.median(images[1])  # the scene is dark, the lights are not
+    assert np.percentile(night.max(-1), 99.9) > 120
+    assert (tmp_path / "show.mp4").stat().st_size > 1000
+
+
+def test_page_has_lights_that_change(flight, viser):
+    from crazysim.lab.shows.view import media_flight
+    from crazysim.media import web
+
+    recorded = media_flight(flight)
+    still = np.broadcast_to(flight.colors[:1], flight.colors.shape)
+    sizes = [len(web.page(recorded)), len(web.page(recorded, lights=still)), len(page(flight))]
+    assert sizes[0] < sizes[1]
+    assert sizes[1] + 300 < sizes[2]
+    with pytest.raises(ConfigError, match="lights of shape"):
+        web.page(recorded, lights=flight.colors[:3])
+
+
+def test_command(tmp_path, capsys):
+    save_show(SHOW, tmp_path / "show.skyc")
+    arguments = ["show", str(tmp_path / "show.skyc"), "--report", str(tmp_path / "report.json")]
+    assert main([*arguments, "--seconds", "1.2"]) == 0
+    text = capsys.readouterr().out
+    assert "3 drones, 1.2 s" in text
+    figures = json.loads((tmp_path / "report.json").read_text())
+    assert figures["flown"]["duration"] == pytest.approx(1.2)
+    for wrong in (
+        ["--film", "show.txt"],
+        ["--page", "page.txt"],
+        ["--report", "nowhere/report.json"],
+        ["--seconds", "0"],
+    ):
+        assert main(["show", str(tmp_path / "show.skyc"), *wrong]) == 2
+        assert "expected" in capsys.readouterr().err
+    assert main(["show", str(tmp_path / "nowhere.skyc")]) == 2
+
+
+def test_a_live_show_has_lights():
+    """The LEDs of the show at three moments, and drones where the plan has them."""
+    seen = {}
+    with live_show(SHOW, speed="max") as live:
+        for at in (0.5, 1.5):
+            live.at(at, lambda live: seen.update({live.step: live.lights[0].copy()}))
+        live.run(SHOW.duration)
+        expected = SHOW.lights.colors([0.5, 1.5])
+        np.testing.assert_allclose([seen[50], seen[150]], expected, atol=1e-6)
+        np.testing.assert_array_equal(expected[:, 0], [[1, 0, 0], [0, 0, 1]])
+        np.testing.assert_allclose(live.sim.data.states.pos[0], [[1, 0, 1], [0, 0.02, 1], [0.5, 2, 1.5]], atol=0.1)
+        live.go_to(0.5)
+        np.testing.assert_allclose(live.lights[0], SHOW.lights.colors([live.time - 0.01])[0], atol=0.05)
+
+
+def test_the_live_command(tmp_path, capsys):
+    save_show(SHOW, tmp_path / "show.skyc")
+    main(["show", str(tmp_path / "show.skyc"), "--live", "--seconds", "0.2"])
+    assert "times real time" in capsys.readouterr().out
+    assert main(["show", str(tmp_path / "show.skyc"), "--live", "--film", str(tmp_path / "a.mp4")]) == 2
+    assert "expected --live or --film, got both" in capsys.readouterr().err
