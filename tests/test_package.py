@@ -1,6 +1,7 @@
 """The package as its users get it: what it needs, what it exports, what the wheel holds."""
 
 import ast
+import collections
 import importlib
 import re
 import subprocess
@@ -97,6 +98,32 @@ def test_extras_are_never_imported_at_module_level():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert not extras & {name.split(".")[0] for name in names}, source
+
+
+def undocumented(sources):
+    """Return the public methods of public classes that neither the class nor a base of the package documents."""
+    classes = [node for source in sources for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
+    methods, bases = collections.defaultdict(dict), collections.defaultdict(set)
+    for node in classes:
+        for x in node.body:
+            if isinstance(x, ast.FunctionDef):
+                methods[node.name][x.name] = bool(ast.get_docstring(x)) or methods[node.name].get(x.name, False)
+        bases[node.name] |= {ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases}
+
+    def is_documented(name, method, seen=()):
+        return name not in seen and (
+            methods[name].get(method, False) or any(is_documented(b, method, (*seen, name)) for b in bases[name])
+        )
+
+    public = [(name, method) for name in list(methods) for method in list(methods[name]) if name[0] != "_" != method[0]]
+    return [f"{name}.{method}" for name, method in public if not is_documented(name, method)]
+
+
+def test_public_methods_are_documented_where_they_are_defined_or_in_a_base():
+    """Ruff's D102 also complains about overrides."""
+    assert not undocumented(source.read_text() for source in SOURCES)
+    assert undocumented(["class A:\n    def f(self): ...\nclass B(A):\n    def f(self): ..."]) == ["A.f", "B.f"]
+    assert not undocumented(["class A:\n    def f(self): 'Return 1.'\nclass B(A):\n    def f(self): ..."])
 
 
 def test_the_wheel_holds_scene_airframes_and_type_marker(tmp_path):
