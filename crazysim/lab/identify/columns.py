@@ -150,11 +150,13 @@ def _numbers(name: str, key: str, values: NDArray) -> NDArray:
             f"{name}: expected one number a sample in column {key}, got {got}. "
             "Convert it to numbers, or name another column."
         )
-    return plausible(x.astype(np.float64))
+    return plausible(x)
 
 
 def plausible(x: NDArray) -> NDArray:
-    """Return the numbers, NaN in place of those above ``LARGEST``, whose squares and products would overflow."""
+    """Return numbers as float64, NaN in place of those above ``LARGEST``, whose squares and products would overflow."""
+    with np.errstate(invalid="ignore"):  # bytes of a damaged log may be a signalling NaN
+        x = x.astype(np.float64)
     return np.where(np.abs(x) <= LARGEST, x, np.nan)
 
 

@@ -166,7 +166,7 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
             table = np.array(rows[key], np.float64)
             names = [x if times[x] == 1 else f"{name}.{x}" for x in variables]
             values = dict(zip(names, table.T[1:], strict=True))
-            for x in [x for x in names if x.endswith(".quat") and np.all(values[x] == values[x].astype(np.uint32))]:
+            for x in [x for x in names if x.endswith(".quat") and _are_uint32(values[x])]:
                 attitude = decompressed(values[x].astype(np.uint32))
                 values |= {f"{x[:-4]}q{axis}": c for axis, c in zip("xyzw", attitude.T, strict=True)}
             streams[name] = Stream(table[:, 0], values)
@@ -175,6 +175,10 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
     if wanted is not None:
         streams = {key: x for key, x in streams.items() if set(wanted.names) & set(x.columns)} or streams
     return at_equal_times(path.name, streams, repairs, wanted)
+
+
+def _are_uint32(x: NDArray) -> bool:
+    return bool(np.all((x >= 0) & (x < 2**32) & (np.floor(x) == x)))
 
 
 def decompressed(packed: NDArray) -> NDArray:

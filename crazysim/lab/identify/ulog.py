@@ -178,7 +178,7 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
             repairs.append(f"left out {len(parts[key]) - len(whole)} messages {name}, which are too short")
         if whole:
             table = np.frombuffer(b"".join(whole), layout)
-            columns = {field: plausible(table[field].astype(np.float64)) for field in layout.names or ()}
+            columns = {field: plausible(table[field]) for field in layout.names or ()}
             found[name] = Topic(f"{path.name}: {name}", columns)
     return found
 
