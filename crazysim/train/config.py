@@ -63,6 +63,7 @@ RECIPES: dict[str, Recipe] = {
     "transport": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
     "chase": Recipe(config={"iterations": 200, "discount": 0.99}),
     "deliver": Recipe(n_worlds=4096, config={"iterations": 1000, "discount": 0.99}),
+    "land": Recipe(n_worlds=2048, config={"iterations": 150, "n_steps": 64, "minibatches": 16, "discount": 0.99}),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
 """Recipes by task."""

@@ -25,6 +25,7 @@ from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.references import code_digest, is_reference, split
 from crazysim.envs.statistics import RunningStats
+from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
 from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, DivergedError
@@ -209,9 +210,11 @@ def train(
             f"other starts, by more than two standard errors"
         )
     point = best | {name: last[name] for name in ("env_steps", "seconds", "compile_seconds")}
+    judged = f"error below {base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s"
+    if type(base.task).succeeded is not Task.succeeded:
+        judged = "as the task judges it"
     log(
-        f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts (error below "
-        f"{base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s), "
+        f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts ({judged}), "
         f"{outcome(point, base.task.unit)}; "
         f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
     )

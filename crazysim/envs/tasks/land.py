@@ -59,6 +59,7 @@ class Land(TouchDown):
     name = "land"
     Record = PadLanding
     what = "pad"
+    crash = 2.0  # at 10, as much as a landing pays, policies hover beside the pad: of their first contacts few are soft
 
     speed: float = setting(default=0.0, low=0.0, high=10.0)
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""
