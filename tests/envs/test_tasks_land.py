@@ -71,7 +71,7 @@ def test_landing_pays_and_crashing_costs_once(still):
     _, world, _, after, step = still
     reward = np.asarray(after.reward)[:, 0]
     assert reward[world["soft"]] > 9
-    assert reward[world["fast"]] < -9
+    assert -3 < reward[world["fast"]] < -1, "less than a landing pays, or none is tried"
     assert abs(reward[world["hover"]]) < 0.1
     again = step(after, after.action)
     np.testing.assert_array_equal(np.asarray(again.reward)[:, 0] == 0, [name != "hover" for name in CASES])
