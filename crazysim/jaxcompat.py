@@ -53,7 +53,7 @@ __all__ = [
     "jaxpr_as_fun",
     "n_compilations",
     "primitive_by_platform",
-    "put_own",
+    "put_host_array",
     "reading",
     "register_host_target",
     "threefry2x32_p",
@@ -296,7 +296,7 @@ def expanded(eqn: Any) -> Callable[..., list[Any]]:
 # Arrays ---------------------------------------------------------------------------------------------------------
 
 
-def put_own(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
+def put_host_array(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
     """Return an array of the host on a device, committed to it: ``jax.device_put`` in a tenth of the time.
 
     It is the same memory where that is possible, so the argument must not be written into afterwards.

@@ -343,10 +343,10 @@ def as_parameter(value: Any) -> Any:
     return np.atleast_1d(np.asarray(value, floating()))
 
 
-def on_device(value: Any, dtype: Any = None) -> jax.Array:
-    """Return numbers of the host as an array of the device, of floating dtype by default; it needs no compilation.
+def device_array(value: Any, dtype: Any = None) -> jax.Array:
+    """Return host data as an array on the default device, of floating dtype by default.
 
-    ``jnp.asarray`` compiles a program for each shape.
+    It compiles nothing, where ``jnp.asarray`` compiles a program for each shape.
     """
     return jax.device_put(np.array(value, dtype or floating()))
 

@@ -188,7 +188,7 @@ def test_an_array_of_the_host_is_put_on_a_device(dtype):
     x = np.arange(6).reshape(2, 3).astype(dtype)
     for device in jax.devices()[:2]:
         sharding = jax.sharding.SingleDeviceSharding(device)
-        ours, theirs = jaxcompat.put_own(x.copy(), sharding), jax.device_put(x, sharding)
+        ours, theirs = jaxcompat.put_host_array(x.copy(), sharding), jax.device_put(x, sharding)
         assert (ours.aval, ours.committed, ours.devices()) == (theirs.aval, True, {device})
         np.testing.assert_array_equal(ours, x)
         doubled = jax.jit(lambda x: x * 2)
@@ -199,7 +199,7 @@ def test_an_array_of_the_host_is_put_on_a_device(dtype):
 def test_an_array_of_the_host_is_split_over_devices():
     mesh = jax.make_mesh((2,), ("worlds",), axis_types=(jax.sharding.AxisType.Auto,), devices=jax.devices()[:2])
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("worlds"))
-    placed = jaxcompat.put_own(np.arange(4.0, dtype=np.float32), sharding)
+    placed = jaxcompat.put_host_array(np.arange(4.0, dtype=np.float32), sharding)
     assert placed.sharding == sharding
     np.testing.assert_array_equal(placed, np.arange(4.0))
 

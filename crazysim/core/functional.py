@@ -57,8 +57,8 @@ def state_control(
     command, feedforward = check_setpoint(
         data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward
     )
-    feedforward = None if feedforward is None else placed(data, feedforward)
-    return stage_command(data, placed(data, command), feedforward)
+    feedforward = None if feedforward is None else put_command(data, feedforward)
+    return stage_command(data, put_command(data, command), feedforward)
 
 
 def check_setpoint(
@@ -140,7 +140,7 @@ def attitude_control(data: SimData, controls: ArrayLike, check_finite: bool = Fa
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, placed(data, check_command(data, Control.attitude, controls, check_finite)))
+    return stage_command(data, put_command(data, check_command(data, Control.attitude, controls, check_finite)))
 
 
 def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -148,7 +148,7 @@ def body_rate_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, placed(data, check_command(data, Control.body_rate, controls, check_finite)))
+    return stage_command(data, put_command(data, check_command(data, Control.body_rate, controls, check_finite)))
 
 
 def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -156,7 +156,7 @@ def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool 
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, placed(data, check_command(data, Control.force_torque, controls, check_finite)))
+    return stage_command(data, put_command(data, check_command(data, Control.force_torque, controls, check_finite)))
 
 
 def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
@@ -164,7 +164,7 @@ def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
     Arguments and errors as in ``state_control``.
     """
-    return stage_command(data, placed(data, check_command(data, Control.rotor_vel, controls, check_finite)))
+    return stage_command(data, put_command(data, check_command(data, Control.rotor_vel, controls, check_finite)))
 
 
 def stage_command(data: SimData, command: Array, feedforward: Array | None = None) -> SimData:
@@ -235,7 +235,7 @@ def controllable(data: SimData) -> Array:
 def check_command(data: SimData, control: Control, command: ArrayLike, check_finite: bool = False) -> Array | NDArray:
     """Return a command as an array of the state's dtype; of the data, shapes and types are enough.
 
-    One of the host is a copy of its caller's; it is still on the host, and ``placed`` moves it.
+    One of the host is a copy of its caller's; it is still on the host, and ``put_command`` moves it.
 
     Raises:
         ValueError: Wrong shape, type or command level, or a NaN or infinite command.
@@ -285,11 +285,11 @@ def _as_command(
     return array
 
 
-def placed(data: SimData, command: Array | NDArray) -> Array:
-    """Return a command that was checked as an array beside the data, of which shapes and devices are enough."""
+def put_command(data: SimData, command: Array | NDArray) -> Array:
+    """Return a checked command as an array on the device of the data, which may be shapes with shardings."""
     if isinstance(command, jax.core.Tracer) or isinstance(data.states.pos, jax.core.Tracer):
         return jnp.asarray(command)
     sharding = data.states.pos.sharding
     if isinstance(command, np.ndarray):
-        return jaxcompat.put_own(command, sharding)
+        return jaxcompat.put_host_array(command, sharding)
     return command if command.committed and command.sharding == sharding else jax.device_put(command, sharding)

@@ -20,7 +20,7 @@ from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import Setting, check_settings, setting, settings_of
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, UnknownNameError, shown
-from crazysim.pytree import PyTree, on_device
+from crazysim.pytree import PyTree, device_array
 from crazysim.tables import Shapes, bounds, numbers
 
 P = TypeVar("P", bound="Plugin")
@@ -162,13 +162,13 @@ def check_parameter(
         )
     array = numbers(name, array, allowed, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
-    return on_device(np.broadcast_to(array, core) if is_shared else array, dtype)
+    return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
 
 
 def per_drone(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     """Return a number for every drone, of the states' type. (n_worlds, n_drones, *core)"""
     shape = (*sim.data.states.pos.shape[:2], *core)
-    return on_device(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
+    return device_array(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(parameter, setting, dataclasses.field))

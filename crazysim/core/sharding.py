@@ -22,7 +22,7 @@ WORLD_AXIS = "worlds"
 
 
 class Location(NamedTuple):
-    """Devices that hold the data of a simulation, and how worlds are spread over them."""
+    """Devices that hold the data of a simulation, and the distribution of worlds over them."""
 
     platform: str
     """``"cpu"`` or ``"gpu"``."""
@@ -34,13 +34,13 @@ class Location(NamedTuple):
     """Axis of the mesh, or axes, that worlds are split over; None where each device has all of them."""
 
     @property
-    def spread(self) -> bool:
-        """True where there are several devices."""
+    def is_distributed(self) -> bool:
+        """True for several devices."""
         return self.mesh is not None or (self.devices is not None and len(self.devices) > 1)
 
 
-def locate(x: jax.Array) -> Location:
-    """Return where an array with an axis of worlds in front is."""
+def location_of(x: jax.Array) -> Location:
+    """Return the devices of an array whose first axis is over worlds."""
     devices = tuple(sorted(x.sharding.device_set, key=lambda d: d.id))
     platform = devices[0].platform
     if len(devices) == 1 or not isinstance(x.sharding, NamedSharding):
@@ -49,40 +49,42 @@ def locate(x: jax.Array) -> Location:
     return Location(platform, devices, cast(Mesh, x.sharding.mesh), spec[0] if len(spec) else None)
 
 
-def put(tree: T, device: jax.Device) -> T:
-    """Return the tree committed to a device, itself if it is; leaves that are remain the same arrays."""
-    here = SingleDeviceSharding(device)
+def put_on_device(tree: T, device: jax.Device) -> T:
+    """Return the tree committed to a device. A tree that is already, and leaves that are, stay the same objects.
 
-    def is_here(x: object) -> bool:
-        return isinstance(x, jax.Array) and x.committed and x.sharding == here
-
-    leaves, treedef = jax.tree.flatten(tree)
-    away = [i for i, x in enumerate(leaves) if not is_here(x)]
-    if not away:
-        return tree
-    placed = jax.device_put([leaves[i] for i in away], here)  # one call for all takes half the time
-    return treedef.unflatten(with_leaves(leaves, away, placed))
-
-
-def commit(x: jax.Array, device: jax.Device) -> jax.Array:
-    """Return an array committed to a device. Under a trace, the function that is compiled then runs on it.
-
-    JAX compiles a function of uncommitted arrays for its default device. If that is the device, or under a mesh, which
-    has devices of its own, a traced array is returned as it is.
+    JAX compiles a function of uncommitted arrays for its default device. A traced leaf of another device gets a
+    constraint, so that the compiled function runs on this one. Under a mesh, which has its own devices, it stays as it
+    is.
     """
-    if not isinstance(x, jax.core.Tracer):
-        return jax.device_put(x, device)
+    sharding = SingleDeviceSharding(device)
+    leaves, treedef = jax.tree.flatten(tree)
+    traced = [i for i, x in enumerate(leaves) if isinstance(x, jax.core.Tracer)]
+    away = [i for i, x in enumerate(leaves) if i not in traced and not _is_on(x, sharding)]
+    if not away and not traced:
+        return tree
+    if away:  # one call for all leaves takes half the time
+        leaves = with_leaves(leaves, away, jax.device_put([leaves[i] for i in away], sharding))
+    if traced and not _runs_on(device):
+        leaves = with_leaves(leaves, traced, jax.lax.with_sharding_constraint([leaves[i] for i in traced], sharding))
+    return treedef.unflatten(leaves)
+
+
+def _is_on(x: object, sharding: SingleDeviceSharding) -> bool:
+    return isinstance(x, jax.Array) and x.committed and x.sharding == sharding
+
+
+def _runs_on(device: jax.Device) -> bool:
+    """Return True where a function that is traced now will run on a device, or on a mesh."""
     with jax.ensure_compile_time_eval():
         default = jax.device_put(np.int8(0)).devices()
-    if default == {device} or not jax.sharding.get_abstract_mesh().empty:
-        return x
-    return jax.lax.with_sharding_constraint(x, SingleDeviceSharding(device))
+    return default == {device} or not jax.sharding.get_abstract_mesh().empty
 
 
-def beside(x: object) -> AbstractContextManager[object]:
-    """Return a context in which new arrays are made on the device of an array, not on JAX's default one.
+def default_device_of(x: object) -> AbstractContextManager[object]:
+    """Return a context whose default device is the device of an array.
 
-    It changes nothing under a trace, whose program runs where its arguments are, and for arrays of several devices.
+    It has no effect on a traced array, whose program runs on the device of its arguments, or on an array of several
+    devices.
     """
     devices = () if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array) else tuple(x.devices())
     return jax.default_device(devices[0]) if len(devices) == 1 else nullcontext()
@@ -117,9 +119,9 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
-    """Return the data distributed over a mesh; under a trace, the compiled function returns it so."""
-    place = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
-    return place(data, shardings_of(data, mesh))
+    """Return the data distributed over a mesh. Under a trace, the results of the compiled function are."""
+    put = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
+    return put(data, shardings_of(data, mesh))
 
 
 def shard_scene(mjx_data: T, mesh: Mesh) -> T:

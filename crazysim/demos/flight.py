@@ -21,7 +21,7 @@ from crazysim.errors import RenderError, not_installed
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
 from crazysim.progress import progress_bar
-from crazysim.pytree import on_device
+from crazysim.pytree import device_array
 from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
@@ -105,7 +105,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     places = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
     sim.scene.add("pole", count=2, pos=places, height=1.7, radius=POLE_RADIUS)
 
-    start = reference(on_device(np.zeros((n_worlds, 1))), n_drones)
+    start = reference(device_array(np.zeros((n_worlds, 1))), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
     states = sim.data.states.replace(pos=start[..., :3], vel=start[..., 3:6], rotor_vel=rotor_vel)
     sim.data = sim.data.replace(states=states)

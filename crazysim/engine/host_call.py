@@ -57,7 +57,9 @@ class HostLeaves:
         if isinstance(x, jax.Array):
             return x
         if i not in self._made:
-            self._made.setdefault(i, jaxcompat.put_own(self.array(i), self._sharding))  # another thread may read it too
+            self._made.setdefault(
+                i, jaxcompat.put_host_array(self.array(i), self._sharding)
+            )  # another thread may read it too
         return self._made[i]
 
     def array(self, i: int) -> NDArray:

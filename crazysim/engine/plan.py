@@ -160,7 +160,7 @@ class Planner(NamedTuple):
         lowered = [
             lower_stages(g.stages, data, known, _watched, population=g.population, tracer=tracer) for g in groups
         ]
-        one_kernel = self._has_kernels and not self.location.spread and [x.fused for x in lowered] == [True]
+        one_kernel = self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered] == [True]
         select = None
         if apart is not None and one_kernel:
             kept = {*apart, numbered(data).core.mjx_synced}
@@ -168,7 +168,7 @@ class Planner(NamedTuple):
         programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
         split = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
-        if self.location.spread and split:
+        if self.location.is_distributed and split:
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
         engine, why, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
@@ -197,7 +197,7 @@ class Planner(NamedTuple):
 
     def _spread_limit(self, data: SimData) -> str:
         """Return why data on several devices is stepped by ``plain``, or nothing."""
-        if not self.location.spread:
+        if not self.location.is_distributed:
             return ""
         if self.location.mesh is None:
             return f"the data is spread over devices by a {type(data.states.pos.sharding).__name__}, not over a mesh"

@@ -15,9 +15,9 @@ from jax.sharding import Mesh
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
 from crazysim.core.data import MAX_STEPS, SimData
-from crazysim.core.functional import placed, staged_fields, staged_leaves
+from crazysim.core.functional import put_command, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.sharding import WORLD_AXIS, Location, locate
+from crazysim.core.sharding import WORLD_AXIS, Location, location_of
 from crazysim.core.stage import Axes, Stage, as_stages, with_leaves
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
@@ -76,7 +76,7 @@ class FlatData:
         """
         numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
         on_host = isinstance(self.leaves, HostLeaves)
-        return self.replaced(numbers, [x if on_host else placed(like, x) for x in values.values()])
+        return self.replaced(numbers, [x if on_host else put_command(like, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step besides the number of steps."""
@@ -316,8 +316,8 @@ class Step:
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
         if sharding is None or sharding is self._at_home:
             return None
-        here, home = locate(x), self.location
-        if here.spread:
+        here, home = location_of(x), self.location
+        if here.is_distributed:
             at_home = home.mesh is not None and (here.mesh, here.axis) == (home.mesh, home.axis)
         elif home.devices is None or home.mesh is not None:
             at_home = True

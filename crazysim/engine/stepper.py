@@ -13,9 +13,9 @@ from jax.sharding import Mesh
 
 from crazysim.cache import announced
 from crazysim.core.data import MAX_STEPS, SimData
-from crazysim.core.functional import placed, stage_command
+from crazysim.core.functional import put_command, stage_command
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.sharding import put, shard
+from crazysim.core.sharding import put_on_device, shard
 from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
@@ -88,8 +88,8 @@ class Stepper:
             self._data = self._data.staged(self.like, command, feedforward)
             return
         data = self.data
-        feedforward = None if feedforward is None else placed(data, feedforward)
-        self._data = stage_command(data, placed(data, command), feedforward)
+        feedforward = None if feedforward is None else put_command(data, feedforward)
+        self._data = stage_command(data, put_command(data, command), feedforward)
 
     @property
     def synced(self) -> bool:
@@ -108,19 +108,19 @@ class Stepper:
         if data.core.mjx_synced is not self._unsynced:
             # A new array: a user may donate data that was read from here, which must not share arrays with other data.
             data = data.replace(core=data.core.replace(mjx_synced=np.False_))
-        self.accept(self.to_device(data))
+        self.accept(self.put_on_device(data))
 
     def accept(self, data: SimData) -> None:
         """Take data that is on the device, with ``core.mjx_synced`` false, as compiled calls return it."""
         self.data, self._unsynced = data, data.core.mjx_synced
 
-    def to_device(self, data: SimData) -> SimData:
-        """Return the data with every leaf on the device, or spread over the mesh.
+    def put_on_device(self, data: SimData) -> SimData:
+        """Return the data with every leaf on the device, or distributed over the mesh.
 
-        An edited leaf is wherever JAX puts new arrays by default. An array elsewhere, or one that is not committed to
-        its device, would make the next step compile again.
+        JAX puts an edited leaf on its default device. A leaf on another device, or one that is not committed to its
+        device, would make the next step compile again.
         """
-        return put(data, self.device) if self.mesh is None else shard(data, self.mesh)
+        return put_on_device(data, self.device) if self.mesh is None else shard(data, self.mesh)
 
     def build(self, pipeline: Pipeline) -> Step:
         """Make the step of a pipeline, use it from now on, and return it."""

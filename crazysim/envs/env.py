@@ -15,7 +15,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive
-from crazysim.core.sharding import beside, commit, put, shard
+from crazysim.core.sharding import default_device_of, put_on_device, shard
 from crazysim.core.stage import over_worlds
 from crazysim.eager import is_traced
 from crazysim.engine.step import FlatData, Step
@@ -117,14 +117,14 @@ class Env(ABC):
                 ``jax.jit(env.reset)``, cannot raise: there such a world ends at its first step, with
                 ``info["nonfinite"]``.
         """
-        key = commit(key, self.sim.device) if self.sim.mesh is None else key
-        with beside(key):
+        key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
+        with default_device_of(key):
             data = self.base.initial_data(key)
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
             state = self._complete(self.begin(state_of_data(data)))
         if not is_traced([state.whole.states.pos]):
-            state = EnvState(put(state.whole, self.sim.device)) if self.sim.mesh is None else state
+            state = EnvState(put_on_device(state.whole, self.sim.device)) if self.sim.mesh is None else state
             require_finite_start(self.task, state)
         return state
 
@@ -139,7 +139,7 @@ class Env(ABC):
             ConfigError: If the mask has another shape or type.
         """
         steps = state.whole.core.steps
-        with beside(steps):
+        with default_device_of(steps):
             mask = as_mask(mask, steps.shape[:1])
             new = self.begin(state)
             new = new if self.reset_policy is None else self.reset_policy.end(new)
@@ -158,7 +158,7 @@ class Env(ABC):
             ValueError: If the action has another shape.
         """
         self._require_own(state)
-        with beside(state.whole.core.steps):
+        with default_device_of(state.whole.core.steps):
             action = validate_action(action, state, self.actions)
             after = self.step_fn(state.replace(next_action=action).whole, self.n_substeps, ())
             return EnvState(after).replace(next_action=state.record.next_action)
@@ -372,7 +372,7 @@ class DroneEnv(Env):
         data = data.replace(core=data.core.replace(rng_key=key))
         if mesh is not None:
             return shard(data, mesh)
-        return data if is_traced([key]) else put(data, self.sim.device)
+        return data if is_traced([key]) else put_on_device(data, self.sim.device)
 
 
 def _beginning(sim: Sim) -> list[Any]:

@@ -19,7 +19,7 @@ from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.core.stages import tick
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device, static
+from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
 
 DEGREE = 7
@@ -108,7 +108,7 @@ class Follow(Plugin):
         index = np.int32(0) if self.index is None else self.index
         if self.index is None and len(given) > 1 and sim.n_drones > 1:
             index = np.broadcast_to(np.arange(sim.n_drones) % len(given), (sim.n_worlds, sim.n_drones))
-        ends, coefficients, repeats = (on_device(x, x.dtype) for x in jax.tree.leaves(slots))
+        ends, coefficients, repeats = (device_array(x, x.dtype) for x in jax.tree.leaves(slots))
         return FollowData(
             ends=ends,
             coefficients=coefficients,

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
-from crazysim.core.sharding import put, shard_scene
+from crazysim.core.sharding import put_on_device, shard_scene
 from crazysim.eager import to_host
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.sync import sync_sim2mjx
@@ -113,4 +113,4 @@ class MjxScene:
             self._data = self._to_device(self._data)
 
     def _to_device(self, data: mjx.Data) -> mjx.Data:
-        return put(data, self._device) if self._mesh is None else shard_scene(data, self._mesh)
+        return put_on_device(data, self._device) if self._mesh is None else shard_scene(data, self._mesh)

@@ -18,7 +18,7 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.settings import as_mask, flag, positive
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.pytree import on_device, select_worlds
+from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
 MAX_OBJECTS = 100_000
@@ -250,8 +250,8 @@ class SceneObjects:
         if before is not None:
             n, old = len(before.names), (before.pos, before.quat, before.vel)
             poses = tuple(np.concatenate([x, new[..., n:, :]], axis=-2) for x, new in zip(old, poses, strict=True))
-        pos, quat, vel = (on_device(x) for x in poses)
-        return Objects(pos, quat, vel, on_device(mocap_ids, np.int32), self.movable)
+        pos, quat, vel = (device_array(x) for x in poses)
+        return Objects(pos, quat, vel, device_array(mocap_ids, np.int32), self.movable)
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:

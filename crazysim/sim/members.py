@@ -143,7 +143,7 @@ def _row(x: Array | NDArray, index: int) -> Any:
     if isinstance(x, np.ndarray):
         return x[:, index]
     if on_host(x) and not jaxcompat.is_key(x):
-        return jaxcompat.put_own(np.asarray(x)[:, index].copy(), x.sharding)
+        return jaxcompat.put_host_array(np.asarray(x)[:, index].copy(), x.sharding)
     return _row_on_device(x, index)
 
 

@@ -36,7 +36,7 @@ from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
 from crazysim.plugins.estimators import Estimator
 from crazysim.plugins.registry import P, PluginRegistry
-from crazysim.pytree import on_device
+from crazysim.pytree import device_array
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
 from crazysim.scene.contact_report import ContactReport, ObjectSelection
@@ -286,7 +286,7 @@ class Sim:
     @default_data.setter
     def default_data(self, data: SimData) -> None:
         self.configuration.check(data, self._default_data)
-        self._default_data = self._stepper.to_device(data)
+        self._default_data = self._stepper.put_on_device(data)
 
     def _adopt_scene(self) -> None:
         """Give the data the objects and mocap ids of an edited scene; the scene itself is not compiled."""
@@ -295,10 +295,10 @@ class Sim:
         with self.lock, jax.ensure_compile_time_eval():  # data that are first read inside a user's trace stay arrays
             self._adopted = self._scene.revision
             self.data = self._with_scene(self._stepper.data)
-            self._default_data = self._stepper.to_device(self._with_scene(self._default_data))
+            self._default_data = self._stepper.put_on_device(self._with_scene(self._default_data))
 
     def _with_scene(self, data: SimData) -> SimData:
-        ids = on_device(self._scene.drone_mocap_ids, np.int32)
+        ids = device_array(self._scene.drone_mocap_ids, np.int32)
         return data.replace(core=data.core.replace(drone_mocap_ids=ids), objects=self._scene.objects(data.objects))
 
     @property

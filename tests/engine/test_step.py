@@ -13,7 +13,7 @@ from crazysim.control import Control, command_size
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.random import drone_key
-from crazysim.core.sharding import put
+from crazysim.core.sharding import put_on_device
 from crazysim.core.stage import stage
 from crazysim.dynamics import Dynamics
 from crazysim.engine import Step, explain, rollout
@@ -50,7 +50,7 @@ def scattered(sim, extreme=False, dtype=np.float32):
         **({} if rotors is None else {"rotor_vel": dtype(rotors)}),
     )
     core = data.core.replace(steps=jnp.asarray(rng.integers(0, 10, (sim.n_worlds, 1)), jnp.int32))
-    data = put(data.replace(states=states, core=core), sim.device)
+    data = put_on_device(data.replace(states=states, core=core), sim.device)
     size = command_size(sim.control, n_rotors)
     command = far * 0.2 * rng.normal(size=(*shape, size))
     if sim.control == Control.rotor_vel:

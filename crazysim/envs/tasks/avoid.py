@@ -21,7 +21,7 @@ from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.goals import install_rules, nearest, others_near, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device, static
+from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -132,7 +132,7 @@ class Avoid(Task):
             handles.append(sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
         contacts = sim.scene.contact_fn(handles, drones=False)
         shape = (sim.n_worlds, sim.n_drones)
-        zero, no = on_device(np.zeros((*shape, 3)), sim.data.states.pos.dtype), on_device(np.zeros(shape), bool)
+        zero, no = device_array(np.zeros((*shape, 3)), sim.data.states.pos.dtype), device_array(np.zeros(shape), bool)
         half = self.field(sim.n_drones).half
 
         @stage("drone")

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.goals import with_record
 from crazysim.plugins.payloads import load_pos, load_vel
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 SETTLED_SPEED = 0.2
 """Largest speed of a load that is delivered, m/s."""
@@ -108,11 +108,11 @@ def not_yet(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Delivery`` at the start: nothing is delivered, and no drone has crashed. All worlds."""
     pos = data.states.pos
     shape = pos.shape[:2]
-    no = on_device(np.zeros(shape), bool)
+    no = device_array(np.zeros(shape), bool)
     return {
-        "goal": on_device(np.zeros(pos.shape), pos.dtype),
-        "to_go_before": on_device(np.zeros(shape), pos.dtype),
-        "steps_there": on_device(np.zeros(shape), np.int32),
+        "goal": device_array(np.zeros(pos.shape), pos.dtype),
+        "to_go_before": device_array(np.zeros(shape), pos.dtype),
+        "steps_there": device_array(np.zeros(shape), np.int32),
         "delivered": no,
         "crashed": no,
     }

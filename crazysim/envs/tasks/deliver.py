@@ -26,7 +26,7 @@ from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
 from crazysim.plugins.vehicles.state import to_world
 from crazysim.plugins.vehicles.trailer import trailer_axles, trailer_rates
-from crazysim.pytree import leaf, on_device
+from crazysim.pytree import device_array, leaf
 from crazysim.sim.sim import Sim
 
 CARS, VEHICLE = "cars", "f1tenth_ros"
@@ -101,7 +101,7 @@ class Deliver(BringLoad):
             crashed = beyond(data) | (taken & (load.pos[2] < DROPPED))
             return with_record(data, self.judged(data, crashed).replace(taken=taken))
 
-        not_taken = on_device(np.zeros((sim.n_worlds, sim.n_drones)), bool)
+        not_taken = device_array(np.zeros((sim.n_worlds, sim.n_drones)), bool)
         install_rules(sim, TrailerDelivery(**not_yet(sim.data), taken=not_taken), judge)
 
     def spawn(self, data: SimData, key: Array) -> SimData:

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, Placement
 from crazysim.core.stage import Stage, stage
 from crazysim.envs.task import NAME, Task
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 FLOOR = 0.02
@@ -70,7 +70,7 @@ class GoalTask(Task):
 def install_goal(sim: Sim) -> None:
     """Give every drone a goal, ``data.plugins["task"]``, at the origin and at rest."""
     pos = sim.data.states.pos
-    zero = on_device(np.zeros(pos.shape), pos.dtype)
+    zero = device_array(np.zeros(pos.shape), pos.dtype)
     sim.add(FunctionPlugin(NAME, Goal(zero, zero)))
 
 

@@ -20,7 +20,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME
 from crazysim.envs.tasks.goals import pick, with_record
 from crazysim.envs.tasks.touch_down import Landing, TouchDown, landing_of, not_yet
-from crazysim.pytree import leaf, on_device, static
+from crazysim.pytree import device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
@@ -77,7 +77,7 @@ class Land(TouchDown):
             pos, vel = pad_of(data, data.core.steps + 1)
             return pads.set_pose(data, pos, vel=vel)
 
-        zero = on_device(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
+        zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
         record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **not_yet(sim.data))
         placements = [Placement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:

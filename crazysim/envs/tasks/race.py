@@ -25,7 +25,7 @@ from crazysim.envs.tasks.race_observations import observe, visited
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
 from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
 from crazysim.errors import ConfigError
-from crazysim.pytree import host_array, on_device
+from crazysim.pytree import device_array, host_array
 from crazysim.sim.sim import Sim
 
 SENSOR_RANGE = 0.7
@@ -102,7 +102,7 @@ class Race(Task):
         pos, shape = sim.data.states.pos, (sim.n_worlds, sim.n_drones)
 
         def zeros(*shape: int, dtype: DTypeLike = pos.dtype) -> Array:
-            return on_device(np.zeros(shape), dtype)
+            return device_array(np.zeros(shape), dtype)
 
         zero, none = zeros(*shape, dtype=np.int32), zeros(*shape, dtype=bool)
         n, moved = course.n_gates + course.n_obstacles, self.level >= 2
@@ -237,7 +237,7 @@ def _one_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
         params, shape, each = data.params, data.states.pos.shape[:2], {}
         for name, ndim in names.items():  # they may be one per drone already
             value = getattr(params, name)
-            each[name] = on_device(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
+            each[name] = device_array(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
         return data.replace(params=params.replace(**each))
 
     sim.data, sim.default_data = spread(sim.data), spread(sim.default_data)

@@ -21,7 +21,7 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.goals import install_rules, on_floor, others_near, state_of, with_record
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 
 SEPARATION = (0.24, 0.24, 0.6)
@@ -94,7 +94,10 @@ class Swarm(Task):
             return with_record(data, own.replace(closest=jnp.minimum(own.closest, nearest)))
 
         pos = sim.data.states.pos
-        zero, far = on_device(np.zeros(pos.shape), pos.dtype), on_device(np.full(pos.shape[:2], np.inf), pos.dtype)
+        zero, far = (
+            device_array(np.zeros(pos.shape), pos.dtype),
+            device_array(np.full(pos.shape[:2], np.inf), pos.dtype),
+        )
         record = SwarmRecord(zero, far)
         install_rules(sim, record, keep_closest)
 

@@ -15,7 +15,7 @@ from crazysim.core.stage import Stage, stage
 from crazysim.envs import terms
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.goals import state_of, with_record
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ContactFn
 
 SOFT = 0.5
@@ -157,5 +157,5 @@ def landing_of(data: SimData) -> Any:
 def not_yet(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Landing`` for drones in the air, of all worlds."""
     pos = data.states.pos
-    zero, no = on_device(np.zeros(pos.shape[:2]), pos.dtype), on_device(np.zeros(pos.shape[:2]), bool)
+    zero, no = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
     return {"landed": no, "crashed": no, "out_before": no, "to_go_before": zero}

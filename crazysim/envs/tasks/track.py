@@ -20,7 +20,7 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
 from crazysim.envs.tasks.goals import on_floor, state_of, with_record
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, figure_eight
 
@@ -67,7 +67,7 @@ class TrackTrajectory(Task):
 
     def install(self, sim: Sim) -> None:
         """Give every drone its time on the trajectory."""
-        self.add_record(sim, Phase(on_device(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)))
+        self.add_record(sim, Phase(device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones near the trajectory, moving along it."""

@@ -12,7 +12,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.stage import Stage, StageScope
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device, static
+from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.scene.contact_report import ContactReport, ObjectSelection, choose
 from crazysim.scene.placement import placed_by
 
@@ -58,10 +58,10 @@ class ContactLog(Plugin):
             raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
         shape = (sim.n_worlds, sim.n_drones)
         return ContactLogData(
-            floor=on_device(np.zeros(shape), bool),
-            objects=on_device(np.zeros((*shape, len(names))), bool),
-            drones=on_device(np.zeros(shape), bool),
-            first=on_device(np.full(shape, -1), np.int32),
+            floor=device_array(np.zeros(shape), bool),
+            objects=device_array(np.zeros((*shape, len(names))), bool),
+            drones=device_array(np.zeros(shape), bool),
+            first=device_array(np.full(shape, -1), np.int32),
             object_names=names,
         )
 

@@ -25,7 +25,7 @@ from crazysim.plugins.contacts.rigid_bodies import (
     require_few_contacts,
 )
 from crazysim.plugins.contacts.solver import Impulses, solve_contacts
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 
 class DroneCollisionsData(PyTree):
@@ -68,11 +68,11 @@ class DroneCollisions(Plugin):
         check_softness(sim.data.core.freq, self.softness)
         n_contacts = require_few_contacts(N_OF_BOXES * n * (n - 1) // 2, f"{n} drones")
         return DroneCollisionsData(
-            friction=on_device([self.friction]),
-            restitution=on_device([self.restitution]),
+            friction=device_array([self.friction]),
+            restitution=device_array([self.restitution]),
             impulse=per_drone(sim, 0.0, 3),
-            press=on_device(np.zeros((sim.n_worlds, 1, n_contacts))),
-            drag=on_device(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
+            press=device_array(np.zeros((sim.n_worlds, 1, n_contacts))),
+            drag=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

@@ -24,7 +24,7 @@ from crazysim.plugins.contacts.drone_boxes import Boxes, boxes_of, of_kind
 from crazysim.plugins.contacts.impulse import Material, after_contact, inertia_matrix
 from crazysim.plugins.contacts.load_contacts import hit_drones, hit_each_other, loads_of, names_of, stop_loads
 from crazysim.plugins.payloads.body import Colliding
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ObjectSelection, choose
 
 
@@ -72,10 +72,10 @@ class ContactResponse(Plugin):
         """Return the parameters, and no impulse."""
         check_softness(sim.data.core.freq, self.softness)
         return ContactResponseData(
-            friction=on_device([self.friction]),
-            restitution=on_device([self.restitution]),
-            softness=on_device([self.softness]),
-            impulse=on_device(np.zeros((sim.n_worlds, sim.n_drones, 3))),
+            friction=device_array([self.friction]),
+            restitution=device_array([self.restitution]),
+            softness=device_array([self.softness]),
+            impulse=device_array(np.zeros((sim.n_worlds, sim.n_drones, 3))),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

@@ -20,7 +20,7 @@ from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
 from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE
 from crazysim.plugins.effects.ground import TerrainData, ground_height
-from crazysim.pytree import on_device
+from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -61,9 +61,9 @@ class Terrain(Plugin):
         heights, size, pos = self._checked(sim)
         dtype = sim.data.states.pos.dtype
         record = TerrainData(
-            heights=on_device(heights, dtype),
-            middle=on_device(pos, dtype),
-            half=on_device(size / 2, dtype),
+            heights=device_array(heights, dtype),
+            middle=device_array(pos, dtype),
+            half=device_array(size / 2, dtype),
             below=per_drone(sim, 0.0, 1),
             floor=self.floor,
         )

@@ -20,7 +20,7 @@ from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve
 from crazysim.plugins.effects.moving_air import Air, Exposed, checked_propeller_radius, require_drag, with_moving_air
-from crazysim.pytree import leaf, on_device
+from crazysim.pytree import device_array, leaf
 
 DECAY, SPREAD = 5.8, 0.094
 """Velocity decay constant B and spreading rate S of a round turbulent jet, 1 (Hussein, Capp and George 1994; Pope,
@@ -96,7 +96,7 @@ def stream_diameter(sim: Simulation, radius: Array) -> Array:
     """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
     factor = np.sqrt(2 * of_airframes(sim, lambda airframe: airframe.n_rotors))
     factor = factor[..., None] if factor.ndim else factor
-    return on_device(factor * np.asarray(radius), radius.dtype)
+    return device_array(factor * np.asarray(radius), radius.dtype)
 
 
 def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:

@@ -13,7 +13,7 @@ from crazysim.core.plugin import Plugin, Simulation, of_airframes, parameter
 from crazysim.drones import Airframe
 from crazysim.plugins.effects.ground import ground_below
 from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 
 class GroundEffectData(PyTree):
@@ -60,7 +60,7 @@ def rotor_positions(sim: Simulation) -> Array:
         own = airframe.value("rotors.position")
         return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
 
-    return on_device(of_airframes(sim, of_one), sim.data.states.pos.dtype)
+    return device_array(of_airframes(sim, of_one), sim.data.states.pos.dtype)
 
 
 def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:

@@ -17,7 +17,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter,
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 MAX_DELAY = 100_000
 """Longest delay, steps: the queue of each drone has a row for each."""
@@ -92,7 +92,7 @@ class Latency(Plugin):
         longest = int(np.max(delay)) if longest is None else longest
         steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _sent(data)
         queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
-        return LatencyData(steps, on_device(queue, command.dtype), command)
+        return LatencyData(steps, device_array(queue, command.dtype), command)
 
 
 def _controller(sim: Simulation) -> str:

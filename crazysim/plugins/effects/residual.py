@@ -17,7 +17,7 @@ from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve, rotor_torque
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import require_rotors
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 N_INPUTS = 14
 """Number of inputs: see ``residual_inputs``."""
@@ -43,9 +43,9 @@ class ResidualData(PyTree):
         dtype = jnp.result_type(float)
         names = ("hidden", "output") if "residual.hidden" in airframe.values else ()
         return ResidualData(
-            linear=on_device(airframe.value("residual.linear"), dtype),
-            hidden=on_device(airframe.value("residual.hidden"), dtype) if names else None,
-            output=on_device(airframe.value("residual.output"), dtype) if names else None,
+            linear=device_array(airframe.value("residual.linear"), dtype),
+            hidden=device_array(airframe.value("residual.hidden"), dtype) if names else None,
+            output=device_array(airframe.value("residual.output"), dtype) if names else None,
         )
 
 

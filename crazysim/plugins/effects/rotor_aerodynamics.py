@@ -21,7 +21,7 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground_effect import rotor_positions
 from crazysim.plugins.effects.moving_air import air_velocity, checked_propeller_radius, drag_factor, require_rotors
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 
 class RotorAerodynamicsData(PyTree):
@@ -132,7 +132,7 @@ class RotorAerodynamics(Plugin):
             height = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_height", ()))
         up = np.asarray(check_parameter(sim, "hub_height", height))[..., None]
         pos = np.asarray(rotor_positions(sim))
-        return on_device(pos + up * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
+        return device_array(pos + up * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
 
     def influence(self, data: SimData) -> SimData:
         """Return the data with the forces and torques of the rotors in place of the linear drag."""

@@ -15,7 +15,7 @@ from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, Grid, interpolate
 from crazysim.plugins.effects.moving_air import Air, Exposed, require_drag, with_moving_air
-from crazysim.pytree import leaf, on_device
+from crazysim.pytree import device_array, leaf
 
 
 class WindFieldData(Air):
@@ -81,9 +81,9 @@ class WindField(Plugin):
         return self.filled(
             sim,
             WindFieldData,
-            field=on_device(grid.values, dtype),
-            origin=on_device(grid.origin, dtype),
-            spacing=on_device(grid.spacing, dtype),
+            field=device_array(grid.values, dtype),
+            origin=device_array(grid.origin, dtype),
+            spacing=device_array(grid.spacing, dtype),
             shift=None if self.spread is None else per_drone(sim, 0.0, 3),
         )
 

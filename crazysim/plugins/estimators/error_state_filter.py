@@ -20,7 +20,7 @@ from crazysim.plugins.estimators.estimator import Estimator
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import PyTree, on_device
+from crazysim.pytree import PyTree, device_array
 
 R = TypeVar("R", bound=PyTree)
 
@@ -73,8 +73,8 @@ class ErrorStateFilter(Estimator):
             given: Other fields, see ``filled``.
         """
         shape = sim.data.states.pos.shape[:2]
-        used = on_device(np.full((*shape, len(self.aids)), -1), np.int32)
-        failures = on_device(np.zeros((*shape, 1)), np.int32)
+        used = device_array(np.full((*shape, len(self.aids)), -1), np.int32)
+        failures = device_array(np.zeros((*shape, 1)), np.int32)
         return self.filled(sim, kind, estimate=estimate, used=used, failures=failures, **given)
 
     def predictions(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:

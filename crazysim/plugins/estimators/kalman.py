@@ -24,7 +24,7 @@ from crazysim.plugins.sensors.flow_deck import FAR_NOISE, OpticalFlow, TimeOfFli
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.motion_capture import MotionCapture
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 FIRMWARE_RATE = 1000
 """Loops of the firmware's filter in a second, each of which adds process noise, Hz (estimator_kalman.c)."""
@@ -110,7 +110,7 @@ class Kalman(ErrorStateFilter):
             KalmanData,
             Estimate(still, still, level, still, per_drone(sim, cov, *cov.shape), None, None),
             previous=level,
-            deviations=on_device(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
+            deviations=device_array(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
         )
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:

@@ -30,7 +30,7 @@ from crazysim.plugins.payloads.load import (
     turned_z,
 )
 from crazysim.plugins.payloads.slung import load_record, place_loads, upward
-from crazysim.pytree import leaf, on_device, select_worlds
+from crazysim.pytree import device_array, leaf, select_worlds
 from crazysim.rotation import dot
 
 
@@ -109,18 +109,18 @@ class Hook(Colliding, Plugin):
 
     def record(self, sim: Simulation) -> HookData:
         """Return hooks at rest below their drones, and the loads on them or where ``load_at`` puts them."""
-        grip = on_device(np.ones(sim.data.states.pos.shape[:2]), bool)
+        grip = device_array(np.ones(sim.data.states.pos.shape[:2]), bool)
         load = load_record(self, sim, HookData, False, rest_height(self.size) + self.ring, self.ring, grip=grip)
         if self.load_at is None:
-            return load.replace(tip_pos=on_device(load.pos), tip_vel=on_device(load.vel))
+            return load.replace(tip_pos=device_array(load.pos), tip_vel=device_array(load.vel))
         at = check_parameter(sim, "load_at", self.load_at, (3,))
         pos = np.array(np.broadcast_to(at, load.pos.shape))
         pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
-        no_clearance = on_device(np.zeros(load.clearance.shape))
+        no_clearance = device_array(np.zeros(load.clearance.shape))
         tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
-        free = {name: on_device(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
+        free = {name: device_array(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
         return load.replace(
-            pos=on_device(pos), vel=on_device(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **free
+            pos=device_array(pos), vel=device_array(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **free
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

@@ -24,7 +24,7 @@ from crazysim.plugins.effects.moving_air import checked_propeller_radius, requir
 from crazysim.plugins.payloads.body import Colliding
 from crazysim.plugins.payloads.jet_table import JetTable
 from crazysim.plugins.payloads.panels import panels_of
-from crazysim.pytree import PyTree, leaf, on_device, static
+from crazysim.pytree import PyTree, device_array, leaf, static
 
 PANELS_PER_LENGTH = 2
 """Panels along the longest edge of a load by default."""
@@ -86,7 +86,7 @@ class RotorJet(Plugin):
         radius = checked_propeller_radius(sim, self.propeller_radius)
         names = ("speeds", "pressure", "velocity", "origin", "spacing")
         values = {name: getattr(table, name, None) for name in names}
-        shared = {name: None if x is None else on_device(x, radius.dtype) for name, x in values.items()}
+        shared = {name: None if x is None else device_array(x, radius.dtype) for name, x in values.items()}
         return self.filled(sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared)
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

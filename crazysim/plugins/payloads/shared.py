@@ -29,7 +29,7 @@ from crazysim.plugins.payloads.load import (
     pieces,
     turned_z,
 )
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 SOFT = 1e-6
 """Summand of the matrix of tensions, 1, without which four rods at one load would have no unique tensions."""
@@ -131,7 +131,7 @@ class SharedLoad(PointLoad, Plugin):
         return SharedLoadData(
             pos=pos,
             vel=vel,
-            attached=on_device(np.ones(sim.data.states.pos.shape[:2]), bool),
+            attached=device_array(np.ones(sim.data.states.pos.shape[:2]), bool),
             mass=scalars["mass"],
             length=length,
             attach=attach if np.any(np.asarray(attach)) else None,

@@ -28,7 +28,7 @@ from crazysim.plugins.payloads.load import (
     pieces,
     turned_z,
 )
-from crazysim.pytree import on_device, select_worlds
+from crazysim.pytree import device_array, select_worlds
 
 L = TypeVar("L", bound=LoadData)
 
@@ -164,7 +164,7 @@ def load_record(
         given: Further fields of the record.
     """
     rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
-    attached = on_device(np.ones(states.pos.shape[:2]), bool)
+    attached = device_array(np.ones(states.pos.shape[:2]), bool)
     given |= {} if is_cable else {"restitution": None}
     load = plugin.filled(sim, kind, clearance=rest, attached=attached, **given)
     # A setting that is zero everywhere is None: what is not there is not computed.

@@ -18,7 +18,7 @@ from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal, uniform
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import Samples, Sensor
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 SWEEP_TILTS = -math.pi / 6, math.pi / 6
 """Tilts of the two light planes of a lighthouse of the second generation, rad: 30 degrees either way (Taffanel et al.
@@ -81,7 +81,7 @@ class UWB(Sensor):
     def record(self, sim: Simulation) -> UWBData:
         """Return the system before its first measurement."""
         anchors = _places("anchors", self.anchors, 2 if self.tdoa else 1)
-        return self.filled(sim, UWBData, anchors=on_device(anchors, sim.data.states.pos.dtype))
+        return self.filled(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
 
     def ideal(self, data: SimData) -> Array:
         """Return the distances, or their differences, m. (n,)"""
@@ -156,9 +156,9 @@ class Lighthouse(Sensor):
         return self.filled(
             sim,
             LighthouseData,
-            stations=on_device(stations, dtype),
-            quat=jax.jit(rotation.from_rpy)(on_device(rpy, dtype)),
-            diodes=on_device(_places("diodes", self.diodes, 1), dtype),
+            stations=device_array(stations, dtype),
+            quat=jax.jit(rotation.from_rpy)(device_array(rpy, dtype)),
+            diodes=device_array(_places("diodes", self.diodes, 1), dtype),
         )
 
     def ideal(self, data: SimData) -> Array:

@@ -16,7 +16,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_d
 from crazysim.core.stage import Stage
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.rotation import safe_clip, safe_norm
 
 CLEAR, ALARM = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
@@ -83,8 +83,8 @@ class Radar(Plugin):
             value = np.asarray(getattr(self, name), np.float64)
             if value.shape not in ((), (len(pos),)):
                 raise ConfigError(f"expected {name} of shape () or ({len(pos)},) for each radar, got {value.shape}")
-            found[name] = on_device(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=on_device(pos, dtype), **found, exposure=per_drone(sim, 0.0, len(pos)))
+            found[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
+        return RadarData(pos=device_array(pos, dtype), **found, exposure=per_drone(sim, 0.0, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that counts the time within the lobes."""

@@ -18,7 +18,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import steps_between
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.placement import place, placed_by
 from crazysim.scene.rays import MAX_UNROLLED, RayKernels, cast
@@ -76,7 +76,7 @@ class RangeFinder(Plugin):
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         far = float(self.max_range)
         distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
-        return RangeFinderData(on_device(distance), on_device(rays), on_device(far))
+        return RangeFinderData(device_array(distance), device_array(rays), device_array(far))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that measures: of one drone; of one world if drones or loads are to be measured; or of all

@@ -20,7 +20,7 @@ from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate, setting
 from crazysim.core.stage import Stage, tick
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 
 R = TypeVar("R", bound=PyTree)
 
@@ -122,11 +122,11 @@ class Sensor(Plugin):
                 "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, longest),
                 "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, longest),
                 "queue": per_drone(sim, 0.0, rows, k),
-                "due": on_device(np.full((*shape, rows), NEVER), np.int32),
+                "due": device_array(np.full((*shape, rows), NEVER), np.int32),
             }
         return Samples(
             value=per_drone(sim, 0.0, k),
-            taken=on_device(np.full((*shape, 1), -1), np.int32),
+            taken=device_array(np.full((*shape, 1), -1), np.int32),
             delay=transit.get("delay"),
             jitter=transit.get("jitter"),
             dropout=check_parameter(sim, "dropout", self.dropout, (1,), 0.0, 1.0) if lossy else None,

@@ -30,7 +30,7 @@ from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.path import Path
 from crazysim.plugins.vehicles.single_track import single_track
 from crazysim.plugins.vehicles.state import to_body
-from crazysim.pytree import PyTree, on_device
+from crazysim.pytree import PyTree, device_array
 from crazysim.trajectories import Trajectory
 
 CONTROL_FREQ = 50
@@ -136,7 +136,7 @@ class Cars(Population):
         pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
         if arc is not None and self.pos is not None:
             arc = starts.projected(paths, index, pos, arc)
-        height, normal = ground_at(sim.data, on_device(np.concatenate([pos, pos[..., :1]], axis=-1)))
+        height, normal = ground_at(sim.data, device_array(np.concatenate([pos, pos[..., :1]], axis=-1)))
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
         two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)

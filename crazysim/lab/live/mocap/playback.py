@@ -14,7 +14,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, leaf, on_device
+from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.objects import Handle
 
 
@@ -68,11 +68,11 @@ class Playback(Plugin):
         vel[-1] = 0.0
         dtype = sim.data.states.pos.dtype
         return PlaybackData(
-            pos=on_device(pos, dtype),
-            quat=on_device(quat, dtype),
-            vel=on_device(vel, dtype),
-            freq=on_device(self.freq, dtype),
-            start=on_device(np.broadcast_to(start, sim.n_worlds)[:, None], dtype),
+            pos=device_array(pos, dtype),
+            quat=device_array(quat, dtype),
+            vel=device_array(vel, dtype),
+            freq=device_array(self.freq, dtype),
+            start=device_array(np.broadcast_to(start, sim.n_worlds)[:, None], dtype),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
