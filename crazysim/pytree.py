@@ -168,29 +168,29 @@ def n_world_axes(scope: str) -> int:
 
 
 def scopes(tree: Any) -> Any:
-    """Return the same tree with the scope of every leaf in its place.
+    """Return a tree of the same structure that holds the scope of every leaf.
 
-    A leaf of members has the name of its population. A parameter is returned as ``shared``, ``drone`` or the name of a
-    population. Leaves without a declaration are ``opaque``. A leaf of another dataclass whose field has
+    For a leaf of members it is the name of their population; for a parameter ``shared``, ``drone`` or the name of a
+    population; for a leaf without a declaration ``opaque``. A leaf of another dataclass whose field has
     ``CORE_NDIM_KEY`` in its metadata is ``batched`` if it has more dimensions than that: its first axis is over worlds,
     and stages receive it like an opaque leaf.
     """
-    return _map_declared(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
+    return _map_leaves(lambda x, metadata, _, members: _scope(x, metadata, members), tree, {}, "", None)
 
 
-def numbered(tree: Any) -> Any:
-    """Return the same tree with the number of every leaf, in the order of ``jax.tree.leaves``, in its place.
+def leaf_indices(tree: Any) -> Any:
+    """Return a tree of the same structure that holds the index of every leaf in ``jax.tree.leaves``.
 
-    Code that handles flattened trees finds the number of a leaf by its path, as in ``numbered(data).core.nonfinite``.
-    It cannot find it by identity, since leaves may share one array.
+    Code that handles flattened trees finds a leaf by its path, as in ``leaf_indices(data).core.nonfinite``. It cannot
+    find it by identity, since leaves may share one array.
     """
     treedef = jax.tree.structure(tree)
     return treedef.unflatten(range(treedef.num_leaves))
 
 
-def declared(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
-    """Return the same tree with True in the place of every leaf that is declared so, and False elsewhere."""
-    return _map_declared(lambda _, metadata, *__: bool(metadata.get(flag)), tree, {}, "", None)
+def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
+    """Return a tree of the same structure: whether each leaf is declared with a flag of ``leaf``."""
+    return _map_leaves(lambda _, metadata, *__: bool(metadata.get(flag)), tree, {}, "", None)
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
@@ -236,27 +236,27 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
                 f"with jnp.broadcast_to."
             )
 
-    _map_declared(check, tree, {}, "data", None)
+    _map_leaves(check, tree, {}, "data", None)
 
 
-def _map_declared(
+def _map_leaves(
     fn: Callable[[Any, Any, str, Members | None], Any], node: Any, metadata: Any, name: str, members: Members | None
 ) -> Any:
     """Return the tree with ``fn(leaf, metadata of its field, its name, record of its population)`` for every leaf."""
     if isinstance(node, PyTree):
         members = node if isinstance(node, Members) else members
         changes = {
-            f.name: _map_declared(fn, getattr(node, f.name), f.metadata, f"{name}.{f.name}", members)
+            f.name: _map_leaves(fn, getattr(node, f.name), f.metadata, f"{name}.{f.name}", members)
             for f in dataclasses.fields(node)  # type: ignore[arg-type]
             if not f.metadata.get("static")
         }
         return node.replace(**changes)
     if isinstance(node, dict):
-        return {k: _map_declared(fn, v, metadata, f"{name}[{k!r}]", members) for k, v in node.items()}
+        return {k: _map_leaves(fn, v, metadata, f"{name}[{k!r}]", members) for k, v in node.items()}
     if _is_foreign_record(node):
         return _map_foreign(fn, node, name, members)
     return jax.tree.map(
-        lambda x: _map_declared(fn, x, metadata, name, members) if _is_record(x) else fn(x, metadata, name, members),
+        lambda x: _map_leaves(fn, x, metadata, name, members) if _is_record(x) else fn(x, metadata, name, members),
         node,
         is_leaf=_is_record,
     )
@@ -265,19 +265,19 @@ def _map_declared(
 def _map_foreign(
     fn: Callable[[Any, Any, str, Members | None], Any], record: Any, name: str, members: Members | None
 ) -> Any:
-    """Return a record of another library, such as ``flax.struct``, mapped like ``_map_declared``."""
+    """Return a record of another library, such as ``flax.struct``, mapped like ``_map_leaves``."""
     children, treedef = jax.tree_util.tree_flatten_with_path(record, is_leaf=lambda x: x is not record)
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
     mapped = []
     for path, child in children:
         key = getattr(path[0], "name", "")  # absent where the record is registered without names
-        child_name, declared = f"{name}{jax.tree_util.keystr(path)}", metadata.get(key, {})
-        if CORE_NDIM_KEY in declared and _is_record(child):
+        child_name, field_metadata = f"{name}{jax.tree_util.keystr(path)}", metadata.get(key, {})
+        if CORE_NDIM_KEY in field_metadata and _is_record(child):
             raise ConfigError(
                 f"expected an array in {child_name}, whose metadata have {CORE_NDIM_KEY!r}, got a "
                 f"{type(child).__name__}. Give the metadata to the fields of that record."
             )
-        mapped.append(_map_declared(fn, child, declared, child_name, members))
+        mapped.append(_map_leaves(fn, child, field_metadata, child_name, members))
     return treedef.unflatten(mapped)
 
 

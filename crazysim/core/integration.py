@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData, SimStateDeriv
 from crazysim.core.influence import constrained, influenced, own_rates
 from crazysim.core.plugin import Plugin
-from crazysim.core.stage import Stage, over_drones
+from crazysim.core.stage import Stage, vmap_drones
 from crazysim.pytree import PyTree
 
 R = TypeVar("R", bound=PyTree)
@@ -143,7 +143,7 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
         if self.couples_world:
-            seen, deriv = data, over_drones(lambda one: self._free(one)[1])(data)
+            seen, deriv = data, vmap_drones(lambda one: self._free(one)[1])(data)
         else:
             seen, deriv = self._free(data)
         constraining = [plugin for plugin in self.plugins if plugin.constrains]

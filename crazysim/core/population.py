@@ -22,7 +22,7 @@ from crazysim.core.influence import own_rates
 from crazysim.core.integration import Integrator, along
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import RESERVED, Stage, tick
+from crazysim.core.stage import RESERVED_SCOPES, Stage, tick
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, floating
 
@@ -126,7 +126,7 @@ class Population(Plugin):
         Raises:
             ConfigError: If one is invalid.
         """
-        if self.name in (*RESERVED, "drone", "world"):
+        if self.name in (*RESERVED_SCOPES, "drone", "world"):
             raise ConfigError(f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.")
         if self.control_freq is not None:
             dividing_rate(f"control_freq of {self.name!r}", self.control_freq, sim.data.core.freq)

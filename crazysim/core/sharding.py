@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import replace_leaves
 from crazysim.errors import ConfigError
 from crazysim.pytree import n_batch_axes, scopes
 
@@ -63,9 +63,9 @@ def put_on_device(tree: T, device: jax.Device) -> T:
     if not away and not traced:
         return tree
     if away:  # one call for all leaves takes half the time
-        leaves = with_leaves(leaves, away, jax.device_put([leaves[i] for i in away], sharding))
+        leaves = replace_leaves(leaves, away, jax.device_put([leaves[i] for i in away], sharding))
     if traced and not _runs_on(device):
-        leaves = with_leaves(leaves, traced, jax.lax.with_sharding_constraint([leaves[i] for i in traced], sharding))
+        leaves = replace_leaves(leaves, traced, jax.lax.with_sharding_constraint([leaves[i] for i in traced], sharding))
     return treedef.unflatten(leaves)
 
 

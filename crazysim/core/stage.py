@@ -12,7 +12,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.others import AXIS
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, has_members, n_batch_axes, n_world_axes, numbered, scopes, select_worlds
+from crazysim.pytree import PyTree, has_members, leaf_indices, n_batch_axes, n_world_axes, scopes, select_worlds
 
 T = TypeVar("T")
 
@@ -24,7 +24,7 @@ Phase = Literal["before", "each", "after"]
 
 PHASES: tuple[Phase, ...] = ("before", "each", "after")
 
-RESERVED = ("batch", "batched", "shared", "opaque", "parameter", "member")
+RESERVED_SCOPES = ("batch", "batched", "shared", "opaque", "parameter", "member")
 """Names of other scopes, which neither a stage is declared for nor a population is named."""
 
 
@@ -60,10 +60,10 @@ class Stage:
     def __call__(self, data: SimData) -> SimData:
         """Return the data after the stage, in every world and for every drone."""
         if self.batched or self.scope == "batch":
-            return self.one(data)
-        return _over_worlds(self, data)
+            return self.apply_to_one(data)
+        return _apply_in_all_worlds(self, data)
 
-    def one(self, data: SimData) -> SimData:
+    def apply_to_one(self, data: SimData) -> SimData:
         """Return the data of one drone or world after the stage."""
         after = self.fn(data)
         mask = None if self.when is None else self.when(data)
@@ -75,7 +75,7 @@ class Stage:
 
         return jax.tree.map(select, after, data)
 
-    def in_worlds(self, data: SimData, mask: Array | None) -> SimData:
+    def apply_in_worlds(self, data: SimData, mask: Array | None) -> SimData:
         """Return the data after the stage in the worlds of a mask, (n_worlds,), or in all for None."""
         after = self(data)
         return (
@@ -115,7 +115,7 @@ def stage(
     Raises:
         ConfigError: If the scope or the phase is none of these. A population is looked up when the stage is applied.
     """
-    if not isinstance(scope, str) or not scope or scope in RESERVED:
+    if not isinstance(scope, str) or not scope or scope in RESERVED_SCOPES:
         raise ConfigError(
             f"expected scope 'drone', 'world' or the name of a population, got {scope!r}. A stage of the full batch is "
             f"left undeclared."
@@ -156,7 +156,7 @@ class Axes:
         """Take the data of all worlds."""
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
-        self.numbers = numbered(data)
+        self.numbers = leaf_indices(data)
         """Number of every leaf, by its path."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
@@ -222,15 +222,15 @@ class Axes:
         return jax.ShapeDtypeStruct(jnp.shape(x)[taken:], x.dtype)
 
 
-def with_leaves(leaves: Sequence[T], numbers: Sequence[int], values: Sequence[T]) -> list[T]:
-    """Return a list of leaves in which those of some numbers are replaced."""
+def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence[T]) -> list[T]:
+    """Return a list of leaves with other values at some indices."""
     out = list(leaves)
-    for i, value in zip(numbers, values, strict=True):
+    for i, value in zip(indices, values, strict=True):
         out[i] = value
     return out
 
 
-def over_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
+def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
     """Return a function of one world as a function of all worlds.
 
     In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), those of
@@ -288,12 +288,12 @@ def over_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
     return of_all
 
 
-def over_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
-    """Return a function of the data of one drone as a function of the data of one world; see ``over_members``."""
-    return over_members(fn, "drone")
+def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
+    """Return a function of the data of one drone as a function of the data of one world; see ``vmap_members``."""
+    return vmap_members(fn, "drone")
 
 
-def over_members(fn: Callable[[SimData], Any], population: str) -> Callable[[SimData], Any]:
+def vmap_members(fn: Callable[[SimData], Any], population: str) -> Callable[[SimData], Any]:
     """Return a function of the data of one member of a population as a function of the data of one world.
 
     Args:
@@ -318,12 +318,12 @@ def _kinds(tree: object) -> list[str]:
     return jax.tree.leaves(jax.tree.map(lambda x: scopes(x) if is_record(x) else "batched", tree, is_leaf=is_record))
 
 
-def _over_worlds(stage: Stage, data: SimData) -> SimData:
-    """Return the data after ``stage.one`` in every world, and for every drone or member that it is declared for."""
-    return over_worlds(of_world(stage, Axes(data)), 2)(data)
+def _apply_in_all_worlds(stage: Stage, data: SimData) -> SimData:
+    """Return the data after a stage in every world, and there for every drone or member if it is declared for one."""
+    return vmap_worlds(world_function(stage, Axes(data)), 2)(data)
 
 
-def of_world(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
+def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
     """Return a stage as a function of the data of one world, with a condition that selects its results."""
 
     def of_one_world(world: SimData) -> SimData:
@@ -331,13 +331,13 @@ def of_world(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
         written: list[int] = []
 
         def one(values: list[Array]) -> list[Array]:
-            after = stage.one(axes.treedef.unflatten(values))
+            after = stage.apply_to_one(axes.treedef.unflatten(values))
             written[:] = axes.written(values, after, stage)
             new = jax.tree.leaves(after)
             return [new[i] for i in written]
 
         own = [0 if s == stage.scope else None for s in axes.scopes]
         out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,), axis_name=AXIS)(leaves)
-        return axes.treedef.unflatten(with_leaves(leaves, written, out))
+        return axes.treedef.unflatten(replace_leaves(leaves, written, out))
 
     return of_one_world

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.engine.ir.program import Zeros
-from crazysim.pytree import declared, numbered, scopes
+from crazysim.pytree import leaf_flags, leaf_indices, scopes
 
 
 class PackCache:
@@ -87,9 +87,9 @@ class ZerosCache:
     def _indices(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
         key = (treedef, *[x.ndim for x in leaves])
         if key not in self._shared:
-            numbers = numbered(data)
+            numbers = leaf_indices(data)
             parameters = set(jax.tree.leaves((numbers.params, numbers.controls)))
-            rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(declared(data, "sparse")), leaves, strict=True)
+            rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(leaf_flags(data, "sparse")), leaves, strict=True)
             self._shared[key] = [
                 i
                 for i, (scope, is_sparse, x) in enumerate(rows)

@@ -25,7 +25,7 @@ from jax.sharding import PartitionSpec
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
-from crazysim.core.stage import Stage, with_leaves
+from crazysim.core.stage import Stage, replace_leaves
 from crazysim.core.stages import watched
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
@@ -38,7 +38,7 @@ from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
 from crazysim.engine.passes.layout import Rows, rows_of
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_batch_axes, numbered, scopes
+from crazysim.pytree import leaf_indices, n_batch_axes, scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
 """Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
@@ -163,7 +163,7 @@ class Planner(NamedTuple):
         one_kernel = self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered] == [True]
         select = None
         if apart is not None and one_kernel:
-            kept = {*apart, numbered(data).core.mjx_synced}
+            kept = {*apart, leaf_indices(data).core.mjx_synced}
             select = lambda written: [i for i in written if i not in kept]  # noqa: E731
         programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
         split = [stage for program in programs for stage in program.unfused_stages]
@@ -225,7 +225,7 @@ class Planner(NamedTuple):
         run: Run,
         n_leaves: int,
     ) -> Plan:
-        numbers, inputs = numbered(data), tuple(sorted(needed))
+        numbers, inputs = leaf_indices(data), tuple(sorted(needed))
         # Where a stage writes the flags itself, there is no check.
         checks = any(p.check is not None for p in programs) if programs else numbers.core.nonfinite not in written
         flags = (numbers.core.nonfinite,) if checks else ()
@@ -235,7 +235,7 @@ class Planner(NamedTuple):
         rows = tuple(rows_of(main)) if main is not None else ()
 
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
-            leaves = with_leaves([None] * n_leaves, inputs, values)
+            leaves = replace_leaves([None] * n_leaves, inputs, values)
             out, flagged = run(leaves, n_steps)
             return [*out, flagged] if flags else list(out)
 

@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
-from crazysim.core.stage import Axes, Stage, with_leaves
+from crazysim.core.stage import Axes, Stage, replace_leaves
 from crazysim.engine.backends import fused
 from crazysim.engine.lowering.relative import on_data
 from crazysim.engine.lowering.stages import lower_stages
@@ -65,7 +65,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         raise program.unfused_stages[0].error
     packed = [jnp.concatenate([given[i].ravel() for i in program.packed])] if program.packed else []
     written, _ = on_data(program, fused.build(program, Location(platform)))([*given, *packed], 0)
-    found = treedef.unflatten(with_leaves(given, program.written, written)).plugins[NAME].rows
+    found = treedef.unflatten(replace_leaves(given, program.written, written)).plugins[NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])
         for tree, some in zip(trees, shapes, strict=True)

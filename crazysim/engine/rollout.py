@@ -16,7 +16,7 @@ from crazysim.engine.ir.program import Zeros
 from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
 from crazysim.progress import progress_bar
-from crazysim.pytree import numbered
+from crazysim.pytree import leaf_indices
 
 Policy = Callable[[Any, SimData], Any]
 """Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
@@ -68,7 +68,7 @@ def rollout(
     if n_control_steps % every:
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
-    staged = F.staged_leaves(numbered(data))
+    staged = F.staged_leaves(leaf_indices(data))
     start = step.flatten(data, zeros, n_substeps, frozenset(staged) if step.platform == "gpu" else None)
     changed = sorted({*start.plan.written, start.plan.synced, *staged})
 

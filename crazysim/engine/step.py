@@ -18,7 +18,7 @@ from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import put_command, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, location_of
-from crazysim.core.stage import Axes, Stage, as_stages, with_leaves
+from crazysim.core.stage import Axes, Stage, as_stages, replace_leaves
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
@@ -64,7 +64,7 @@ class FlatData:
             )
         if isinstance(self.leaves, HostLeaves):
             return FlatData(self.leaves.replaced(numbers, values), self.plan)
-        return FlatData(with_leaves(self.leaves, numbers, values), self.plan)
+        return FlatData(replace_leaves(self.leaves, numbers, values), self.plan)
 
     def staged(self, like: SimData, command: Any, feedforward: Any = None) -> FlatData:
         """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does.
@@ -219,7 +219,7 @@ class Step:
         with keep_programs(when=program not in self._called):
             out = step(inputs, n_steps)
         self._called.add(program)
-        leaves = with_leaves(flat.leaves, plan.written, out)  # type: ignore[arg-type]  # a list, but for a host call
+        leaves = replace_leaves(flat.leaves, plan.written, out)  # type: ignore[arg-type]  # a list, but for a host call
         leaves[plan.synced] = self._false(leaves[plan.synced])
         return FlatData(leaves, plan)
 
@@ -270,7 +270,7 @@ class Step:
         packed = [self._pack([leaves[i] for i in plan.packed])] if plan.packed else []
         rows = [rows.pack(viewed(rows.program.views, leaves)) for rows in plan.rows]
         in_rows = [i for rows in plan.rows for i in rows.members]
-        return [*with_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
+        return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
     def _false(self, before: Any) -> Any:
         """Return a flag that is false, on the devices of the flag before; the same array again costs no call."""

@@ -16,7 +16,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive
 from crazysim.core.sharding import default_device_of, put_on_device, shard
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.eager import is_traced
 from crazysim.engine.step import FlatData, Step
 from crazysim.engine.tools.explain import explain
@@ -29,7 +29,7 @@ from crazysim.envs.state import NAME, OUTPUTS, EnvState, state_of_data, validate
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError
-from crazysim.pytree import numbered
+from crazysim.pytree import leaf_indices
 from crazysim.sim.sim import Sim
 
 
@@ -166,7 +166,7 @@ class Env(ABC):
     def flatten(self, state: EnvState) -> FlatData:
         """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
         self._require_own(state)
-        record = numbered(state.whole).plugins[NAME]
+        record = leaf_indices(state.whole).plugins[NAME]
         outputs = jax.tree.leaves([getattr(record, name) for name in OUTPUTS])
         return self.step_fn.flatten(state.whole, (), self.n_substeps, frozenset(outputs))
 
@@ -296,7 +296,7 @@ class DroneEnv(Env):
                     "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()])."
                 )
             of_world = sim.plugins.measured_states
-            self.measured = over_worlds(of_world) if task.batched else of_world
+            self.measured = vmap_worlds(of_world) if task.batched else of_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         if self._max_steps < 1:

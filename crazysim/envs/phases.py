@@ -19,7 +19,7 @@ from jax.tree_util import keystr, tree_leaves_with_path
 
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
-from crazysim.core.stage import Phase, Stage, over_worlds
+from crazysim.core.stage import Phase, Stage, vmap_worlds
 from crazysim.core.stages import nonfinite
 from crazysim.envs.actions import Actions
 from crazysim.envs.hooks import Hooks
@@ -43,7 +43,7 @@ def one_world(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
 
 def all_worlds(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
     """Return a function of all worlds."""
-    return fn if batched else over_worlds(fn)
+    return fn if batched else vmap_worlds(fn)
 
 
 @dataclass(frozen=True)

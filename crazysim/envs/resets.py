@@ -12,9 +12,9 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.population import populations
-from crazysim.core.stage import Axes, Stage, of_world
+from crazysim.core.stage import Axes, Stage, world_function
 from crazysim.core.stages import reset
-from crazysim.pytree import has_members, map_batched, n_batch_axes, n_world_axes, numbered, scopes
+from crazysim.pytree import has_members, leaf_indices, map_batched, n_batch_axes, n_world_axes, scopes
 from crazysim.sim.sim import Sim
 
 
@@ -33,8 +33,8 @@ class Resets:
         """True if ``data`` takes all worlds at once."""
         self.batched: str | None = None
         """Reason why new episodes are computed in all worlds and then selected; None where each world begins alone."""
-        rows = zip(*map(jax.tree.leaves, (scopes(default), default, numbered(default))), strict=True)
-        world_id = numbered(default).core.world_id
+        rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
+        world_id = leaf_indices(default).core.world_id
         if names:
             self.batched = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
         elif any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows):
@@ -78,7 +78,7 @@ def _reset_world(stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]
         data = reset_world(data, default)
         axes = Axes(data)  # a wrapper may have made parameters one per drone
         for stage in stages:
-            data = of_world(stage, axes)(data)
+            data = world_function(stage, axes)(data)
         return data
 
     return reset_one

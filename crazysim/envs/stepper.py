@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import replace_leaves
 from crazysim.engine.step import FlatData
 from crazysim.envs.env import Env
 from crazysim.envs.state import NAME, OUTPUTS, EnvState
@@ -87,8 +87,8 @@ class EnvStepper:
         like = flat.leaves[record.next_action]
 
         def step(carry: list[Array], rest: list[Array], ends: tuple[Array, Array], actions: ArrayLike) -> Any:
-            leaves = with_leaves(with_leaves([None] * n, fixed, rest), carried, carry)
-            leaves = with_leaves(leaves, flags, [x[:, None] for x in ends])
+            leaves = replace_leaves(replace_leaves([None] * n, fixed, rest), carried, carry)
+            leaves = replace_leaves(leaves, flags, [x[:, None] for x in ends])
             after = env.advance(FlatData(leaves, plan), jnp.asarray(actions, like.dtype).reshape(like.shape))
             state = EnvState(after.data())
             return [after.leaves[i] for i in carried], self._output(state), (state.terminated, state.truncated)

@@ -19,7 +19,7 @@ from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import settings_of
-from crazysim.core.stage import Axes, Stage, at_the_start, over_drones, over_worlds
+from crazysim.core.stage import Axes, Stage, at_the_start, vmap_drones, vmap_worlds
 from crazysim.eager import compiled
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.sensors.sensor import Sensor
@@ -243,7 +243,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def measured_states(self, data: SimData) -> SimData:
         """Return the data of one world with the states that sensors measure in place of the true ones."""
         plugins = tuple(self.values())
-        return data.replace(states=over_drones(lambda one: with_measured_states(plugins, one).states)(data))
+        return data.replace(states=vmap_drones(lambda one: with_measured_states(plugins, one).states)(data))
 
     def with_placed_objects(self, data: SimData) -> SimData:
         """Return the data with the plugins' objects of the scene at their poses, unless these are recorded ones."""
@@ -252,7 +252,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         for name, plugin in self.items():
             if plugin.places:
                 if self._placing.get(name, (None, None))[0] is not plugin:
-                    self._placing[name] = plugin, jax.jit(over_worlds(plugin.place))
+                    self._placing[name] = plugin, jax.jit(vmap_worlds(plugin.place))
                 data = data.replace(objects=self._placing[name][1](data))
         return data
 
@@ -432,6 +432,6 @@ def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> d
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
     worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]
-    of_drones = over_drones(of_one)
+    of_drones = vmap_drones(of_one)
     of_world = [x[:, 0] if scope == "world" else x for scope, x in zip(axes.scopes, leaves, strict=True)]
     return jax.vmap(lambda values: of_drones(axes.treedef.unflatten(values)), (worlds,))(of_world)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.errors import ConfigError
 
 Placing = Callable[[], Iterable[Plugin]]
@@ -42,6 +42,6 @@ def place(data: SimData, placed: Mapping[str, Plugin]) -> SimData:
             f"objects=."
         )
     for plugin in dict.fromkeys(placed.values()):
-        where = over_worlds(plugin.place) if data.states.pos.ndim == 3 else plugin.place
+        where = vmap_worlds(plugin.place) if data.states.pos.ndim == 3 else plugin.place
         data = data.replace(objects=where(data))
     return data

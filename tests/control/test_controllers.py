@@ -12,7 +12,7 @@ from crazysim import ConfigError, Latency, Sim, load_airframe, make
 from crazysim.control import INDI, PID, Control, Controller, LoadLQR, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
-from crazysim.core.stage import as_stages, with_leaves
+from crazysim.core.stage import as_stages, replace_leaves
 from crazysim.pytree import PyTree, as_parameter, leaf
 
 WORLDS, DRONES = 3, 2
@@ -441,7 +441,7 @@ def every_controller(control):
         numbers = [k for k, x in enumerate(leaves) if is_number(x)]
 
         def advance(command, values):
-            data = treedef.unflatten(with_leaves(leaves, numbers, values))
+            data = treedef.unflatten(replace_leaves(leaves, numbers, values))
             data = F.stage_command(data, command)
             for stage in as_stages(sim.step_pipeline):
                 data = stage(data)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.pytree import PyTree, leaf
 
 
@@ -36,7 +36,7 @@ def test_every_world_is_treated_as_the_function_says(n_worlds, n_drones):
         new = one.replace(own=factor * one.own + one.ours, ours=one.ours + one.all, row=one.row[::-1])
         return new, {"sum": one.own.sum(), "opaque": one.opaque}["sum"], one.ours
 
-    after, total, ours = over_worlds(fn)(record, factor)
+    after, total, ours = vmap_worlds(fn)(record, factor)
     np.testing.assert_allclose(after.own, factor[:, None, None] * record.own + record.ours, rtol=1e-6)
     np.testing.assert_allclose(after.ours, record.ours + record.all, rtol=1e-6)
     np.testing.assert_array_equal(after.row, record.row[:, ::-1])
@@ -48,12 +48,12 @@ def test_every_world_is_treated_as_the_function_says(n_worlds, n_drones):
 
 def test_a_leaf_that_is_not_written_is_returned_as_it_came():
     record = numbers(2, 3)
-    after = over_worlds(lambda one: one.replace(own=one.own + 1))(record)
+    after = vmap_worlds(lambda one: one.replace(own=one.own + 1))(record)
     assert all(getattr(after, name) is getattr(record, name) for name in ("ours", "row", "all", "opaque"))
 
 
 def test_a_shared_leaf_may_be_returned_for_every_world():
-    np.testing.assert_array_equal(over_worlds(lambda one: one.all)(numbers(3, 1)).shape, (3, 2))
+    np.testing.assert_array_equal(vmap_worlds(lambda one: one.all)(numbers(3, 1)).shape, (3, 2))
 
 
 @pytest.mark.parametrize("name", ["all", "opaque"])
@@ -62,7 +62,7 @@ def test_what_all_worlds_share_cannot_be_changed(name):
         return one.replace(**{name: getattr(one, name) + 1})
 
     with pytest.raises(ConfigError, match=f"'greedy' is written for one world and changes {name}, which all worlds"):
-        over_worlds(greedy)(numbers(2, 2))
+        vmap_worlds(greedy)(numbers(2, 2))
 
 
 def test_a_world_of_a_simulation_has_no_batch_axes():
@@ -74,4 +74,4 @@ def test_a_world_of_a_simulation_has_no_batch_axes():
         assert one.params.mass.shape == data.params.mass.shape
         return one.replace(core=one.core.replace(steps=one.core.steps + one.core.world_id))
 
-    np.testing.assert_array_equal(over_worlds(fn)(data).core.steps, [[0], [1]])
+    np.testing.assert_array_equal(vmap_worlds(fn)(data).core.steps, [[0], [1]])

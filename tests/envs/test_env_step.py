@@ -11,7 +11,7 @@ import crazysim.envs as envs
 from crazysim import Sim
 from crazysim.core.pipeline import append_fn
 from crazysim.core.sharding import world_mesh
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.engine.backends import fused
 from crazysim.engine.rollout import rollout
 from crazysim.envs.tasks.hover import Hover
@@ -230,10 +230,10 @@ class Ranked(Hover):
     batched = True
 
     def spawn(self, data, key):
-        return over_worlds(super().spawn)(data, key)
+        return vmap_worlds(super().spawn)(data, key)
 
     def terminated(self, data):
-        return over_worlds(super().terminated)(data)
+        return vmap_worlds(super().terminated)(data)
 
     def rewards(self, data, *_):
         height = data.states.pos[..., 2]

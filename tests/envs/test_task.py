@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim, Wind
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, DroneVectorEnv, Task, draw, make, uniform
 from crazysim.envs.random import between, episode_key, within
 from crazysim.envs.task import total
@@ -83,7 +83,7 @@ def test_keys_depend_on_seed_world_episode_and_name_only():
     four, two = (Sim(n_worlds=n, rng_key=7).data for n in (4, 2))
 
     def words(data, name="spawn"):
-        return np.asarray(jax.random.key_data(over_worlds(lambda one: episode_key(one, name))(data)))
+        return np.asarray(jax.random.key_data(vmap_worlds(lambda one: episode_key(one, name))(data)))
 
     first = words(four)
     np.testing.assert_array_equal(words(two), first[:2])

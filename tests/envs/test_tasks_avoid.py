@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.avoid import CELL, HEIGHT, IN_CELL, Avoid
 
@@ -67,7 +67,7 @@ def test_what_is_seen_are_the_nearest_points_of_the_nearest_obstacles(begun):
     inside = put(state, rng.uniform([-1.6, -2, 0.2], [1.6, 2, 1.8], (N_WORLDS, 2, 3))).data
     env.sim.data = inside
     gaps = np.sort(np.asarray(env.sim.contact_report().object_distance), axis=-1)[..., :4]
-    ways = np.asarray(jax.jit(over_worlds(env.task.observe))(inside)["obstacles_near"]).reshape(N_WORLDS, 2, 4, 3)
+    ways = np.asarray(jax.jit(vmap_worlds(env.task.observe))(inside)["obstacles_near"]).reshape(N_WORLDS, 2, 4, 3)
     # A report measures from the ball around the drone, 2 cm above its centre, which the ways begin at.
     far = np.linalg.norm(ways, axis=-1) - 0.086
     outside = gaps > 0.05

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import make
 
 CONTACT = 0.066
@@ -45,7 +45,7 @@ def step(env):
 @pytest.fixture(scope="module")
 def place(env):
     """Return the function from data to place and velocity of the roof."""
-    return jax.jit(over_worlds(env.task.target_motion))
+    return jax.jit(vmap_worlds(env.task.target_motion))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.land import Land, pad_of
 from crazysim.train.evaluation import evaluate
@@ -107,7 +107,7 @@ def test_a_moving_pad_moves_in_the_data_at_its_speed(moving):
     np.testing.assert_allclose(np.linalg.norm(after.objects.vel, axis=-1), SPEED, rtol=1e-4)
     along = (after.objects.pos - data.objects.pos) * 500 / steps
     np.testing.assert_allclose(along, after.objects.vel, atol=0.01)
-    seen = jax.jit(over_worlds(env.task.observe))(after)["difference_to_pad"] + np.asarray(after.states.pos)
+    seen = jax.jit(vmap_worlds(env.task.observe))(after)["difference_to_pad"] + np.asarray(after.states.pos)
     np.testing.assert_allclose(seen, after.objects.pos[:, 0], atol=1e-5)
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, Sim
 from crazysim.core.random import world_keys
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks import race as task
 from crazysim.envs.tasks import race_rules as rules
@@ -105,7 +105,7 @@ def test_rewards_count_way_gates_and_crashes_once(raced):
     np.testing.assert_allclose(reward[world["not there yet"]], 2 * moved, atol=0.01)
     assert reward[world["forwards"]] > 1.9
     assert reward[world["obstacle"]] < -1.9
-    terms = jax.jit(over_worlds(lambda data: rules.sparse(data, None, None)))(after.data)
+    terms = jax.jit(vmap_worlds(lambda data: rules.sparse(data, None, None)))(after.data)
     sparse = np.asarray(terms["gates"])[:, 0] + np.asarray(terms["disabled"])[:, 0]
     assert sparse[world["forwards"]] == 1
     assert sparse[world["obstacle"]] == -1
@@ -234,7 +234,7 @@ def test_random_courses_leave_room_between_gates_and_poles(drawn):
 def test_poses_are_nominal_until_the_drone_was_near(drawn):
     env, data = drawn[2]
     gate = np.asarray(data.objects.pos)[:, :, 0]
-    observe = jax.jit(over_worlds(env.task.observe))
+    observe = jax.jit(vmap_worlds(env.task.observe))
     said, far = np.asarray(TRACK.gates_pos[0]), np.array([-2.0, 1.0, 1.0])
 
     def at(data, pos):
@@ -254,14 +254,14 @@ def test_poses_are_nominal_until_the_drone_was_near(drawn):
     assert visited.all()
     observed, _ = seen(at(data, gate + [0.6, 0.4, 0.0]))
     np.testing.assert_allclose(observed, np.broadcast_to(said, observed.shape), atol=1e-6)
-    observed, visited = seen(at(jax.jit(over_worlds(env.task.before_step))(near), far))
+    observed, visited = seen(at(jax.jit(vmap_worlds(env.task.before_step))(near), far))
     np.testing.assert_allclose(observed, gate, atol=1e-6)
     assert visited.all()
 
 
 def test_the_same_key_gives_the_same_course_in_any_world(drawn):
     env, _ = drawn[1]
-    spawn = jax.jit(over_worlds(env.task.spawn))
+    spawn = jax.jit(vmap_worlds(env.task.spawn))
     default, keys = env.resets.default_of(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
     data, again, other = spawn(default, keys), spawn(default, keys), spawn(default, jnp.roll(keys, 1))
     for name in ("pos", "quat"):

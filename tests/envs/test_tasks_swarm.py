@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.swarm import Swarm, separation
 
@@ -109,8 +109,8 @@ def test_a_formation_is_what_drones_are_sent_to():
     close[:, 1] = close[:, 0] + 0.1
     near = data.replace(states=data.states.replace(pos=close))
     near = near.replace(plugins={"task": near.plugins["task"].replace(closest=np.zeros((64, 4), np.float32))})
-    assert not np.any(jax.jit(over_worlds(task.terminated))(near))
-    zeros, rewards = np.zeros((64, 4, 4), np.float32), jax.jit(over_worlds(task.rewards))
+    assert not np.any(jax.jit(vmap_worlds(task.terminated))(near))
+    zeros, rewards = np.zeros((64, 4, 4), np.float32), jax.jit(vmap_worlds(task.rewards))
     calm, crowded = rewards(data, zeros, zeros), rewards(near, zeros, zeros)
     assert np.all((np.asarray(crowded["crowding"]) - calm["crowding"])[:, 0] < -2)
 

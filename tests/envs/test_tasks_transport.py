@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError, Sim
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, make
 from crazysim.envs.tasks.transport import Transport, gate_axis, is_behind
 from crazysim.pytree import PyTree
@@ -115,7 +115,7 @@ def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
     at = GATE + rng.uniform(-corner, corner, (64, 3))
     aim = GATE - np.array([0.0, 0.0, LENGTH / 2], np.float32)
     at[0] = aim
-    ways, to_go = [], jax.jit(over_worlds(env.task.to_go))
+    ways, to_go = [], jax.jit(vmap_worlds(env.task.to_go))
     for x in (-1.0, -1e-3, 1e-3, 1.0):
         load = (at + np.array([x, 0.0, 0.0])).astype(np.float32)
         ways.append(np.asarray(to_go(placed(state, load - DOWN, load, 0.0).data))[:, 0])
@@ -127,7 +127,7 @@ def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
     data = placed(state, GOAL - DOWN, GOAL, 0.0).data
     own = data.plugins["task"].replace(to_go_before=jnp.asarray(ways[0])[:, None])
     data = data.replace(plugins=data.plugins | {"task": own})
-    paid = jax.jit(over_worlds(env.task.rewards))(data, state.action, state.action)
+    paid = jax.jit(vmap_worlds(env.task.rewards))(data, state.action, state.action)
     np.testing.assert_allclose(paid["progress"][:, 0], 5 * ways[0], rtol=1e-4)
     np.testing.assert_allclose(paid["proximity"], 1.5, rtol=1e-3)
     assert not np.any(paid["crash"])
@@ -154,7 +154,7 @@ def test_starts_are_clear_of_the_gates_and_links_are_taut():
     behind = jax.jit(is_behind)
     for place, expected in ((s.pos, False), (load.pos, False), (own.goal, True)):
         assert np.all(np.asarray(behind(place, pos, quat)) == expected)
-    assert np.all(np.asarray(jax.jit(over_worlds(env.task.error))(data)) > 2.0)
+    assert np.all(np.asarray(jax.jit(vmap_worlds(env.task.error))(data)) > 2.0)
 
 
 class Pilot(PyTree):

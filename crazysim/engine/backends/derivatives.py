@@ -17,7 +17,7 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.cache import announce
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import replace_leaves
 from crazysim.engine.backends import Run, lanes
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
 
@@ -59,7 +59,7 @@ def differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels | Non
             known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
 
             def of(some: list[Any]) -> Any:
-                return other(with_leaves(values, changing, some), known)
+                return other(replace_leaves(values, changing, some), known)
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
@@ -97,7 +97,7 @@ class Case(NamedTuple):
 
     def values(self, args: Sequence[Any]) -> list[Any]:
         """Return all leaves from the operands; None for one that is not given."""
-        return with_leaves([None] * self.n_leaves, self.present, args[: len(self.present)])
+        return replace_leaves([None] * self.n_leaves, self.present, args[: len(self.present)])
 
     def linear(self, args: Sequence[Any]) -> list[Any]:
         """Return the operands in which the derivative is linear."""
@@ -195,7 +195,7 @@ def _transposed(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params
 
 def _floats_after(case: Case, values: Sequence[Any], some: Sequence[Any]) -> list[Array]:
     kernels = case.kernels
-    written, _ = kernels.on_lanes(with_leaves(values, case.changing, some), case.n_steps)
+    written, _ = kernels.on_lanes(replace_leaves(values, case.changing, some), case.n_steps)
     return [x for i, x in zip(kernels.program.written, written, strict=True) if i in kernels.floats]
 
 

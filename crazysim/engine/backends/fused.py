@@ -19,7 +19,7 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.core.sharding import Location
-from crazysim.core.stage import PHASES, Phase, with_leaves
+from crazysim.core.stage import PHASES, Phase, replace_leaves
 from crazysim.engine.backends import Run, cuda, kernel, lanes, native
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
 from crazysim.engine.backends.derivatives import CountedRun, differentiable
@@ -208,8 +208,8 @@ def _on_leaves(program: Program, in_leaves: Program, location: Location) -> Run:
             for i in rows.members:
                 given[i] = rows.unpack(leaves[rows.leaf], i)
         out, flagged = built[0](given[: len(in_leaves.leaves)], n_steps)
-        after = with_leaves(given, in_leaves.written, out)
-        after = with_leaves(after, [rows.leaf for rows in every], [rows.pack(after) for rows in every])
+        after = replace_leaves(given, in_leaves.written, out)
+        after = replace_leaves(after, [rows.leaf for rows in every], [rows.pack(after) for rows in every])
         return [after[i] for i in program.written], flagged
 
     return run
@@ -238,7 +238,7 @@ def _split(program: Program, location: Location) -> CountedRun:
     def after(phase: Phase, leaves: list[Any], count: Array) -> list[Any]:
         for part, run in by_phase[phase]:
             out, _ = lanes.steps(part, leaves, 1) if run is None else run(leaves, count)
-            leaves = with_leaves(leaves, part.written, out)
+            leaves = replace_leaves(leaves, part.written, out)
         return leaves
 
     def run(leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
@@ -249,11 +249,11 @@ def _split(program: Program, location: Location) -> CountedRun:
         elif by_phase["each"]:
 
             def body(_: Any, values: list[Any]) -> list[Any]:
-                stepped = after("each", with_leaves(start, in_loop, values), once)
+                stepped = after("each", replace_leaves(start, in_loop, values), once)
                 return [stepped[i] for i in in_loop]
 
             start = leaves
-            leaves = with_leaves(start, in_loop, jax.lax.fori_loop(0, count, body, [start[i] for i in in_loop]))
+            leaves = replace_leaves(start, in_loop, jax.lax.fori_loop(0, count, body, [start[i] for i in in_loop]))
         flagged = lanes.nonfinite(program, lanes.LeafValues(program, leaves))
         leaves = after("after", leaves, once)
         return [leaves[i] for i in program.written], flagged

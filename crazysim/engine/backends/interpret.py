@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.sharding import Location
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import replace_leaves
 from crazysim.engine.backends import Run, lanes, subnormals
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Operation, Value
@@ -259,7 +259,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
     def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
-        arrays = with_leaves([None] * len(leaves), given, [np.asarray(x) for x in values])
+        arrays = replace_leaves([None] * len(leaves), given, [np.asarray(x) for x in values])
         with subnormals.flushed() if on_cpu else contextlib.nullcontext():
             return _steps(program, arrays, int(n_steps))
 

@@ -14,10 +14,10 @@ from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import PHASES, Axes, Phase, Stage, with_leaves
+from crazysim.core.stage import PHASES, Axes, Phase, Stage, replace_leaves
 from crazysim.core.stages import nonfinite
 from crazysim.engine.backends import Run
-from crazysim.pytree import declared
+from crazysim.pytree import leaf_flags
 
 
 def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
@@ -41,7 +41,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
                 written = axes.written(leaves, after, stage)
                 new = jax.tree.leaves(after)
                 # XLA's CPU backend would compute what a later stage reads again for each of its results.
-                leaves = with_leaves(leaves, written, jax.lax.optimization_barrier([new[i] for i in written]))
+                leaves = replace_leaves(leaves, written, jax.lax.optimization_barrier([new[i] for i in written]))
         return leaves
 
     jaxprs = {phase: jax.make_jaxpr(single, static_argnums=1)(jax.tree.leaves(data), phase) for phase in PHASES}
@@ -53,7 +53,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
         in_loop = written["each"]
 
         def turn(values: list[Any]) -> list[Any]:
-            after = run["each"](*with_leaves(leaves, in_loop, values))
+            after = run["each"](*replace_leaves(leaves, in_loop, values))
             return [after[i] for i in in_loop]
 
         out = [leaves[i] for i in in_loop]
@@ -61,12 +61,12 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
             out, _ = jax.lax.scan(lambda x, _: (turn(x), None), out, length=n_steps)
         elif in_loop:
             out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), out)
-        leaves = with_leaves(leaves, in_loop, out)
+        leaves = replace_leaves(leaves, in_loop, out)
         flagged = nonfinite(axes.treedef.unflatten(leaves))
         leaves = run["after"](*leaves)
         return [leaves[i] for i in every], flagged
 
-    scratch = {i for i, x in enumerate(jax.tree.leaves(declared(data, "scratch"))) if x}
+    scratch = {i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x}
     every = sorted({i for some in written.values() for i in some} - scratch)
     return steps, every
 
@@ -108,7 +108,7 @@ class Reset:
         """Return the same, without a compiled call."""
         for name, fn in self._stages:
             with jax.named_scope(name):
-                data = fn.in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)
+                data = fn.apply_in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)
         return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(False)))
 
     def lower(self, data: SimData, default_data: SimData, mask: Any = None) -> Any:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from crazysim.core.stage import Axes, Stage, of_world
+from crazysim.core.stage import Axes, Stage, world_function
 from crazysim.pytree import has_members
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class RelativeAxes(Axes):
     def __init__(self, data: Any, population: str):
         """Take the data of all worlds, not viewed."""
         super().__init__(data)
-        self.declared = Axes(data)
+        self.original = Axes(data)
         """Batch axes as declared."""
         self.views = frozenset(i for i, scope in enumerate(self.scopes) if has_members(scope) and scope != population)
         """Leaves of other populations."""
@@ -35,7 +35,7 @@ class RelativeAxes(Axes):
 
     def stage(self, stage: Stage) -> Stage:
         """Return a stage on viewed data."""
-        return stage if self.declared.scopes == self.scopes else RelativeStage(stage, self)
+        return stage if self.original.scopes == self.scopes else RelativeStage(stage, self)
 
 
 class RelativeStage(Stage):
@@ -48,10 +48,10 @@ class RelativeStage(Stage):
         if scope == "batch":
             fn = self
         elif scope != "world":
-            scopes = {axes.scopes[i] for i, declared in enumerate(axes.declared.scopes) if declared == scope}
+            scopes = {axes.scopes[i] for i, original in enumerate(axes.original.scopes) if original == scope}
             scope = next(iter(scopes))
             if scope == "world":
-                fn, when = of_world(stage, axes.declared), None
+                fn, when = world_function(stage, axes.original), None
         super().__init__(fn, scope, when, name=stage.__name__, why=stage.why, phase=stage.phase)
 
     def __call__(self, data: Any) -> Any:

@@ -19,7 +19,7 @@ from crazysim.engine.lowering.jaxprs import Elements, Entry, Lowering, as_elemen
 from crazysim.engine.lowering.relative import RelativeAxes, viewed
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
 from crazysim.jaxcompat import equations, is_key
-from crazysim.pytree import declared
+from crazysim.pytree import leaf_flags
 
 MAX_UNROLLED_DRONES = 8
 """Most drones of a world for which a stage of one world is lowered; its block grows with their square."""
@@ -61,7 +61,7 @@ def lower_stages(
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
     ])  # fmt: skip
-    scratch = frozenset(i for i, x in enumerate(jax.tree.leaves(declared(data, "scratch"))) if x)
+    scratch = frozenset(i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x)
     program = Program(described, n_drones, tuple(segments), None, scratch, (), population, axes.views)
     changed = known.keys() & set(program.written)
     if changed:  # an element is only known to be zero while no stage writes it

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import replace_leaves
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero
@@ -171,7 +171,7 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
         operands, tangents = args[: len(dtypes)], args[len(dtypes) :]
 
         def of(*some: Any) -> Any:
-            return applied(name, with_leaves(operands, floats, some), dtype, params)
+            return applied(name, replace_leaves(operands, floats, some), dtype, params)
 
         return jax.jvp(of, tuple([operands[k] for k in floats]), tangents)[1]
 

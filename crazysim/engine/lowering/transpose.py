@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.core.stage import with_leaves
+from crazysim.core.stage import replace_leaves
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
@@ -138,7 +138,7 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
         *operands, ct = args
 
         def of(some: list[Any]) -> Any:
-            return applied(name, with_leaves(operands, floats, some), dtype, params)
+            return applied(name, replace_leaves(operands, floats, some), dtype, params)
 
         return jax.vjp(of, [operands[k] for k in floats])[1](ct)[0]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import over_drones, over_worlds
+from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.media.poses import mocap_poses
@@ -78,7 +78,7 @@ class PictureSource:
         self._sim, self._worlds = sim, np.asarray(worlds)
         self._bodies = {(body.kind, body.index): body for body in bodies.items}
         self._contacts, self._wind = contacts, wind
-        self._wind_fn = jax.jit(over_worlds(over_drones(_air)))
+        self._wind_fn = jax.jit(vmap_worlds(vmap_drones(_air)))
 
     def take(self, live: Live, plot: str = "") -> Picture:
         """Return a picture of the simulation as it is now.

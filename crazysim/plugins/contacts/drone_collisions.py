@@ -13,7 +13,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
-from crazysim.core.stage import Stage, over_worlds
+from crazysim.core.stage import Stage, vmap_worlds
 from crazysim.errors import ConfigError
 from crazysim.geometry.manifold import N_OF_BOXES
 from crazysim.plugins.contacts.pairs import Solids, between, joined
@@ -92,5 +92,5 @@ class DroneCollisions(Plugin):
             states = moved(data.states, solved, slice(n))
             return self.write(data.replace(states=states), record.replace(**changes))
 
-        solve = Stage(over_worlds(of_world), "batch", why="it solves the contacts of all worlds at once")
+        solve = Stage(vmap_worlds(of_world), "batch", why="it solves the contacts of all worlds at once")
         return [Placement(solve, before="increment_steps")]

@@ -13,7 +13,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
-from crazysim.core.stage import over_worlds
+from crazysim.core.stage import vmap_worlds
 from crazysim.errors import ConfigError
 from crazysim.geometry.linear import apply, matmul
 from crazysim.geometry.manifold import N_OF_BOXES
@@ -58,7 +58,7 @@ class Touching:
 
     def respond(self, data: SimData) -> SimData:
         """Return the data of all worlds with the velocities after contact."""
-        return over_worlds(self.of_world)(data)
+        return vmap_worlds(self.of_world)(data)
 
     def of_world(self, data: SimData) -> SimData:
         """Return the data of one world with the velocities of bodies and drones after contact."""

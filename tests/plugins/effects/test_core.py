@@ -23,7 +23,7 @@ from crazysim import (
     load_airframe,
 )
 from crazysim.core.pipeline import replace_fn
-from crazysim.core.stage import over_drones
+from crazysim.core.stage import vmap_drones
 from crazysim.engine import Step
 from crazysim.plugins import effects
 from crazysim.plugins.effects.grid import Grid
@@ -166,8 +166,8 @@ def at_world(scope, x, world):
 def test_law_01_what_a_stage_does_to_all_it_does_to_one(every, flown, name):
     """A stage on the data of one drone, or one world, gives what it gives on all data at that place."""
     stage = every.step_pipeline[name]
-    all_at_once, of_one = on_host(jax.jit(stage)(flown)), jax.jit(stage.one)
-    blown = jax.jit(over_drones(stage.one))
+    all_at_once, of_one = on_host(jax.jit(stage)(flown)), jax.jit(stage.apply_to_one)
+    blown = jax.jit(vmap_drones(stage.apply_to_one))
     for index in [(0, 0), (1, 1), (2, 0)]:
 
         def at(scope, x, index=index):

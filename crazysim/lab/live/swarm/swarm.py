@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.core.data import SimData
-from crazysim.core.stage import over_drones, over_worlds
+from crazysim.core.stage import vmap_drones, vmap_worlds
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError, UnknownNameError
@@ -80,7 +80,7 @@ class Swarm(Closing):
         self._motors = self._add_motors()
         estimators = [plugin for plugin in sim.plugins.values() if isinstance(plugin, Estimator)]
         self._estimator = next((each for each in estimators if each.control), None)
-        self._estimate = jax.jit(over_worlds(over_drones(self._estimated)))
+        self._estimate = jax.jit(vmap_worlds(vmap_drones(self._estimated)))
         self._on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
         self._yaws: list[float] = []
