@@ -18,11 +18,11 @@ from crazysim.pytree import PyTree
 
 T = TypeVar("T")
 
-PREFIXES = {"Crazyflie": ("cf", "crazyflie"), "Bumblebee": ("bumblebee",)}
+NAME_PREFIXES = {"Crazyflie": ("cf", "crazyflie"), "Bumblebee": ("bumblebee",)}
 """Names of drones of some airframes, by the beginnings of the names of these, as AIMotionLab-Virtual has them."""
-MASK = "rotors"
+ROTOR_MASK = "rotors"
 """Name of fields that are True for the rotors that a drone has; None where all drones have equally many."""
-PER_ROTOR = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
+PER_ROTOR_FIELDS = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
 """Fields that missing rotors have like the last one; all others are zero for missing rotors."""
 
 
@@ -83,7 +83,7 @@ def n_rotors_of(airframes: Airframes) -> int:
 def prefix_of(airframe: Airframe) -> str:
     """Return the beginning of the names of drones of an airframe: ``Crazyflie``, ``Bumblebee``, or its own name."""
     name = airframe.name.lower()
-    for prefix, beginnings in PREFIXES.items():
+    for prefix, beginnings in NAME_PREFIXES.items():
         if name.startswith(beginnings):
             return prefix
     words = re.findall("[A-Za-z0-9]+", airframe.name)
@@ -152,7 +152,7 @@ def _of_one_shape(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
         if any(alike):
             x = np.broadcast_to(x, [n if one else own for n, own, one in zip(shape, x.shape, alike, strict=True)])
             missing = [(0, n - own) for n, own in zip(shape, x.shape, strict=True)]
-        out.append(np.pad(x, missing, mode="edge" if name in PER_ROTOR else "constant"))
+        out.append(np.pad(x, missing, mode="edge" if name in PER_ROTOR_FIELDS else "constant"))
     return out
 
 
@@ -163,7 +163,7 @@ def _with_mask(record: Any, n_rotors: int) -> Any:
     changes = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
         value = getattr(record, f.name)
-        if f.name == MASK and value is None:
+        if f.name == ROTOR_MASK and value is None:
             changes[f.name] = np.ones(n_rotors, bool)
         elif isinstance(value, (PyTree, tuple, list)):
             of_parts = isinstance(value, (tuple, list))

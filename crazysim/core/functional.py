@@ -19,7 +19,7 @@ from crazysim.core.settings import flag
 from crazysim.core.stage import tick
 from crazysim.errors import ConfigError, shown
 
-FEEDFORWARD = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"
+FEEDFORWARD_FIELDS = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"
 """Entries of a feedforward with their units, for messages."""
 
 
@@ -90,7 +90,7 @@ def check_setpoint(
             "controller='auto', or leave it out."
         )
     shape = (*command.shape[:-1], 8)
-    return command, _as_command(data, "feedforward", shape, FEEDFORWARD, feedforward, check_finite)
+    return command, _as_command(data, "feedforward", shape, FEEDFORWARD_FIELDS, feedforward, check_finite)
 
 
 def _joined(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:

@@ -16,7 +16,7 @@ from jax import Array
 from crazysim.errors import ConfigError
 from crazysim.jaxcompat import ClosedJaxpr, batched_primitive, jaxpr_as_fun, without_constants
 
-AXIS = "members"
+MEMBER_AXIS = "members"
 """Name of the axis of ``vmap`` over the drones of a world, or over the members of another population."""
 
 Reduction = Literal["sum", "min", "max"]
@@ -102,7 +102,7 @@ def _batched(axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJ
     """Return the reduction under ``vmap``: over drones it is computed, over any other axis it stays one."""
     mapped = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
-    if axis.name == AXIS:
+    if axis.name == MEMBER_AXIS:
         out = _of_all(axis.size, rows[:n_own], mapped[:n_own], rows[n_own:], mapped[n_own:], jaxpr, reduce)
     else:
         of_many = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*mapped, None), axis_size=axis.size)

@@ -34,7 +34,7 @@ MAX_FRICTION = 1000.0
 MAX_SOFTNESS = 10.0
 """Largest softness of contacts, s."""
 
-NUMERIC = frozenset((int, float, np.ndarray))
+NUMERIC_TYPES = frozenset((int, float, np.ndarray))
 """Types of fields with numbers; an array stands for ``ArrayLike``."""
 SLOW_FREQ = 200
 """Rate of physics steps, Hz, below which half of it is too slow for a controller: the cascades of small drones are
@@ -82,7 +82,7 @@ class NumbersByName:
     """Stands for ``Mapping[str, float]`` among the types of a field."""
 
 
-NAMES = {Callable: "a function", Mapping: "a dict"}
+TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
 """Names of types for messages, where they are not those of the classes."""
 
 
@@ -167,7 +167,7 @@ def check_settings(settings: Any) -> None:
         name, declared = f"{field.name} of {kind.__name__}", settings_of(kind)[field.name]
         remedy = f"help({kind.__name__}) describes it."
         kinds = set(kinds) - {type(None)}
-        classes = tuple(kinds - NUMERIC)
+        classes = tuple(kinds - NUMERIC_TYPES)
         if kinds == {bool}:
             flag(name, value)
         elif kinds == {NumbersByName}:
@@ -175,12 +175,12 @@ def check_settings(settings: Any) -> None:
                 raise ConfigError(f"expected {name} as a dict of numbers by name, got {shown(value)}. {remedy}")
             for key, item in value.items():
                 numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
-        elif kinds & NUMERIC and not isinstance(value, classes):
+        elif kinds & NUMERIC_TYPES and not isinstance(value, classes):
             shapes = declared.shapes if np.ndarray in kinds or declared.is_parameter else ((),)
-            whole = kinds & NUMERIC == {int} or declared.dtype is not None
+            whole = kinds & NUMERIC_TYPES == {int} or declared.dtype is not None
             numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
         elif not isinstance(value, classes):
-            names = " or ".join(sorted(NAMES.get(k, k.__name__) for k in kinds))
+            names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in kinds))
             raise ConfigError(f"expected {name} as {names}, got {shown(value)}. {remedy}")
 
 
@@ -216,7 +216,7 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
         parts = [_types(part, names) for part in typing.get_args(hint)]
         return tuple(itertools.chain(*parts)) if all(parts) else ()
     if typing.get_origin(hint) is Sequence and (inner := _types(typing.get_args(hint)[0], names)):
-        return (np.ndarray,) if NUMERIC.issuperset(inner) else ()
+        return (np.ndarray,) if NUMERIC_TYPES.issuperset(inner) else ()
     if hint is None:
         return (type(None),)
     # Arrays may be of any type, such as bool, and a JAX array one of NumPy; ``ArrayLike`` is for numbers.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.others import AXIS
+from crazysim.core.others import MEMBER_AXIS
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, has_members, leaf_indices, n_batch_axes, n_world_axes, scopes, select_worlds
 
@@ -304,7 +304,7 @@ def vmap_members(fn: Callable[[SimData], Any], population: str) -> Callable[[Sim
     def of_world(data: SimData) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == population else None for scope in jax.tree.leaves(scopes(data))]
-        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=AXIS)(leaves)
+        return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=MEMBER_AXIS)(leaves)
 
     return of_world
 
@@ -337,7 +337,7 @@ def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
             return [new[i] for i in written]
 
         own = [0 if s == stage.scope else None for s in axes.scopes]
-        out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,), axis_name=AXIS)(leaves)
+        out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,), axis_name=MEMBER_AXIS)(leaves)
         return axes.treedef.unflatten(replace_leaves(leaves, written, out))
 
     return of_one_world

@@ -21,7 +21,7 @@ from crazysim.core.stage import Stage, StageScope, tick
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
 
-FLOOR = -0.001
+FLOOR_HEIGHT = -0.001
 """Height below which no drone falls, m: a little under zero, so that a negative height marks a landing."""
 
 
@@ -129,7 +129,7 @@ def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
 
     def held(data: SimData) -> SimStateDeriv:
         s, deriv = data.states, deriv_fn(data)
-        stands = (s.pos[..., 2:] == FLOOR) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
+        stands = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
         return deriv.replace(acc=jnp.where(stands, 0.0, deriv.acc), ang_acc=jnp.where(stands, 0.0, deriv.ang_acc))
 
     return held
@@ -149,7 +149,7 @@ def stopped_at(s: SimState, lowest: Array | float) -> SimState:
 @_built_in("drone")
 def clip_floor_pos(data: SimData) -> SimData:
     """Stop drones at the floor."""
-    return data.replace(states=stopped_at(data.states, FLOOR))
+    return data.replace(states=stopped_at(data.states, FLOOR_HEIGHT))
 
 
 @_built_in("world")

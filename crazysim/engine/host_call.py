@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from crazysim import jaxcompat
 from crazysim.engine.backends.fused import Kernels
 
-ALIGNMENT = 64
+ALIGNMENT_BYTES = 64
 """Alignment of memory that JAX takes over without a copy, bytes."""
-SMALL = 1 << 16
+MAX_SHARED_BYTES = 1 << 16
 """Bytes up to which all results of a call share one piece of memory."""
 
 
@@ -100,8 +100,10 @@ class _Layout:
     def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
         self.places: list[_Place] = []
         self.sizes: list[int] = []
-        rounded = [-(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT for _, shape, dtype in results]
-        self.shared = sum(rounded) <= SMALL
+        rounded = [
+            -(-math.prod(shape) * dtype.itemsize // ALIGNMENT_BYTES) * ALIGNMENT_BYTES for _, shape, dtype in results
+        ]
+        self.shared = sum(rounded) <= MAX_SHARED_BYTES
         for (_, shape, dtype), size in zip(results, rounded, strict=True):
             if self.shared and self.sizes:
                 self.places.append(_Place(0, self.sizes[0], shape, dtype))
@@ -121,9 +123,9 @@ class Results:
     def __init__(self, layout: _Layout):
         """Allocate their memory."""
         self._layout = layout
-        self._memory = [np.empty(size + ALIGNMENT, np.uint8) for size in layout.sizes]
+        self._memory = [np.empty(size + ALIGNMENT_BYTES, np.uint8) for size in layout.sizes]
         begins = [_address(x) for x in self._memory]
-        self._starts = [-begin % ALIGNMENT for begin in begins]
+        self._starts = [-begin % ALIGNMENT_BYTES for begin in begins]
         first = [begin + start for begin, start in zip(begins, self._starts, strict=True)]
         self.addresses = [first[piece] + offset for piece, offset in layout.begins]
 

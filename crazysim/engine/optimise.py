@@ -14,7 +14,7 @@ from crazysim.engine.passes.schedule import fuse, hoist, join_ticks
 
 Pass = Callable[[Program], Program]
 
-VERIFY = "CRAZYSIM_VERIFY"
+VERIFY_VARIABLE = "CRAZYSIM_VERIFY"
 """Environment variable that, set to 1, has every program verified after every pass."""
 
 
@@ -43,7 +43,7 @@ def apply(program: Program, passes: Iterable[Pass]) -> Program:
 
 
 def _inspect(program: Program, name: str) -> None:
-    if os.environ.get(VERIFY) == "1":
+    if os.environ.get(VERIFY_VARIABLE) == "1":
         verify(program)
     if dump.enabled():
         dump.write(f"program.{name}", listing.list_program(program))

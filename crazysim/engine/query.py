@@ -18,7 +18,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf
 
-NAME = "results"
+RECORD_NAME = "results"
 """Name of the results in ``data.plugins`` while the kernel runs."""
 
 Query = tuple[Literal["drone", "world"], Callable[[SimData], Any]]
@@ -58,14 +58,14 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         shapes.append(dict(zip(names, per_drone, strict=True)))
         trees.append(treedef)
         stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}", phase="after"))
-    prepared = data.replace(plugins={NAME: Results(rows)})
+    prepared = data.replace(plugins={RECORD_NAME: Results(rows)})
     given, treedef = jax.tree.flatten(prepared)
     program = optimise(lower_stages(stages, prepared))
     if program.unfused_stages:
         raise program.unfused_stages[0].error
     packed = [jnp.concatenate([given[i].ravel() for i in program.packed])] if program.packed else []
     written, _ = on_data(program, fused.build(program, Location(platform)))([*given, *packed], 0)
-    found = treedef.unflatten(replace_leaves(given, program.written, written)).plugins[NAME].rows
+    found = treedef.unflatten(replace_leaves(given, program.written, written)).plugins[RECORD_NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])
         for tree, some in zip(trees, shapes, strict=True)
@@ -76,10 +76,10 @@ def _writing(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Call
     """Return the stage that writes the results of a function to the data."""
 
     def write(data: SimData) -> SimData:
-        rows = data.plugins[NAME].rows
+        rows = data.plugins[RECORD_NAME].rows
         outs = jax.tree.leaves(fn(data.replace(plugins={})))
         shape = (data.core.n_drones, -1) if scope == "world" else (-1,)
         new = {name: x.reshape(shape) for name, x in zip(names, outs, strict=True)}
-        return data.replace(plugins={NAME: Results(rows | new)})
+        return data.replace(plugins={RECORD_NAME: Results(rows | new)})
 
     return write

@@ -86,9 +86,9 @@ def rollout(
     return start.replaced(changed, carry).data(), kept
 
 
-SETTINGS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
+STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
 
-compiled = functools.partial(jax.jit, static_argnames=SETTINGS)(rollout)
+compiled = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
 """``rollout`` in one compiled call; only the carries of its loops reuse buffers."""
 
 

@@ -20,7 +20,7 @@ from crazysim.engine.plan import Plan
 from crazysim.engine.step import FlatData, Step
 from crazysim.errors import ConfigError
 
-PATIENCE = 5.0
+ANNOUNCED_AFTER = 5.0
 """Time after which the compilation of a step is announced, s: most take less, filters with many states take more."""
 
 
@@ -132,7 +132,7 @@ class Stepper:
         """Advance the data; any number of steps uses the same compilation."""
         self.count(n_steps)
         compiles, self._compiled = self._compiled is not self.step, self.step
-        with announced("compiling the step", "5 to 40 s", PATIENCE) if compiles else nullcontext():
+        with announced("compiling the step", "5 to 40 s", ANNOUNCED_AFTER) if compiles else nullcontext():
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
                 after = self.step.advance(flat, self._as_array(n_steps))

@@ -150,10 +150,10 @@ def test_a_step_has_a_kernel_on_platforms_that_it_was_not_planned_for():
         pytest.skip("no NVRTC here; CI has it")
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
     for planned_for in ("cpu", "gpu"):
-        for platform, target in (("cpu", "crazysim_advance"), ("cuda", cuda.TARGET)):
+        for platform, target in (("cpu", "crazysim_advance"), ("cuda", cuda.PTX_TARGET)):
             text = lowered(sim, planned_for, platform)
-            assert [text.count(name) for name in ("crazysim_advance", cuda.TARGET)] == [
-                int(name == target) for name in ("crazysim_advance", cuda.TARGET)
+            assert [text.count(name) for name in ("crazysim_advance", cuda.PTX_TARGET)] == [
+                int(name == target) for name in ("crazysim_advance", cuda.PTX_TARGET)
             ]
 
 
@@ -165,7 +165,7 @@ def test_compiling_for_one_platform_needs_no_compiler_of_another(monkeypatch):
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     monkeypatch.setattr(native, "compiler", lambda: None)
-    assert cuda.TARGET in lowered(sim, "gpu", "cuda")
+    assert cuda.PTX_TARGET in lowered(sim, "gpu", "cuda")
 
 
 def test_a_step_without_a_kernel_where_jax_compiles_it_is_an_error():

@@ -106,7 +106,7 @@ def test_a_kernel_goes_back(x64, monkeypatch):
     for a, b in zip(found, of_kernel(at), strict=True):
         np.testing.assert_array_equal(a, b)
 
-    monkeypatch.setattr(native, "KEPT", 0)
+    monkeypatch.setattr(native, "GRADIENT_MEMORY_BYTES", 0)
     ((in_intervals, step, data), (plain, *_)), at = functions(n_steps=10)
     assert_same(gradient(in_intervals)(at), gradient(plain)(at))
     assert "gradient: one kernel" in explain(step, data)
@@ -227,7 +227,7 @@ def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
         ways = []
         for platform in ("cuda", "cpu"):
             text = traced.lower(lowering_platforms=(platform,)).as_text()
-            ways.append([text.count(name) for name in (cuda.TARGET, "crazysim_advance")])
+            ways.append([text.count(name) for name in (cuda.PTX_TARGET, "crazysim_advance")])
         forward_and_back, kernels_of_cpu = 2, 2 if n_drones == 1 else 1
         assert ways == [[forward_and_back, 0], [0, kernels_of_cpu]]
         ran = [line for line in explain(step, sim.data).splitlines() if line.startswith("gradient: ")]
@@ -247,7 +247,7 @@ def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, inte
     assert count.tolist() == [n_steps, interval]
     n_states = interval + max(-(-n_steps // interval), 1)
     assert memory.shape == (blocks, n_states * 24 * kernel.threads)
-    assert memory.size * 4 <= cuda.KEPT
+    assert memory.size * 4 <= cuda.MAX_GRADIENT_MEMORY_BYTES
 
 
 @pytest.mark.long("compiles tangents in two engines")

@@ -38,7 +38,7 @@ def source():
 def place(tmp_path, monkeypatch):
     """An empty cache folder, and nothing loaded from an earlier one."""
     monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
-    monkeypatch.setattr(native, "_LOADED", {})
+    monkeypatch.setattr(native, "_LIBRARIES", {})
     monkeypatch.setattr("crazysim.jaxcompat.register_host_target", lambda name, function: None)
     native.toolchain.cache_clear()
     yield tmp_path
@@ -55,7 +55,7 @@ def compilations(monkeypatch):
 
 def again(source):
     """Return the kernel's name in a process that has loaded nothing yet."""
-    native._LOADED.clear()
+    native._LIBRARIES.clear()
     native.toolchain.cache_clear()
     return native.target(source)
 
@@ -201,7 +201,7 @@ def test_a_shared_folder_that_cannot_be_written_is_not_used(tmp_path, monkeypatc
 def test_boundaries_between_the_parts_of_a_key_count():
     assert kernel_cache.digest("ab", "c") != kernel_cache.digest("a", "bc")
     assert kernel_cache.digest("a", "b") != kernel_cache.digest("b", "a")
-    assert len(kernel_cache.digest("a")) == kernel_cache.LENGTH
+    assert len(kernel_cache.digest("a")) == kernel_cache.DIGEST_LENGTH
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place
 def test_without_any_compiler_one_line_names_the_remedy(monkeypatch, capsys):
     monkeypatch.setattr(native, "compiler", lambda: None)
     fused._announce_missing.cache_clear()
-    assert fused.missing("cpu") == fused.missing("cpu") == native.MISSING
+    assert fused.missing("cpu") == fused.missing("cpu") == native.MISSING_COMPILER
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert "pip install 'crazysim[compiler]'" in told

@@ -96,7 +96,7 @@ def test_barriers_separate_runs_of_operations_and_change_no_number(pipeline):
     (before,), (after,) = fused.segments, separated.segments
     names = [op.name for op in after.block.operations]
     runs = "".join("|" if name == "barrier" else "." for name in names).split("|")
-    assert max(map(len, runs)) == schedule.SPAN
+    assert max(map(len, runs)) == schedule.BARRIER_INTERVAL
     assert [name for name in names if name != "barrier"] == [
         op.name for op in before.block.operations if op.name != "barrier"
     ]

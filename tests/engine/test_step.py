@@ -368,8 +368,8 @@ def test_gradients_equal_those_of_the_stages_in_float64(x64):
 
 @pytest.mark.long("compiles gradients in both directions")
 def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
-    """From ``LONG`` steps on few beginnings are kept; what is zero in an inertia has a derivative all the same."""
-    monkeypatch.setattr(lanes, "LONG", 16)
+    """From ``MIN_CHECKPOINTED_STEPS`` on few carries are kept; a zero of an inertia has a derivative all the same."""
+    monkeypatch.setattr(lanes, "MIN_CHECKPOINTED_STEPS", 16)
     sim = Sim(n_worlds=2, n_drones=1, control="rotor_vel")
     data = scattered(sim, dtype=np.float64)
     data = data.replace(states=data.states.replace(pos=data.states.pos + 5.0))  # off the floor
@@ -390,8 +390,8 @@ def test_long_and_forward_gradients_and_those_of_parameters(x64, monkeypatch):
 
 @pytest.mark.parametrize("n", [1, 15, 16, 18, 25])
 def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
-    """Below ``LONG`` steps, and from there on, for a number that is a square and one that leaves a rest."""
-    monkeypatch.setattr(lanes, "LONG", 16)
+    """For fewer steps than ``MIN_CHECKPOINTED_STEPS`` and for more, square numbers and others."""
+    monkeypatch.setattr(lanes, "MIN_CHECKPOINTED_STEPS", 16)
 
     def power(x, y):
         (product, _) = lanes.repeat(lambda c: (c[0] * x, c[1] + 1), (y, 0), n)
@@ -610,7 +610,7 @@ def test_every_pipeline_compiles_for_a_gpu(settings):
     assert text.count("st.global") >= sum(plan.program.leaves[i].size for i in source.outputs)  # nothing is lost
     inputs = step.flatten(sim.data).inputs()
     lowered = plan.dynamic.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
-    assert lowered.as_text().count(cuda.TARGET) == 1  # one kernel for all stages and steps
+    assert lowered.as_text().count(cuda.PTX_TARGET) == 1  # one kernel for all stages and steps
 
 
 def test_appended_stages_are_seen():

@@ -143,7 +143,7 @@ def test_a_step_has_a_kernel_on_each_platform_that_jax_compiles_it_for(env, begu
     if cuda.nvrtc() is None:
         pytest.skip("no NVRTC here; CI has it")
     step = jax.jit(env.env.step).trace(begun, begun.action)
-    kernels = {"cpu": "crazysim_advance", "cuda": cuda.TARGET}
+    kernels = {"cpu": "crazysim_advance", "cuda": cuda.PTX_TARGET}
     for platform in kernels:
         text = step.lower(lowering_platforms=(platform,)).as_text()
         assert {name: target in text for name, target in kernels.items()} == {

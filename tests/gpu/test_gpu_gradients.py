@@ -123,8 +123,8 @@ def test_tangents_are_those_of_the_reference_on_the_cpu(n_drones):
 def test_the_bits_depend_neither_on_the_run_nor_on_memory(monkeypatch):
     """With little memory in intervals, and in fewer blocks of threads, each for several blocks of lanes."""
     found = []
-    for memory in (cuda.KEPT, cuda.KEPT, 2**18):
-        monkeypatch.setattr(cuda, "KEPT", memory)
+    for memory in (cuda.MAX_GRADIENT_MEMORY_BYTES, cuda.MAX_GRADIENT_MEMORY_BYTES, 2**18):
+        monkeypatch.setattr(cuda, "MAX_GRADIENT_MEMORY_BYTES", memory)
         fn, at = gradient(flying(ACCELERATOR, 100, control="attitude"), n_steps=100, of_params=True)
         found.append(floats(jax.jit(fn)(at)))
     assert trees_equal(found[0], found[1])

@@ -24,7 +24,7 @@ from cases import (
 )
 
 from crazysim import ConfigError, PyTree, Sim, leaf
-from crazysim.core.stages import FLOOR
+from crazysim.core.stages import FLOOR_HEIGHT
 from crazysim.pytree import n_batch_axes, scopes
 
 
@@ -245,7 +245,7 @@ def test_fault_13_a_drone_on_the_floor_neither_slides_nor_turns_and_takes_off(in
     tilt[3] = np.sqrt(1 - np.sum(np.square(tilt)))
     data = with_states(
         data,
-        pos=[0.3, -0.2, FLOOR],
+        pos=[0.3, -0.2, FLOOR_HEIGHT],
         quat=tilt,
         rotor_vel=0.7 * hover,
         force=[0.5 * m * 9.81, 0.1 * m * 9.81, 0],
@@ -270,7 +270,7 @@ def test_fault_13_a_drone_that_has_fallen_stays_where_it_came_down(integrator):
     thrown = with_states(data, pos=[0, 0, 0.2], vel=[1.0, 0, -1.0], ang_vel=[0.5, 0.2, 3.0], torque=[0, 0, 1e-4])
     down = run(step, send(thrown, np.zeros((3, 2, 4))), 250)
     later = run(step, down, 250)
-    assert np.all(down.states.pos[..., 2] == np.float32(FLOOR))
+    assert np.all(down.states.pos[..., 2] == np.float32(FLOOR_HEIGHT))
     assert np.all(down.states.pos[..., 0] > 0.05), "it has flown"
     np.testing.assert_array_equal(later.states.pos, down.states.pos)
     np.testing.assert_allclose(later.states.quat, down.states.quat, atol=1e-5)  # rounding of 250 normalisations

@@ -23,7 +23,7 @@ from cases import (
 )
 
 from crazysim import Drone, Sim, load_airframe
-from crazysim.core.stages import FLOOR
+from crazysim.core.stages import FLOOR_HEIGHT
 from crazysim.dynamics import supported_dynamics
 
 HALF = np.sqrt(0.5)
@@ -71,7 +71,7 @@ def situations(dynamics, control, engine="auto"):
     commands = np.broadcast_to(hover_command(sim.data), (n, 1, len(hover_command(sim.data)))).copy()
     at = {name: i for i, name in enumerate(SITUATIONS)}
     rotor_vel[at["hover"]] = hover_rotor_state(sim.data)
-    for name, height in (("rest at zero", 0.0), ("rest on floor", FLOOR), ("below floor", -1.0)):
+    for name, height in (("rest at zero", 0.0), ("rest on floor", FLOOR_HEIGHT), ("below floor", -1.0)):
         pos[at[name], 0, 2] = height
         commands[at[name]] = 0.0
     quat[at["pitch +90"]] = 0, HALF, 0, HALF
@@ -122,7 +122,7 @@ def test_values_and_gradients_are_finite(dynamics, control, engine):
         for leaf, x in {**vars(end.states), **{f"gradient of {k}": v for k, v in gradients.items()}}.items():
             assert np.all(np.isfinite(x[world])), f"{leaf} in {name!r}"
     assert not end.core.nonfinite.any()
-    assert np.all(end.states.pos[..., 2] >= np.float32(FLOOR))
+    assert np.all(end.states.pos[..., 2] >= np.float32(FLOOR_HEIGHT))
     # The drones did fly: the place of each counts fully in where it ends, but on the floor.
     assert np.all(gradients["pos"][SITUATIONS.index("upside down"), 0, :2] != 0)
     # float32 rounding of 50 renormalisations

@@ -1,8 +1,8 @@
 """Kernels on NVIDIA GPUs: CUDA source compiled by NVRTC, launched by XLA itself.
 
 NVRTC comes with JAX's CUDA packages. The PTX that it makes is part of the compiled step, as a custom call of XLA
-(``TARGET``), which hands it to the driver; so JAX's own cache never finds a kernel for another GPU. It needs no other
-package, no compiler on the machine, and no Python at run time.
+(``PTX_TARGET``), which hands it to the driver, so JAX's own cache never finds a kernel for another GPU. Kernels need no
+other package, no compiler on the machine, and no Python at run time.
 """
 
 from __future__ import annotations
@@ -23,33 +23,34 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.engine.backends import kernel_cache
-from crazysim.engine.backends.exchange import WARP
-from crazysim.engine.backends.frame import UNBOUNDED, Kernel, interval
+from crazysim.engine.backends.exchange import WARP_THREADS
+from crazysim.engine.backends.frame import ANY_NUMBER_OF_BLOCKS, Kernel, interval
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
 
-TARGET = "__gpu$xla.gpu.ptx"
+PTX_TARGET = "__gpu$xla.gpu.ptx"
 """XLA's name for a kernel that is passed to it as PTX."""
 
-OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false", "--device-as-default-execution-space")
+NVRTC_OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false",
+                 "--device-as-default-execution-space")  # fmt: skip
 """Division and square root to 2 and 1 units in the last place, as XLA has them; no other shortcut."""
 
-THREADS_AT_ONCE = (512, 384)
+THREADS_TO_TRY = (512, 384)
 """Numbers of threads of a multiprocessor to try, the most first: they leave 128 or 168 registers to each thread."""
 
-WIDE = 256
-"""Threads of a block of a kernel with more than ``CODE`` of code, where there are at least ``LANES`` lanes: those of a
-block take the same way, so more of them wait for the same instructions."""
+LARGE_KERNEL_THREADS = 256
+"""Threads per block for kernels larger than the instruction cache, from ``RESIDENT_LANES`` lanes on. The threads of a
+block execute the same code, so more of them share each fetched instruction."""
 
-CODE = 96 * 2**10
-"""Compiled kernel that the instruction cache of a multiprocessor has no room for, bytes; measured on an H100."""
+INSTRUCTION_CACHE_BYTES = 96 * 2**10
+"""Size of a compiled kernel from which it exceeds the instruction cache of a multiprocessor; measured on an H100."""
 
-KEPT = 2**30
-"""Most memory for what the steps begin with that a gradient goes back through at once, bytes."""
+MAX_GRADIENT_MEMORY_BYTES = 2**30
+"""Most memory for the stored states of the steps that a gradient goes back through at once."""
 
-LANES = 2**16
-"""Lanes that a gradient has memory for at once, if there are as many: as a GPU of 132 multiprocessors runs at most."""
+RESIDENT_LANES = 2**16
+"""Most lanes that run at once, on a GPU of 132 multiprocessors; a gradient has memory for as many."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""
@@ -83,13 +84,13 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
     ptx(few, architecture(device))  # raises here what it would raise at the first launch
 
     def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        kernel = few if n_lanes < LANES else many
+        kernel = few if n_lanes < RESIDENT_LANES else many
         n_blocks, memory = -(-n_lanes // kernel.lanes), []
         if kernel.kept:
             n_blocks, count, memory = _with_memory(kernel, n_lanes, int(count[0]))
         grid = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1}
         block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
-        run = jax.ffi.ffi_call(TARGET, [*outputs, *memory], input_output_aliases=kernel.aliases())
+        run = jax.ffi.ffi_call(PTX_TARGET, [*outputs, *memory], input_output_aliases=kernel.aliases())
         written = list(
             run(
                 np.asarray([n_lanes], np.int32),
@@ -108,15 +109,15 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
 
 
 def _with_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
-    """Return how many blocks of a kernel that keeps numbers run, its numbers of steps, and the memory that it needs.
+    """Return the number of blocks of a kernel that stores states, its numbers of steps, and the memory that it needs.
 
-    Where that would exceed ``KEPT``, there are fewer blocks, each for several blocks of lanes, one after the other.
+    Where that would exceed ``MAX_GRADIENT_MEMORY_BYTES``, fewer blocks each compute several blocks of lanes in turn.
     """
-    here = interval(n_steps, min(n_lanes, LANES) * kernel.kept, KEPT)
+    here = interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.kept, MAX_GRADIENT_MEMORY_BYTES)
     n_states = here + max(-(-n_steps // here), 1)
     size = n_states * kernel.kept * kernel.threads
     n_blocks = -(-n_lanes // kernel.lanes)
-    turns = -(-n_blocks // max(KEPT // size, 1))
+    turns = -(-n_blocks // max(MAX_GRADIENT_MEMORY_BYTES // size, 1))
     n_blocks = -(-n_blocks // turns)
     return n_blocks, np.asarray([n_steps, here], np.int32), [jax.ShapeDtypeStruct((n_blocks, size // 4), np.uint32)]
 
@@ -147,7 +148,7 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
 
     More blocks hide more latency, until registers that no longer fit cost more than that.
     """
-    numbers = dict.fromkeys(n // kernel.threads for n in THREADS_AT_ONCE if n > kernel.threads)
+    numbers = dict.fromkeys(n // kernel.threads for n in THREADS_TO_TRY if n > kernel.threads)
     candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         least, *found = pool.map(lambda c: resources(c, device), candidates)
@@ -158,12 +159,16 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
 
 
 def widened(kernel: Kernel, device: jax.Device) -> Kernel:
-    """Return a kernel with blocks for many lanes: wider ones if its code is long.
+    """Return a kernel for many lanes: with larger blocks if its code exceeds the instruction cache.
 
-    Those of gradients, of large worlds, and with few registers for each thread stay as they are.
+    Kernels of gradients, of large worlds, and with few registers for each thread stay as they are.
     """
-    stays = kernel.kept or kernel.group > WARP or UNBOUNDED not in kernel.text
-    return kernel if stays or resources(kernel, device).code <= CODE else kernel.with_threads(WIDE)
+    stays = kernel.kept or kernel.group > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
+    return (
+        kernel
+        if stays or resources(kernel, device).code <= INSTRUCTION_CACHE_BYTES
+        else kernel.with_threads(LARGE_KERNEL_THREADS)
+    )
 
 
 @functools.cache
@@ -174,7 +179,7 @@ def ptx(kernel: Kernel, arch: str) -> str:
         KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
     if dump.enabled():
-        dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(OPTIONS)}\n{kernel.text}")
+        dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(NVRTC_OPTIONS)}\n{kernel.text}")
     return _compile(kernel.text, arch, "PTX").decode()
 
 
@@ -249,7 +254,7 @@ def _compile(source: str, arch: str, kind: str) -> bytes:
         raise KernelError("NVRTC was not found; it comes with pip install 'jax[cuda13]' or 'jax[cuda12]'")
     major, minor = ctypes.c_int(), ctypes.c_int()
     library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
-    key = kernel_cache.digest(source, arch, kind, *OPTIONS, f"{major.value}.{minor.value}")
+    key = kernel_cache.digest(source, arch, kind, *NVRTC_OPTIONS, f"{major.value}.{minor.value}")
     place = kernel_cache.folder()
     for path in kernel_cache.find(place, key):
         with contextlib.suppress(OSError):  # another process has removed it
@@ -266,7 +271,7 @@ def _run(library: ctypes.CDLL, source: str, arch: str, kind: str) -> bytes:
     program = ctypes.c_void_p()
     library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)
     try:
-        options = [f"--gpu-architecture={arch}", *OPTIONS]
+        options = [f"--gpu-architecture={arch}", *NVRTC_OPTIONS]
         result = library.nvrtcCompileProgram(
             program, len(options), (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
         )

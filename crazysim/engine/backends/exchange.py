@@ -18,16 +18,16 @@ Published = Sequence[tuple[str, str]]
 Live = Sequence[tuple[Value, str]]
 """Values, and their types as they are called in the source."""
 
-SIZES = {"f64": 8, "f32": 4, "i32": 4, "u32": 4, "b1": 1}
+TYPE_BYTES = {"f64": 8, "f32": 4, "i32": 4, "u32": 4, "b1": 1}
 """Sizes of numbers, bytes."""
 
-WARP = 32
+WARP_THREADS = 32
 """Threads of a GPU that run together."""
 
 MAX_THREADS = 1024
 """Most threads of a block on a GPU."""
 
-SHARED_MEMORY = 48 * 1024
+SHARED_MEMORY_BYTES = 48 * 1024
 """Memory that the threads of a block share, bytes."""
 
 MAX_IN_VECTOR = 8
@@ -147,13 +147,14 @@ class SharedMemory(OneLane):
 
     def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
         """Write a record of numbers for each thread, and return how those of another are read."""
-        order = sorted(range(len(values)), key=lambda k: -SIZES[values[k][0]])
+        order = sorted(range(len(values)), key=lambda k: -TYPE_BYTES[values[k][0]])
         text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
         record = f"Record{self._records.setdefault(text, len(self._records))}"
         size = sum(math.ceil(_size(text) / 16) * 16 for text in self._records) * self.lanes
-        if size > SHARED_MEMORY:
+        if size > SHARED_MEMORY_BYTES:
             raise UnsupportedError(
-                f"the drones of a world publish {size} bytes for each other, and a GPU's block has {SHARED_MEMORY}"
+                f"the drones of a world publish {size} bytes for each other, and a GPU's block has "
+                f"{SHARED_MEMORY_BYTES}"
             )
         where = f"shared_{record}"
         numbers = ", ".join(values[k][1] for k in order)
@@ -229,7 +230,7 @@ def exchange_for(target: str, group: int) -> Exchange:
         UnsupportedError: If there are too many drones.
     """
     if target == "cuda":
-        return Registers() if group <= WARP else SharedMemory(lanes_of_block(group)[1])
+        return Registers() if group <= WARP_THREADS else SharedMemory(lanes_of_block(group)[1])
     return Registers() if group <= MAX_IN_VECTOR else Sweeps()
 
 
@@ -243,12 +244,12 @@ def lanes_of_block(group: int, usual: int = 64) -> tuple[int, int]:
         group: Drones of a world that read each other's numbers.
         usual: Threads of a block where it makes no difference.
     """
-    if group <= WARP:
-        return usual, usual // WARP * (WARP // group * group)
-    least = math.ceil(group / WARP) * WARP
-    sizes = range(least, max(least, 256) + 1, WARP)
+    if group <= WARP_THREADS:
+        return usual, usual // WARP_THREADS * (WARP_THREADS // group * group)
+    least = math.ceil(group / WARP_THREADS) * WARP_THREADS
+    sizes = range(least, max(least, 256) + 1, WARP_THREADS)
     return max(((n, n // group * group) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
 
 
 def _size(record: str) -> int:
-    return sum(SIZES.get(word, 0) for word in record.split())
+    return sum(TYPE_BYTES.get(word, 0) for word in record.split())

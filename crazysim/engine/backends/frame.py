@@ -10,13 +10,13 @@ from importlib import resources
 from crazysim.engine.backends.exchange import lanes_of_block
 from crazysim.engine.ir.blocks import Block
 
-UNBOUNDED = "1 /* blocks at least */"
+ANY_NUMBER_OF_BLOCKS = "1 /* blocks at least */"
 """Text in a kernel for a GPU that ``Kernel.with_blocks`` replaces by a number of blocks."""
 
 BLOCK_THREADS = "#define BLOCK_THREADS {}\n"
 """Text in a kernel for a GPU that ``Kernel.with_threads`` replaces."""
 
-BLOCK = 64
+BLOCK_SIZE = 64
 """Threads of a block on a GPU."""
 
 
@@ -32,9 +32,9 @@ class Kernel:
     """Leaves that it writes; if worlds are checked, a bool per drone follows: True where its world is flagged."""
     in_place: tuple[int, ...] = ()
     """Leaves of rows that it updates in place: input and output of each must be the same memory."""
-    threads: int = BLOCK
+    threads: int = BLOCK_SIZE
     """Threads of a block on a GPU."""
-    lanes: int = BLOCK
+    lanes: int = BLOCK_SIZE
     """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
     group: int = 1
     """Drones of a world that read each other's numbers."""
@@ -48,7 +48,7 @@ class Kernel:
 
     def with_blocks(self, n: int) -> Kernel:
         """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
-        return dataclasses.replace(self, text=self.text.replace(UNBOUNDED, f"{n}"))
+        return dataclasses.replace(self, text=self.text.replace(ANY_NUMBER_OF_BLOCKS, f"{n}"))
 
     def with_threads(self, n: int) -> Kernel:
         """Return the kernel with blocks of ``n`` threads on a GPU, a multiple of those that it has."""
@@ -149,7 +149,7 @@ def _cuda(pointers: Sequence[str], shared: str, body: str, keeps: bool) -> str:
         each = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
         interval = ", interval = count[1]"
     return f"""
-extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {UNBOUNDED}) advance({arguments}) {{
+extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {ANY_NUMBER_OF_BLOCKS}) advance({arguments}) {{
   const int n_lanes = sizes[0], n_steps = count[0]{interval};
   const int nothing = n_steps >> 31;
   const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;

@@ -101,7 +101,7 @@ def missing(platform: str) -> str | None:
     if native.compiler():
         return None
     _announce_missing()
-    return native.MISSING
+    return native.MISSING_COMPILER
 
 
 @functools.cache
@@ -140,11 +140,11 @@ def build(program: Program, location: Location, in_leaves: Program | None = None
     if in_leaves is not None:
         return FusedRun(differentiable(_over_batches(program, run), _on_leaves(program, in_leaves, location)), kernels)
     on_lanes = lanes.build(program, location)
-    derivatives = DERIVATIVES[program] = DerivativeKernels(program, location, on_lanes)
+    derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, on_lanes)
     return FusedRun(differentiable(_over_batches(program, run), on_lanes, derivatives), kernels)
 
 
-DERIVATIVES: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
+DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
 """Derivatives of the programs that were built."""
 
 
@@ -156,7 +156,7 @@ def describe(program: Program, platform: str, devices: Sequence[jax.Device] | No
 
 def describe_derivatives(program: Program) -> list[str]:
     """Return the ways in which derivatives of a program were computed so far, in lines."""
-    derivatives = DERIVATIVES.get(program)
+    derivatives = DERIVATIVE_KERNELS.get(program)
     return [] if derivatives is None else list(derivatives.used)
 
 

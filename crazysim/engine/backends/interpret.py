@@ -43,11 +43,11 @@ def run(
     Returns:
         Its outputs, of the lanes' shape.
     """
-    if block not in _PREPARED:
+    if block not in _PREPARED_BLOCKS:
         places: dict[Any, int] = {}
         constants: list[Any] = []
-        _PREPARED[block] = _prepare(block, places, constants), constants
-    prepared, constants = _PREPARED[block]
+        _PREPARED_BLOCKS[block] = _prepare(block, places, constants), constants
+    prepared, constants = _PREPARED_BLOCKS[block]
     given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
     with np.errstate(all="ignore"):
         out = prepared.run(constants.copy(), given, shape, observe)
@@ -113,7 +113,7 @@ class _Prepared(NamedTuple):
 _Run = Callable[[Sequence[Any]], list[Any]]
 """Runs a block: from its inputs to its outputs."""
 
-_PREPARED: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
+_PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
 """Blocks that were run, prepared, with the constants at their places and None elsewhere."""
 
 
@@ -208,7 +208,7 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     return found
 
 
-ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 """Bits that a round rotates by: J. K. Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC 2011, table 2."""
 
 
@@ -217,7 +217,7 @@ def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray)
     keys = (k0, k1, k0 ^ k1 ^ np.uint32(0x1BD11BDA))
     x0, x1 = x0 + keys[0], x1 + keys[1]
     for n in range(5):
-        for r in ROTATIONS[n % 2]:
+        for r in THREEFRY_ROTATIONS[n % 2]:
             x0 = x0 + x1
             x1 = (x1 << np.uint32(r)) | (x1 >> np.uint32(32 - r))
             x1 = x1 ^ x0

@@ -11,12 +11,12 @@ from collections.abc import Iterable, Sequence
 from crazysim.core.stage import Phase
 from crazysim.engine.backends.exchange import exchange_for
 from crazysim.engine.backends.frame import Kernel, framed
-from crazysim.engine.backends.source import TYPES, Writer, require, type_name
+from crazysim.engine.backends.source import TYPE_NAMES, Writer, require, type_name
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
-from crazysim.engine.ir.program import TABLE, Program, Segment, Slot
+from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
 
-REGISTERS = 255
+MAX_REGISTERS = 255
 """Registers of a thread of a GPU."""
 
 
@@ -34,7 +34,7 @@ def write(program: Program, target: str) -> Kernel:
     """
     require_source(program)
     body = Body(program, target)
-    hoisted = body.write_loads(REGISTERS if target == "cuda" else None)
+    hoisted = body.write_loads(MAX_REGISTERS if target == "cuda" else None)
     body.write_loop(hoisted)
     body.write_stores()
 
@@ -77,7 +77,7 @@ class Body:
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
         shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
         for slot in shared:
-            if slot[1] == TABLE:
+            if slot[1] == TABLE_INDEX:
                 names[slot] = f"p{rank[slot[0]]}"
             elif slot in self.stored or not (at_use or slot in deferred):
                 writer.line(f"const auto {names[slot]} = {_load(program, slot)};", 1)
@@ -190,7 +190,7 @@ def require_source(program: Program) -> None:
         require(segment.block)
         for i in {*segment.read, *segment.written}:
             leaf = program.leaves[i]
-            if leaf.number not in TYPES:
+            if leaf.number not in TYPE_NAMES:
                 why = f"kernels have no numbers of type {leaf.number}, which {leaf.name} has"
                 raise UnsupportedError(why, stage=", ".join(segment.stages))
 

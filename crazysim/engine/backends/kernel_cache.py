@@ -31,10 +31,10 @@ from crazysim import cache
 from crazysim.errors import warn
 from crazysim.trust import REMEDY, distrust, make_private
 
-LENGTH = 24
+DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
 
-DAY = 86400.0
+ABANDONED_AFTER = 86400.0
 """Age of remains of another machine, s, at which they are removed."""
 
 
@@ -44,7 +44,7 @@ def digest(*parts: str | bytes) -> str:
     for part in parts:
         raw = part.encode() if isinstance(part, str) else part
         state.update(len(raw).to_bytes(8, "little") + raw)
-    return state.hexdigest()[:LENGTH]
+    return state.hexdigest()[:DIGEST_LENGTH]
 
 
 def folder() -> Path:
@@ -141,10 +141,10 @@ def _abandoned(name: str, age: float) -> bool:
     """
     named = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
     if named is None:
-        return name.endswith(".tmp") and age > DAY
+        return name.endswith(".tmp") and age > ABANDONED_AFTER
     machine, pid = named.groups()
     if machine != _machine() or os.name == "nt":  # on Windows the call below would end the process
-        return age > DAY
+        return age > ABANDONED_AFTER
     try:
         os.kill(int(pid), 0)
     except OSError:  # there is none, or it belongs to another user

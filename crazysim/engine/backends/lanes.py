@@ -22,7 +22,7 @@ from crazysim.core.sharding import Location
 from crazysim.core.stage import Phase
 from crazysim.engine.backends import Run, xla
 from crazysim.engine.ir.blocks import Block
-from crazysim.engine.ir.program import TABLE, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot, UnfusedStage
 from crazysim.engine.passes.schedule import separate
 from crazysim.jaxcompat import is_key
 
@@ -60,7 +60,7 @@ class LeafValues:
 
     def get(self, slot: Slot) -> Any:
         """Return a number of every drone, or the one number that all share, or a table."""
-        if slot[1] == TABLE:
+        if slot[1] == TABLE_INDEX:
             return self.arrays[slot[0]].reshape(-1)
         if slot not in self.vectors:
             self._split(slot[0])
@@ -128,8 +128,8 @@ def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct
     return jax.ShapeDtypeStruct((*of_leaf, *([2] if is_key(example) else [])), example.number)
 
 
-LONG = 256
-"""Number of steps from which a gradient keeps only some of their beginnings."""
+MIN_CHECKPOINTED_STEPS = 256
+"""Number of steps from which a gradient keeps only some of the carries between them."""
 
 Constants = dict[int, Sequence[Any]]
 """Hoisted numbers, by the segment that uses them."""
@@ -172,7 +172,7 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
             drone, k = divmod(k, leaves[leaf].size)
             return values.get((leaf, k)).reshape(shape)[:, drone]
         value = values.get(slot)
-        return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE else value
+        return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE_INDEX else value
 
     outs = values.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
     new: dict[Slot, dict[int, Any]] = {}
@@ -252,16 +252,16 @@ def steps(
 def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     """Return a carry after ``n`` iterations, in a form whose gradient takes little memory.
 
-    Only the carry at the beginning of a step is kept, and the rest computed again on the way back, which costs less
-    than fetching it from memory. From ``LONG`` steps on only every k-th carry is kept, k being the root of n: the
-    memory of a gradient then grows with the root of the horizon, at the price of one more pass.
+    Only the carry before each iteration is kept. The backward pass computes the rest again, which costs less than
+    fetching it from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is kept, with k the
+    square root of n. The memory of a gradient then grows with that root, at the price of one more pass.
     """
     turn = jax.checkpoint(turn, prevent_cse=False)  # a scan does that anyway
 
     def turns(carry: Any, n: int) -> Any:
         return jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n)[0]
 
-    if n < LONG:
+    if n < MIN_CHECKPOINTED_STEPS:
         return turns(carry, n)
     inner = math.isqrt(n)
     outer = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)

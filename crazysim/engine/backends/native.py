@@ -33,35 +33,35 @@ from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError
 from crazysim.version import __version__
 
-FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv",
-         "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
+COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
+                  "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
 """Options of the compiler, before those of the variable CXXFLAGS. Products and sums may be contracted; no option
 assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them without a sign."""
 
-ZIG = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
+ZIG_ARGUMENTS = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
 """Arguments that make zig a compiler of kernels. As ``c++``, or without ``-nostdlib``, it would first compile libraries
 that kernels do not need, for 20 s."""
 
-MISSING = "no C++ compiler was found; run pip install 'crazysim[compiler]', install g++ or clang++, or set CXX"
+MISSING_COMPILER = "no C++ compiler was found; run pip install 'crazysim[compiler]', install g++ or clang++, or set CXX"
 """Reason why there are no kernels on the host, and the remedy."""
 
-TIMEOUT = 300.0
+COMPILE_TIMEOUT = 300.0
 """Time that the compiler may take, s, unless the variable CRAZYSIM_COMPILE_TIMEOUT says otherwise."""
 
-LINES = 10_000
+LINES_IN_ONE_SECOND = 10_000
 """Lines of a kernel that is compiled in 1 s at best; the time grows with the square of their number.
 
 Measured with g++ 12 on one core: 20,000 lines of matrix products take 5 s, of maxima 38 s, 40,000 of conditions 94 s.
 """
-SELECTING = re.compile(r"^.*\b(?:select_n_|max_|min_|clamp_|at_least|at_most)\(.*$", re.MULTILINE)
+SELECTING_LINE = re.compile(r"^.*\b(?:select_n_|max_|min_|clamp_|at_least|at_most)\(.*$", re.MULTILINE)
 """Lines of a kernel that select between numbers."""
-SELECTION = 2.4
+SELECTING_LINE_WEIGHT = 2.4
 """Lines that a selecting line counts for: by the same measurements those of conditions take 5.9 s for 10,000."""
 
-TEMPORARY = ("TMPDIR", "ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
+TEMPORARY_FOLDER_VARIABLES = ("TMPDIR", "ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
 """Variables that name the folder of a compiler's temporary files."""
 
-SHELL = """exec 3<&0 </dev/null
+KILLING_SCRIPT = """exec 3<&0 </dev/null
 (read -r _ <&3; kill -9 0) >/dev/null 2>&1 &
 "$@" 3<&-
 status=$?
@@ -70,10 +70,10 @@ exit $status"""
 """Script that runs a command whose input is a pipe to this process. When the pipe closes, which is at the latest when
 this process ends, however it ends, it kills the command with all its children."""
 
-KEPT = 256 * 1024
-"""Memory of what the steps begin with that a core goes back through at once, bytes: as much as is near to it."""
+GRADIENT_MEMORY_BYTES = 256 * 1024
+"""Memory for the stored states of the steps that a core goes back through at once: what its nearest caches hold."""
 
-VECTOR = 64
+VECTOR_BYTES = 64
 """Size of the widest vector, bytes."""
 
 Launch = Callable[[int, Any, Sequence[Array], Sequence[Any]], list[Array]]
@@ -95,8 +95,10 @@ class HostLaunch:
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
         """Return what the kernel writes."""
         if self._kept:
-            lanes_of_vector = VECTOR // 4
-            count = np.append(count, np.int32(interval(int(count[0]), self._kept * lanes_of_vector, KEPT)))
+            lanes_of_vector = VECTOR_BYTES // 4
+            count = np.append(
+                count, np.int32(interval(int(count[0]), self._kept * lanes_of_vector, GRADIENT_MEMORY_BYTES))
+            )
         run = jax.ffi.ffi_call(self._name, list(outputs), input_output_aliases=self._aliases)
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
@@ -106,7 +108,7 @@ class HostLaunch:
         It takes the number of lanes, that of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
         number of inputs. It returns 0 if there was no memory for it.
         """
-        call = _LOADED[self._name].crazysim_call
+        call = _LIBRARIES[self._name].crazysim_call
         call.restype = ctypes.c_int
         call.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_int]
         return call
@@ -132,7 +134,9 @@ def _zig() -> str | None:
     """Return the command of the compiler in the package ziglang, which the extra ``compiler`` installs."""
     package = importlib.util.find_spec("ziglang")
     folders = [] if package is None else package.submodule_search_locations or []
-    return next((shlex.join([path, *ZIG]) for folder in folders if (path := shutil.which("zig", path=folder))), None)
+    return next(
+        (shlex.join([path, *ZIG_ARGUMENTS]) for folder in folders if (path := shutil.which("zig", path=folder))), None
+    )
 
 
 def command(options: bool = True) -> list[str]:
@@ -147,8 +151,14 @@ def command(options: bool = True) -> list[str]:
     """
     program = compiler()
     if program is None:
-        raise KernelError(MISSING)
-    return [*shlex.split(program), *FLAGS, *_words("CXXFLAGS" if options else ""), "-I", jaxcompat.ffi_include_folder()]
+        raise KernelError(MISSING_COMPILER)
+    return [
+        *shlex.split(program),
+        *COMPILER_FLAGS,
+        *_words("CXXFLAGS" if options else ""),
+        "-I",
+        jaxcompat.ffi_include_folder(),
+    ]
 
 
 def _words(variable: str) -> list[str]:
@@ -170,7 +180,7 @@ def limit() -> float:
     Raises:
         ConfigError: If the variable CRAZYSIM_COMPILE_TIMEOUT is no such number.
     """
-    given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", TIMEOUT)
+    given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", COMPILE_TIMEOUT)
     try:
         seconds = float(given)
     except ValueError:
@@ -193,18 +203,18 @@ def target(kernel: Kernel) -> str:
         dump.write("kernel.cpp", f"// {shlex.join(words)} kernel.cpp\n{kernel.text}")
     key = kernel_cache.digest(*words, toolchain(tuple(words)), kernel.text)
     name = f"crazysim_advance_{key}"
-    if name not in _LOADED:
+    if name not in _LIBRARIES:
         library = _library(words, key, kernel.text)
-        with _LOCK:
-            if name not in _LOADED:
+        with _LIBRARIES_LOCK:
+            if name not in _LIBRARIES:
                 jaxcompat.register_host_target(name, library.crazysim_advance)
-                _LOADED[name] = library
+                _LIBRARIES[name] = library
     return name
 
 
-_LOADED: dict[str, ctypes.CDLL] = {}
+_LIBRARIES: dict[str, ctypes.CDLL] = {}
 """Libraries by the name of their kernel."""
-_LOCK = threading.Lock()
+_LIBRARIES_LOCK = threading.Lock()
 
 
 @functools.cache
@@ -260,7 +270,9 @@ def _compile(words: Sequence[str], source: str) -> bytes:
         KernelError: If the compiler refuses it or takes too long.
     """
     seconds, n_lines = limit(), source.count("\n")
-    if n_lines + (SELECTION - 1) * len(SELECTING.findall(source)) > LINES * math.sqrt(seconds):
+    if n_lines + (SELECTING_LINE_WEIGHT - 1) * len(SELECTING_LINE.findall(source)) > LINES_IN_ONE_SECOND * math.sqrt(
+        seconds
+    ):
         raise KernelError(
             f"a kernel of {n_lines:,} lines takes {words[0]} longer than {seconds:g} s; use loops (lax.fori_loop) for "
             f"what is unrolled, or set CRAZYSIM_COMPILE_TIMEOUT to a larger number of seconds"
@@ -317,12 +329,12 @@ def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
             yield pool
         except (KeyboardInterrupt, SystemExit):
             pool.shutdown(wait=False, cancel_futures=True)
-            for alive in list(_RUNNING):
+            for alive in list(_COMPILER_PIPES):
                 alive.close()
             raise
 
 
-_RUNNING: set[IO[str]] = set()
+_COMPILER_PIPES: set[IO[str]] = set()
 """Pipes of the compilers that run; one that is closed ends its compiler."""
 
 
@@ -343,13 +355,13 @@ def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = Non
     with os.fdopen(reader) as watched, os.fdopen(writer, "w") as alive:
         try:
             process = subprocess.Popen(
-                ["/bin/sh", "-c", SHELL, "sh", *words], stdin=watched, stdout=pipe, stderr=pipe, text=True,
-                start_new_session=True, cwd=cwd, env=os.environ | dict.fromkeys(TEMPORARY, str(work)),
+                ["/bin/sh", "-c", KILLING_SCRIPT, "sh", *words], stdin=watched, stdout=pipe, stderr=pipe, text=True,
+                start_new_session=True, cwd=cwd, env=os.environ | dict.fromkeys(TEMPORARY_FOLDER_VARIABLES, str(work)),
             )  # fmt: skip
         except OSError as error:
             raise KernelError(f"{words[0]} cannot be run: {error}") from error
         with process:
-            _RUNNING.add(alive)
+            _COMPILER_PIPES.add(alive)
             try:
                 out, err = process.communicate(timeout=seconds)
             except subprocess.TimeoutExpired:
@@ -358,6 +370,6 @@ def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = Non
                     f"seconds"
                 ) from None
             finally:
-                _RUNNING.discard(alive)
+                _COMPILER_PIPES.discard(alive)
                 alive.close()
     return subprocess.CompletedProcess(list(words), process.returncode, out, err)

@@ -37,5 +37,5 @@ def described(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | Non
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
     few = cuda.fitted(kernel, device)
     many, used = cuda.widened(few, device), cuda.resources(few, device)
-    wide = f", {many.threads} from {cuda.LANES:,} drones on" if many is not few else ""
+    wide = f", {many.threads} from {cuda.RESIDENT_LANES:,} drones on" if many is not few else ""
     return f"{few.threads} threads a block{wide}, {used.registers} registers, {used.spilled} bytes spilled"

@@ -19,7 +19,7 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value, is_constant
 
-TYPES = {np.dtype(name): short for name, short in
+TYPE_NAMES = {np.dtype(name): short for name, short in
          {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}.items()}  # fmt: skip
 """Types of numbers, and what they are called in the source."""
 
@@ -32,7 +32,7 @@ def require(block: Block) -> None:
     """
     for op in block.walk():
         row = ops.TABLE[op.name]
-        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype not in TYPES), None)
+        other = next((x.dtype.name for x in (*op.args, *op.results) if x.dtype not in TYPE_NAMES), None)
         if other is not None:
             raise UnsupportedError(f"kernels have no numbers of type {other}", op.name, op.stage)
         if not row.source and not row.structured:
@@ -191,7 +191,7 @@ class Writer:
         name = self._carry(op, [literal(x) for x in first], [False] * len(first), depth)
         best: dict[int, str] = {}
         for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
-            if combine in ops.PLACES:
+            if combine in ops.INDEX_REDUCTIONS:
                 best[k], start = self.new(), literal(ops.neutral(combine[3:], x.dtype))
                 self.line(f"auto {best[k]} = {type_name(x.dtype)}_lanes({start});", depth)
         turn = self.new("j")
@@ -308,9 +308,9 @@ def type_name(dtype: DTypeLike) -> str:
         UnsupportedError: If it has no name there.
     """
     dtype = np.dtype(dtype)
-    if dtype not in TYPES:
+    if dtype not in TYPE_NAMES:
         raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")
-    return TYPES[dtype]
+    return TYPE_NAMES[dtype]
 
 
 def _entry(x: np.generic) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 
 Environment = ctypes.c_uint32 * 8
 """``fenv_t`` of x86-64 Linux."""
-MXCSR = 7
+MXCSR_INDEX = 7
 """Word of it that controls the arithmetic of vector registers."""
-FLUSH = 0x8040
+FLUSH_BITS = 0x8040
 """Bits that take subnormal results and operands for zero: Intel 64 manual, volume 1, section 10.2.3."""
 
 
@@ -29,7 +29,7 @@ def flushed() -> Iterator[None]:
     before = Environment()
     library.fegetenv(before)
     inside = Environment(*before)
-    inside[MXCSR] |= FLUSH
+    inside[MXCSR_INDEX] |= FLUSH_BITS
     library.fesetenv(inside)
     try:
         yield

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from crazysim.storage import write_file
 
-VARIABLE = "CRAZYSIM_DUMP"
+DUMP_VARIABLE = "CRAZYSIM_DUMP"
 """Environment variable that names the folder; nothing is written where it is not set."""
 
 _numbers = itertools.count()
@@ -17,7 +17,7 @@ _numbers = itertools.count()
 
 def enabled() -> bool:
     """Return True where a folder is set, so that text worth time to make is made."""
-    return bool(os.environ.get(VARIABLE))
+    return bool(os.environ.get(DUMP_VARIABLE))
 
 
 def write(name: str, text: str) -> Path | None:
@@ -33,7 +33,7 @@ def write(name: str, text: str) -> Path | None:
     """
     if not enabled():
         return None
-    folder = Path(os.environ[VARIABLE])
+    folder = Path(os.environ[DUMP_VARIABLE])
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"{os.getpid()}-{next(_numbers):03d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}"
     write_file(file, text)

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
-from crazysim.engine.ir.program import PACKED, Program, Segment, Slot, UnfusedStage
+from crazysim.engine.ir.program import PACKED_LEAF_NAME, Program, Segment, Slot, UnfusedStage
 
 INDENT = "  "
 
@@ -58,7 +58,9 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
     if segment.scope == "world" and leaf.scope == "drone":
         number, k = divmod(k, leaf.size)
         drone = f" of drone {number}"
-    for member in program.packed if leaf.name == PACKED else leaf.rows_of:  # the field that the number belongs to
+    for member in (
+        program.packed if leaf.name == PACKED_LEAF_NAME else leaf.rows_of
+    ):  # the field that the number belongs to
         if k < program.leaves[member].size:
             return f"{program.leaves[member].name}[{k}]{drone}"
         k -= program.leaves[member].size

@@ -68,7 +68,7 @@ class Row:
         )
 
 
-EXPENSIVE = 2
+EXPENSIVE_COST = 2
 """Cost from which a number is worth a register, to be computed once instead of at every step."""
 
 
@@ -98,7 +98,7 @@ def _casadi_round_even(ca: Any, x: Any) -> Any:
     return up - ca.logic_and(up == x + 0.5, ca.fmod(up, 2) != 0)
 
 
-_LARGEST = float(np.finfo(np.float64).max)
+_LARGEST_FLOAT64 = float(np.finfo(np.float64).max)
 """CasADi has no operation that tests for finite numbers."""
 
 
@@ -144,7 +144,7 @@ def _rows() -> list[Row]:
               xla=lambda x: _lax().round(x, _lax().RoundingMethod.TO_NEAREST_EVEN)),
         unary("round_away", forms.round_away, 4, lambda ca, x: ca.sign(x) * ca.floor(ca.fabs(x) + 0.5), exact=True,
               xla=lambda x: _lax().round(x, _lax().RoundingMethod.AWAY_FROM_ZERO)),
-        unary("is_finite", np.isfinite, 1, lambda ca, x: ca.fabs(x) <= _LARGEST, results="b", exact=True),
+        unary("is_finite", np.isfinite, 1, lambda ca, x: ca.fabs(x) <= _LARGEST_FLOAT64, results="b", exact=True),
     ]  # fmt: skip
     functions = [
         unary("sqrt", np.sqrt, 4, "sqrt", exact=True),
@@ -244,14 +244,14 @@ twenty rounds of add, rotate and xor make a random number. An operation that run
 REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
 """Operations that combine the results of ``over_others``."""
 
-PLACES: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
+INDEX_REDUCTIONS: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
 """Reductions to the first drone with the smallest or largest number, and how a number compares that replaces it. Only
 derivatives in kernels have them."""
 
 
 def neutral(name: str, dtype: np.dtype) -> np.generic:
     """Return the number that an operation of ``REDUCTIONS`` begins with; ``or`` and ``and`` stand for max and min."""
-    if name in ("add", "or", "and", *PLACES):
+    if name in ("add", "or", "and", *INDEX_REDUCTIONS):
         return dtype.type(name == "and")
     limits = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     return dtype.type(limits[name == "min"])

@@ -22,10 +22,10 @@ from crazysim.jaxcompat import is_key
 Slot = tuple[int, int]
 """Place of a number: which leaf, and which element of the part of it that belongs to one drone (or one world)."""
 
-TABLE = -1
+TABLE_INDEX = -1
 """Element of a slot that means the whole leaf, a table: only shared leaves are tables."""
 
-PACKED = "packed"
+PACKED_LEAF_NAME = "packed"
 """Name of the leaf of shared numbers."""
 
 Zeros = tuple[tuple[int, frozenset[int]], ...]
@@ -193,7 +193,7 @@ class Program:
     def tables(self) -> set[int]:
         """Leaves that are read as tables."""
         segments = self.fused_segments
-        return {leaf for s in segments for leaf, k in (*s.reads, *s.hoisted_reads) if k == TABLE}
+        return {leaf for s in segments for leaf, k in (*s.reads, *s.hoisted_reads) if k == TABLE_INDEX}
 
     @functools.cached_property
     def rows(self) -> dict[int, int]:
@@ -213,7 +213,7 @@ class Program:
         """Return the slots of a segment as those of one drone: in a segment of worlds they count all its drones."""
         if segment.scope == "drone":
             return list(slots)
-        return [(i, k if k == TABLE else k % self.leaves[i].size) for i, k in slots]
+        return [(i, k if k == TABLE_INDEX else k % self.leaves[i].size) for i, k in slots]
 
     def changing(self) -> set[Slot]:
         """Return the numbers that a step may change."""
@@ -222,7 +222,9 @@ class Program:
             if isinstance(segment, Segment):
                 changing.update(self.per_drone(segment, segment.writes))
             else:
-                changing.update((leaf, k) for leaf in segment.written for k in range(TABLE, self.leaves[leaf].size))
+                changing.update(
+                    (leaf, k) for leaf in segment.written for k in range(TABLE_INDEX, self.leaves[leaf].size)
+                )
         return changing
 
     def parts(self) -> Iterator[Program]:

@@ -7,7 +7,7 @@ import numpy as np
 from crazysim.core.stage import PHASES
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
-from crazysim.engine.ir.program import TABLE, Program, Segment, Slot
+from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
 
 
 class VerificationError(AssertionError):
@@ -72,7 +72,7 @@ def _slots(
     _require(len(set(slots)) == len(slots), f"a place is there twice as {what}")
     for (i, k), x in zip(slots, elements, strict=True):
         leaf = program.leaves[i]
-        if k == TABLE:
+        if k == TABLE_INDEX:
             is_table = what != "output" and leaf.scope == "shared" and x.size == leaf.size and x.dtype == leaf.number
             _require(is_table, f"{what} is {leaf.name} as a table, which it is not")
             continue
@@ -142,7 +142,7 @@ def _verify_types(op: Operation) -> None:
             (block,) = op.blocks
             _require([x.dtype for x in block.inputs] == [*dtypes, np.dtype(bool)], text)
             names = op.param("reduce")
-            outs = [np.dtype(np.int32) if name in ops.PLACES else x.dtype
+            outs = [np.dtype(np.int32) if name in ops.INDEX_REDUCTIONS else x.dtype
                     for name, x in zip(names, block.outputs, strict=False)]  # fmt: skip
             _require(outs == results and len(names) == len(results) == len(block.outputs), text)
         case "custom_jvp":

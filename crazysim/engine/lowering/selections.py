@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 
-FINDERS = {"min": "argmin", "max": "argmax"}
+INDEX_REDUCTION_OF = {"min": "argmin", "max": "argmax"}
 """Reductions, see ``ops.PLACES``, that find the drone with the smallest or largest number."""
 
 
@@ -32,7 +32,7 @@ def _selects(op: Operation) -> list[int]:
     if op.name != "over_others":
         return []
     pairs = zip(op.param("reduce"), op.results, strict=True)
-    return [k for k, (name, x) in enumerate(pairs) if name in FINDERS and x.dtype.kind == "f"]
+    return [k for k, (name, x) in enumerate(pairs) if name in INDEX_REDUCTION_OF and x.dtype.kind == "f"]
 
 
 def _selected(builder: Builder, op: Operation, some: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
@@ -52,7 +52,7 @@ def _selected(builder: Builder, op: Operation, some: list[int], values: dict[Val
     inner, (is_self,), found = of_pair(0)
     one, zero = (constant(x, dtypes[0]) for x in (1, 0))
     own = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the largest is that of the drone itself
-    names = (*(FINDERS[op.param("reduce")[k]] for k in some), "argmax")
+    names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in some), "argmax")
     block = prune(inner.finish([*found, own]))
     *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
                                        (block,))  # fmt: skip

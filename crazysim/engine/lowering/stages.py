@@ -14,7 +14,7 @@ from crazysim.core.others import reduce_over_others_p
 from crazysim.core.stage import PHASES, Axes, Phase, Stage, at_the_start
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
-from crazysim.engine.ir.program import TABLE, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
+from crazysim.engine.ir.program import TABLE_INDEX, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
 from crazysim.engine.lowering.jaxprs import Elements, Entry, Lowering, as_elements, inputs, scalars
 from crazysim.engine.lowering.relative import RelativeAxes, viewed
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
@@ -137,7 +137,7 @@ def _segment(
 ) -> Segment:
     lowering = Lowering(Builder(stage=stage.__name__), n_members=n_members)
     before = {i: inputs(lowering.builder, traced.avals[i], zeros.get(i, frozenset())) for i in traced.used}
-    tables = {_table(lowering, before[i]): (i, TABLE) for i in shared if i in before and before[i].size > 1}
+    tables = {_table(lowering, before[i]): (i, TABLE_INDEX) for i in shared if i in before and before[i].size > 1}
     lowering.shared.update(x for i in shared for x in scalars(before[i]) if isinstance(x, Value))
     args = [before[i] for i in traced.used]
     if traced.when is None:

@@ -77,9 +77,9 @@ class Tracer:
         return self._found[key][1]
 
 
-_FIXED: dict[Any, TracedStage] = {}
+_TRACED_STAGES: dict[Any, TracedStage] = {}
 """Traced stages that always do the same, for all simulations of this process."""
-MAX_FIXED = 256
+MAX_TRACED_STAGES = 256
 """Largest number of them."""
 
 
@@ -88,11 +88,11 @@ def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -
     data = axes.treedef.unflatten(leaves)
     kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
     key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)
-    traced = _FIXED.get(key)
+    traced = _TRACED_STAGES.get(key)
     if traced is None:
-        traced = _FIXED[key] = TracedStage(stage, axes, leaves)
-        for oldest in list(_FIXED)[:-MAX_FIXED]:
-            _FIXED.pop(oldest, None)
+        traced = _TRACED_STAGES[key] = TracedStage(stage, axes, leaves)
+        for oldest in list(_TRACED_STAGES)[:-MAX_TRACED_STAGES]:
+            _TRACED_STAGES.pop(oldest, None)
     return traced
 
 

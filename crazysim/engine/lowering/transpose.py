@@ -64,14 +64,17 @@ def transposed(block: Block, wanted: Sequence[Value]) -> Block:
     return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
 
 
-SPAN = 60
+OPERATIONS_PER_PART = 60
 """Operations of a part of a block. Of 60, 100, 150, 250 and all, 60 and 100 left the most numbers in registers."""
 
 
 def _parts(block: Block) -> list[Block]:
     """Return the operations of a block in parts, one after the other."""
     operations = [op for op in block.operations if op.name != "barrier"]
-    return [Block((), tuple(operations[k : k + SPAN])) for k in range(0, len(operations), SPAN)]
+    return [
+        Block((), tuple(operations[k : k + OPERATIONS_PER_PART]))
+        for k in range(0, len(operations), OPERATIONS_PER_PART)
+    ]
 
 
 def _again(

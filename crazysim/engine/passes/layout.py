@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.engine.ir.program import PACKED, Leaf, Program, Segment, Slot
+from crazysim.engine.ir.program import PACKED_LEAF_NAME, Leaf, Program, Segment, Slot
 from crazysim.jaxcompat import is_key
 
 
@@ -29,7 +29,7 @@ def pack_shared(program: Program) -> Program:
     for i in shared:
         starts[i] = size
         size += leaves[i].size
-    packed = Leaf(PACKED, "shared", (size,), leaves[0].dtype)
+    packed = Leaf(PACKED_LEAF_NAME, "shared", (size,), leaves[0].dtype)
     moved = _moved(program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot)
     return dataclasses.replace(moved, leaves=(*leaves, packed), packed=tuple(shared))
 

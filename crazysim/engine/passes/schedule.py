@@ -95,13 +95,13 @@ def _joined_ticks(first: Operation, second: Operation) -> Operation:
     return first._replace(args=args, results=results, blocks=(prune(builder.finish(new)),))
 
 
-SPAN = 40
+BARRIER_INTERVAL = 40
 """Operations between two barriers of ``separate``. Of 20, 30, 40, 60, 80 and 150, 20 to 40 gave the fastest gradients
 on two cores with jax 0.11.2; smaller numbers take longer to compile."""
 
 
 def separate(program: Program) -> Program:
-    """Put a barrier behind every ``SPAN`` operations, for lanes on a CPU.
+    """Put a barrier behind every ``BARRIER_INTERVAL`` operations, for lanes on a CPU.
 
     XLA's CPU backend computes a value again in everything that it is fused into, on the way back of a gradient too. A
     barrier makes it compute the values that are needed further on once. Kernels ignore barriers.
@@ -118,7 +118,7 @@ def separate(program: Program) -> Program:
 def _separated(block: Block) -> Block:
     operations: list[Operation] = []
     for k, op in enumerate(block.operations):
-        if k and k % SPAN == 0 and op.name != "barrier":
+        if k and k % BARRIER_INTERVAL == 0 and op.name != "barrier":
             operations.append(Operation("barrier", (), (), stage=op.stage))
         operations.append(op)
     return dataclasses.replace(block, operations=tuple(operations))
@@ -148,7 +148,7 @@ def _hoisted(segment: Segment, changing: set[Slot]) -> Segment:
         operations.append(op)
         if op.results and not op.blocks and all([is_constant(x) or x in fixed for x in op.args]):
             fixed.update(op.results)
-            if ops.TABLE[op.name].cost >= ops.EXPENSIVE or not worth.isdisjoint(op.args):
+            if ops.TABLE[op.name].cost >= ops.EXPENSIVE_COST or not worth.isdisjoint(op.args):
                 worth.update(op.results)
     rest = Block(block.inputs, tuple([op for op in operations if worth.isdisjoint(op.results)]), block.outputs)
     used = rest.uses()

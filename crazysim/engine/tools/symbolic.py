@@ -16,12 +16,12 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 from crazysim.engine.ir.program import Segment, Slot
 
-RANDOM = "it draws random numbers"
+RANDOM_REASON = "it draws random numbers"
 
 Expression = Any
 """A ``casadi.SX`` of one number."""
 
-MAX_LOOP = 256
+MAX_ITERATIONS = 256
 """Most iterations of a loop that is unrolled."""
 
 
@@ -50,7 +50,7 @@ def require(block: Block) -> None:
     """
     refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
     if refused:
-        drawn = [(stage, why) for stage, why in refused if why == RANDOM]  # says more than the arithmetic around it
+        drawn = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # says most
         stage, why = (drawn or refused)[0]
         raise UnsupportedError(why, stage=stage)
 
@@ -58,13 +58,13 @@ def require(block: Block) -> None:
 def _refusal(op: Operation) -> str | None:
     match op.name:
         case "threefry2x32":
-            return RANDOM
+            return RANDOM_REASON
         case "while":
             return "a loop that runs until a condition fails cannot be unrolled"
         case "lookup":
             return "it looks a number up in a table, at a place that is computed"
-        case "loop" if op.param("length") > MAX_LOOP:
-            return f"a loop of {op.param('length')} iterations is too long; at most {MAX_LOOP} are unrolled"
+        case "loop" if op.param("length") > MAX_ITERATIONS:
+            return f"a loop of {op.param('length')} iterations is too long; at most {MAX_ITERATIONS} are unrolled"
     row = ops.TABLE[op.name]
     if row.structured or op.name == "convert_element_type":
         return None

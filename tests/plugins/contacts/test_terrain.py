@@ -12,7 +12,7 @@ from pictures import png_of
 
 from crazysim import ConfigError, ContactResponse, GroundEffect, Hook, RangeFinder, Sim, SlungLoad, Terrain, Wind
 from crazysim.core.pipeline import remove_fn
-from crazysim.core.stages import FLOOR
+from crazysim.core.stages import FLOOR_HEIGHT
 from crazysim.engine import Step
 from crazysim.plugins.contacts import terrain as terrain_module
 from crazysim.plugins.effects.ground import ground_at, ground_height
@@ -78,7 +78,7 @@ def test_drones_land_on_it_and_take_off():
     sim, plugin = build(control="attitude")
     sim.step(1000)
     ground = np.asarray(ground_height(sim.data, sim.data.states.pos))
-    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[..., 2:], ground + FLOOR, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[..., 2:], ground + FLOOR_HEIGHT, atol=1e-6)
     assert float(ground.min()) > 0.4
     np.testing.assert_array_equal(sim.data.states.vel, 0)
     np.testing.assert_allclose(plugin.read(sim.data).below, ground)
@@ -238,7 +238,7 @@ def test_other_heights_replace_it():
     np.testing.assert_allclose(ground_height(sim.data, sim.data.states.pos), 0.7)
     assert sum(g.name == "terrain" for g in sim.scene.spec.worldbody.geoms) == 1
     sim.step(1000)
-    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[..., 2], 0.7 + FLOOR, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(sim.data.states.pos)[..., 2], 0.7 + FLOOR_HEIGHT, rtol=1e-6)
     assert float(np.asarray(sim.contact_report(drones=False).floor_distance).max()) < 0
     sim.remove("terrain")
     assert "clip_floor_pos" in sim.step_pipeline

@@ -11,13 +11,13 @@ from crazysim.engine.ir import ops
 from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, constants, rule
 from crazysim.jaxcompat import JaxprEqn
 
-OWN_RULE = frozenset(
+PRIMITIVES_WITH_RULES = frozenset(
     "convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away digamma".split()
 )
 """Operations that no primitive maps to one to one."""
 
 
-@rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in OWN_RULE))
+@rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in PRIMITIVES_WITH_RULES))
 def _each(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     return [ctx.elementwise(eqn.primitive.name, args, eqn.outvars[0].aval.dtype)]
 

@@ -10,13 +10,13 @@ from crazysim.engine.ir.blocks import constant
 from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError, as_elements, rule
 from crazysim.jaxcompat import JaxprEqn
 
-LARGEST_SYSTEM = 6
+MAX_SYSTEM_SIZE = 6
 """Largest matrix that is factorised; beyond it the unrolled arithmetic is longer than the rest of a step."""
 
 
 def _check_size(eqn: JaxprEqn, n: int) -> None:
-    if n > LARGEST_SYSTEM:
-        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; at most {LARGEST_SYSTEM} is supported")
+    if n > MAX_SYSTEM_SIZE:
+        raise UnsupportedError(f"primitive {eqn.primitive.name!r} of size {n}; at most {MAX_SYSTEM_SIZE} is supported")
 
 
 def _matrices(x: Elements) -> list[Elements]:

@@ -11,13 +11,13 @@ import numpy as np
 from crazysim.engine.lowering.jaxprs import Elements, Lowering, as_elements, constants, rule
 from crazysim.jaxcompat import JaxprEqn, bind
 
-MOVEMENT = (
+MOVING_PRIMITIVES = (
     "broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "split", "unstack",
     "concatenate", "stack", "pad", "tile",
 )  # fmt: skip
 
 
-@rule(*MOVEMENT)
+@rule(*MOVING_PRIMITIVES)
 def _move(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     return move_many(eqn, args) if eqn.primitive.multiple_results else [move(eqn, args)]
 
