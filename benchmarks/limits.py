@@ -202,7 +202,7 @@ def arithmetic_rate(device: str, n_worlds: int, repeats: int, n_steps: int = 100
 
 def fastest(device: str) -> str:
     """Return the engine that reaches the arithmetic rate of the machine."""
-    return "lanes" if fused.missing("cpu" if device == "cpu" else "gpu") else "fused"
+    return "lanes" if fused.unavailable_reason("cpu" if device == "cpu" else "gpu") else "fused"
 
 
 if __name__ == "__main__":

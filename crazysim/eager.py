@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(*static: str) -> Callable[[F], F]:
+def jit_unless_traced(*static: str) -> Callable[[F], F]:
     """Return a decorator that compiles a function for calls with arrays, and leaves calls with tracers as they are.
 
     Outside of ``jit``, JAX compiles each operation separately, which takes 10 ms to 30 ms per operation and shape; the
@@ -36,12 +36,12 @@ def compiled(*static: str) -> Callable[[F], F]:
     return decorate
 
 
-def to_host(x: Any, rows: Any) -> NDArray:
+def fetch_rows(x: Any, rows: Any) -> NDArray:
     """Return ``x[rows]`` on the host; rows of an array of the CPU are read there, without a compiled call."""
-    return np.asarray(x)[rows] if on_host(x) else np.asarray(x[rows])
+    return np.asarray(x)[rows] if is_on_host(x) else np.asarray(x[rows])
 
 
-def on_host(x: Any) -> bool:
+def is_on_host(x: Any) -> bool:
     """Return whether NumPy reads an array without copying it from a device, or has it already."""
     if isinstance(x, jax.core.Tracer):
         return False

@@ -35,18 +35,18 @@ __all__ = [
     "Literal",
     "Parameters",
     "as_function",
-    "batched_as",
     "batched_primitive",
     "batched_rule",
     "bind",
     "bits_generator",
     "cache_folder",
-    "closed",
+    "close_jaxpr",
     "compilation_cache",
     "compute_capability",
+    "constants_to_inputs",
     "custom_vmap",
     "equations",
-    "expanded",
+    "expand_primitive",
     "ffi_include_folder",
     "is_key",
     "is_symbolic_zero",
@@ -54,25 +54,25 @@ __all__ = [
     "n_compilations",
     "primitive_by_platform",
     "put_host_array",
-    "reading",
+    "read_equation",
     "register_host_target",
+    "select_inputs",
     "threefry2x32_p",
     "threefry_prng_impl",
     "versions",
-    "with_inputs",
-    "without_constants",
+    "vmap_rule_of",
 ]
 
 
 # Jaxprs ---------------------------------------------------------------------------------------------------------
 
 
-def closed(jaxpr: Any) -> ClosedJaxpr:
+def close_jaxpr(jaxpr: Any) -> ClosedJaxpr:
     """Return a jaxpr in closed form; parameters of primitives hold either form."""
     return jaxpr if isinstance(jaxpr, ClosedJaxpr) else ClosedJaxpr(jaxpr, ())
 
 
-def with_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
+def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
     """Return a jaxpr that takes only some of its inputs; the others must be unused.
 
     Args:
@@ -93,7 +93,7 @@ def equations(jaxpr: ClosedJaxpr) -> Iterator[Any]:
         for value in eqn.params.values():
             for inner in value if isinstance(value, list | tuple) else [value]:
                 if isinstance(inner, ClosedJaxpr | Jaxpr):
-                    yield from equations(closed(inner))
+                    yield from equations(close_jaxpr(inner))
 
 
 class Parameters(dict):
@@ -124,7 +124,7 @@ class Equation:
 
 
 @contextlib.contextmanager
-def reading(eqn: Any) -> Iterator[Equation]:
+def read_equation(eqn: Any) -> Iterator[Equation]:
     """Give a rule an equation, and report a parameter that JAX has renamed as unsupported.
 
     Only a missing parameter, or a missing attribute of a parameter, counts. Any other error is the rule's own.
@@ -249,7 +249,7 @@ def _batched_by(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: A
     return out, [0] * len(out)
 
 
-def batched_as(fn: Callable[..., Any]) -> Callable[..., Any]:
+def vmap_rule_of(fn: Callable[..., Any]) -> Callable[..., Any]:
     """Return the rule for ``vmap`` of a primitive that takes what a function makes of its operands."""
 
     def rule(primitive: Primitive, n: int, args: Sequence[Any], batched: Sequence[bool], **params: Any) -> Any:
@@ -264,7 +264,7 @@ def _compiled_primitive(primitive: Primitive, **params: Any) -> Callable[..., An
     return jax.jit(functools.partial(primitive.bind, **params))
 
 
-def without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
+def constants_to_inputs(closed: ClosedJaxpr) -> ClosedJaxpr:
     """Return a jaxpr that takes what it closes over as its first inputs."""
     x = closed.jaxpr
     return ClosedJaxpr(Jaxpr((), [*x.constvars, *x.invars], x.outvars, x.eqns, x.effects, x.debug_info), ())
@@ -287,7 +287,7 @@ def as_function(eqn: Any) -> Callable[..., Any]:
     return lambda *args: eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(dict(eqn.params)))
 
 
-def expanded(eqn: Any) -> Callable[..., list[Any]]:
+def expand_primitive(eqn: Any) -> Callable[..., list[Any]]:
     """Return a ``call_hi_primitive`` of JAX 0.12 as a function of arrays, written in terms of other primitives."""
     primitive = eqn.params["_prim"]
     return lambda *args: jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, args)))

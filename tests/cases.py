@@ -19,7 +19,7 @@ from crazysim.core import functional as F
 from crazysim.core.controls import SimControls
 from crazysim.core.data import create_params
 from crazysim.core.stage import as_stages
-from crazysim.core.stages import nonfinite
+from crazysim.core.stages import nonfinite_worlds
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import native
 from crazysim.pytree import PyTree
@@ -234,7 +234,7 @@ def by_stages(sim):
             return data, None
 
         data, _ = jax.lax.scan(once, data, length=n_steps)
-        return data.replace(core=data.core.replace(nonfinite=nonfinite(data)))
+        return data.replace(core=data.core.replace(nonfinite=nonfinite_worlds(data)))
 
     return step
 

@@ -23,8 +23,8 @@ def equation(fn, *args, name=None):
 
 def test_a_jaxpr_is_closed_once():
     jaxpr = jax.make_jaxpr(lambda x: x + 1)(1.0)
-    assert jaxcompat.closed(jaxpr) is jaxpr
-    opened = jaxcompat.closed(jaxpr.jaxpr)
+    assert jaxcompat.close_jaxpr(jaxpr) is jaxpr
+    opened = jaxcompat.close_jaxpr(jaxpr.jaxpr)
     assert isinstance(opened, jaxcompat.ClosedJaxpr)
     assert jaxcompat.jaxpr_as_fun(opened)(2.0)[0] == 3.0
 
@@ -38,14 +38,14 @@ def test_literals_are_told_from_variables():
 
 def test_a_jaxpr_drops_inputs_that_it_does_not_use():
     jaxpr = jax.make_jaxpr(lambda a, b, c: (a - c,))(1.0, 2.0, 3.0)
-    some = jaxcompat.with_inputs(jaxpr, [0, 2])
+    some = jaxcompat.select_inputs(jaxpr, [0, 2])
     assert len(some.jaxpr.invars) == 2
     assert jaxcompat.jaxpr_as_fun(some)(5.0, 3.0)[0] == 2.0
 
 
 def test_parameters_and_operands_of_an_equation_are_read():
     eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
-    with jaxcompat.reading(eqn) as read:
+    with jaxcompat.read_equation(eqn) as read:
         assert read.primitive.name == "reshape"
         assert read.params["new_sizes"] == (3, 2)
         assert read.invars[0].aval.shape == (6,)
@@ -56,16 +56,16 @@ def test_parameters_and_operands_of_an_equation_are_read():
 def test_a_parameter_that_is_gone_is_unsupported():
     eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
     expected = rf"primitive 'reshape': it has no parameter 'old' in JAX {jax.__version__}, only .*new_sizes"
-    with pytest.raises(UnsupportedError, match=expected), jaxcompat.reading(eqn) as read:
+    with pytest.raises(UnsupportedError, match=expected), jaxcompat.read_equation(eqn) as read:
         read.params["old"]
 
 
 def test_an_attribute_of_a_parameter_that_is_gone_is_unsupported():
     eqn = equation(lambda x, i: x.at[i].add(1.0), jnp.ones(6), jnp.int32(1), name="scatter-add")
-    with jaxcompat.reading(eqn) as read:
+    with jaxcompat.read_equation(eqn) as read:
         assert read.params["dimension_numbers"].scatter_dims_to_operand_dims == (0,)
     expected = f"its parameter 'dimension_numbers' has no 'old' in JAX {jax.__version__}"
-    with pytest.raises(UnsupportedError, match=expected) as error, jaxcompat.reading(eqn) as read:
+    with pytest.raises(UnsupportedError, match=expected) as error, jaxcompat.read_equation(eqn) as read:
         _ = read.params["dimension_numbers"].old
     assert error.value.primitive == "scatter-add"
 
@@ -76,7 +76,7 @@ def test_an_attribute_of_a_parameter_that_is_gone_is_unsupported():
 ])  # fmt: skip
 def test_a_slip_of_a_rule_is_not_taken_for_a_new_jax(slip, kind):
     eqn = equation(lambda x: x.reshape(3, 2), jnp.ones(6), name="reshape")
-    with pytest.raises(kind), jaxcompat.reading(eqn) as read:
+    with pytest.raises(kind), jaxcompat.read_equation(eqn) as read:
         slip(read)
 
 
@@ -85,7 +85,7 @@ def test_a_primitive_runs_again_on_other_operands():
     x = np.arange(6.0).reshape(2, 3)
     np.testing.assert_array_equal(jaxcompat.bind(eqn, x)[0], x.T)
     np.testing.assert_array_equal(jaxcompat.bind(eqn, x, permutation=(0, 1))[0], x)
-    with jaxcompat.reading(eqn) as read:
+    with jaxcompat.read_equation(eqn) as read:
         np.testing.assert_array_equal(jaxcompat.bind(read, x)[0], x.T)
 
 
@@ -113,7 +113,7 @@ def test_primitives_written_in_terms_of_others_are_expanded():
                 found.append(eqn)
                 args = [jnp.ones(v.aval.shape, v.aval.dtype) for v in eqn.invars]
                 expected = jax.tree.leaves(eqn.primitive.bind(*args, **eqn.params))
-                for a, b in zip(jaxcompat.expanded(eqn)(*args), expected, strict=True):
+                for a, b in zip(jaxcompat.expand_primitive(eqn)(*args), expected, strict=True):
                     np.testing.assert_allclose(a, b, rtol=1e-6)
     assert not found or tuple(map(int, jax.__version__.split(".")[:2])) >= (0, 12)
 
@@ -159,7 +159,7 @@ def test_a_primitive_has_a_derivative_a_transpose_and_a_rule_for_vmap():
         {"": lambda x, y, n_fixed: [x * y]},
         derivative=lambda x, y, n_fixed: [5.0 * x * y],
         transposed=lambda fixed, seeds, n_fixed: [7.0 * fixed[0] * seeds[0]],
-        batched=jaxcompat.batched_as(lambda x, y, n_fixed: [x * y + 1.0]),
+        batched=jaxcompat.vmap_rule_of(lambda x, y, n_fixed: [x * y + 1.0]),
     )
     of = lambda x, y: p.bind(x, y, n_fixed=1)[0]  # noqa: E731
     two, three = jnp.float32(2), jnp.float32(3)
@@ -173,7 +173,7 @@ def test_a_jaxpr_takes_what_it_closes_over():
     table = jnp.arange(3.0)
     closed = jax.make_jaxpr(lambda x: x + table)(1.0)
     assert len(closed.consts) == 1
-    opened = jaxcompat.without_constants(closed)
+    opened = jaxcompat.constants_to_inputs(closed)
     assert not opened.consts
     (found,) = jaxcompat.jaxpr_as_fun(opened)(table, 1.0)
     np.testing.assert_array_equal(found, [1.0, 2.0, 3.0])

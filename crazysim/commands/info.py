@@ -100,7 +100,7 @@ def _compiler() -> str:
 
     program = native.compiler()
     if program is None:
-        return f"none; steps run on a slower engine: {native.MISSING}"
+        return f"none; steps run on a slower engine: {native.MISSING_COMPILER}"
     done = subprocess.run([*shlex.split(program), "--version"], capture_output=True, text=True, timeout=20, check=False)
     return f"{program}, {_first_line(done.stdout or done.stderr)}; {shlex.join(native.command()[1:])}"
 

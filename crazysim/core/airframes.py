@@ -100,7 +100,7 @@ def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def for_drones(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:
+def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:
     """Return the record of parameters of all drones: shared where their airframes are alike, one per drone elsewhere.
 
     Axes over rotors are as long as the largest number of rotors. The others do not exist: their thrust, their part in

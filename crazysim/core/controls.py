@@ -11,7 +11,7 @@ from jax import Array
 
 from crazysim.control import AllocationParams, Control, Controller
 from crazysim.control.protocol import controller_chain
-from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
+from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, n_rotors_of
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, floating, host_array, leaf, scopes, static
@@ -34,8 +34,11 @@ class ControllerData(PyTree):
         Raises:
             ConfigError: If an airframe lacks a number, or a record has leaves of another scope or of other counts.
         """
-        params = for_drones(airframes, controller.params, n_worlds)
-        memory, one = for_drones(airframes, controller.memory, n_worlds), controller.memory(as_airframes(airframes)[0])
+        params = create_per_drone(airframes, controller.params, n_worlds)
+        memory, one = (
+            create_per_drone(airframes, controller.memory, n_worlds),
+            controller.memory(as_airframes(airframes)[0]),
+        )
         for record, kinds in ((memory, ("drone",)), (params, ("shared", "drone"))):
             others = set(jax.tree.leaves(scopes(record))) - set(kinds)
             if others:
@@ -289,7 +292,7 @@ class SimControls(PyTree):
         if dynamics == Dynamics.first_principles:
             rotor_vel = zeros(n_rotors_of(airframes))
         if last == Control.force_torque:
-            params = for_drones(airframes, AllocationParams.create, n_worlds)
+            params = create_per_drone(airframes, AllocationParams.create, n_worlds)
             force_torque = ForceTorqueControlData(zeros(4), zeros(4), freqs[Control.force_torque], params)
         return SimControls(control, state, attitude, body_rate, force_torque, rotor_vel)
 

@@ -14,7 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.control import Control, Controller, command_size
-from crazysim.core.airframes import Airframes, as_airframes, for_drones, n_rotors_of
+from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, n_rotors_of
 from crazysim.core.controls import SimControls
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics, first_principles, fitted
@@ -230,7 +230,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
             return first_principles.with_rotors(first_principles.Params.create(one), n_rotors)
         return fitted.Params.create(one, dynamics)
 
-    return for_drones(airframe, create, n_worlds)
+    return create_per_drone(airframe, create, n_worlds)
 
 
 def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
 from crazysim.core.data import SimData, command_shape
-from crazysim.core.settings import flag
+from crazysim.core.settings import check_flag
 from crazysim.core.stage import tick
 from crazysim.errors import ConfigError, shown
 
@@ -275,7 +275,7 @@ def _as_command(
     else:
         raise ValueError(f"expected real numbers as {name} command, got type {array.dtype}; use float32")
     is_tracer = isinstance(array, jax.core.Tracer)
-    check_finite = flag("check_finite", check_finite)
+    check_finite = check_flag("check_finite", check_finite)
     if (on_host or (check_finite and not is_tracer)) and not np.isfinite(array).all():
         worlds = np.unique(np.nonzero(~np.isfinite(np.asarray(array)))[0])[:8]
         raise ValueError(

@@ -18,7 +18,7 @@ from crazysim.pytree import scopes
 T = TypeVar("T")
 
 
-def influenced(plugin: Plugin, data: SimData) -> SimData:
+def apply_influence(plugin: Plugin, data: SimData) -> SimData:
     """Return the data as the plugin's ``influence`` returns it, for the dynamics alone.
 
     It may write what the dynamics read besides the states that they advance: ``states.force``, ``states.torque``, the
@@ -57,7 +57,7 @@ def influenced(plugin: Plugin, data: SimData) -> SimData:
     return after
 
 
-def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
+def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     """Return the rates of the plugin's own states, checked.
 
     Raises:
@@ -92,7 +92,7 @@ def own_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     return dict(rates)
 
 
-def constrained(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
+def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
     """Return the derivative under the constraint of a plugin; its errors carry a note with plugin and method."""
     where = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
     return _called(where, lambda seen: plugin.constrain(seen, deriv, dt), data, plugin.coupling)

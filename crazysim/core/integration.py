@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimStateDeriv
-from crazysim.core.influence import constrained, influenced, own_rates
+from crazysim.core.influence import apply_constraint, apply_influence, plugin_rates
 from crazysim.core.plugin import Plugin
 from crazysim.core.stage import Stage, vmap_drones
 from crazysim.pytree import PyTree
@@ -98,11 +98,11 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool
     )
     if not deriv.plugins:
         return data.replace(states=states)
-    moved = {name: along(data.plugins[name], rates, dt) for name, rates in deriv.plugins.items()}
+    moved = {name: advance_record(data.plugins[name], rates, dt) for name, rates in deriv.plugins.items()}
     return data.replace(states=states, plugins=data.plugins | moved)
 
 
-def along(record: R, rates: Mapping[str, Array], dt: float) -> R:
+def advance_record(record: R, rates: Mapping[str, Array], dt: float) -> R:
     """Return a record ``dt`` seconds along a derivative, by field."""
     return record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
 
@@ -153,15 +153,15 @@ class Integration:
         if self.method is symplectic_euler:
             vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
-        return constrained(constraining[0], seen, deriv, None if self.method is rk4 else dt)
+        return apply_constraint(constraining[0], seen, deriv, None if self.method is rk4 else dt)
 
     def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data under all influences, and the derivative without constraints."""
         for plugin in self.plugins:
-            data = influenced(plugin, data)
+            data = apply_influence(plugin, data)
         deriv = self.deriv_fn(data)
         of_drones = [plugin for plugin in self.plugins if plugin.scope == "drone"]
-        own = {plugin.name: rates for plugin in of_drones if (rates := own_rates(plugin, data))}
+        own = {plugin.name: rates for plugin in of_drones if (rates := plugin_rates(plugin, data))}
         return data, deriv.replace(plugins=own) if own else deriv
 
     def stage(self) -> Stage:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.errors import ConfigError
-from crazysim.jaxcompat import ClosedJaxpr, batched_primitive, jaxpr_as_fun, without_constants
+from crazysim.jaxcompat import ClosedJaxpr, batched_primitive, constants_to_inputs, jaxpr_as_fun
 
 MEMBER_AXIS = "members"
 """Name of the axis of ``vmap`` over the drones of a world, or over the members of another population."""
@@ -82,7 +82,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     if reduce == "sum" and any(x.dtype == bool for x in traced.out_avals):
         raise ConfigError("expected numbers to sum over the other drones, got bools. Use reduce='max' for any of them.")
     found = reduce_over_others_p.bind(
-        *traced.consts, *leaves, jaxpr=without_constants(traced), n_own=len(traced.consts), reduce=reduce
+        *traced.consts, *leaves, jaxpr=constants_to_inputs(traced), n_own=len(traced.consts), reduce=reduce
     )
     return structure.unflatten(found)
 

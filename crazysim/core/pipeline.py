@@ -14,7 +14,7 @@ from crazysim.errors import ConfigError, UnknownNameError, shown
 Pipeline = dict[str, Callable[..., Any]]
 
 
-def checked(name: str, pipeline: object) -> Pipeline:
+def check_pipeline(name: str, pipeline: object) -> Pipeline:
     """Return a pipeline that a user assigns.
 
     Args:

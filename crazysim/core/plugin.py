@@ -98,7 +98,7 @@ def parameter(
     return dataclasses.field(default=default, metadata={"setting": declared})
 
 
-def of_airframes(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
+def airframe_numbers(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
     """Return a number of the airframe, as ``check_parameter`` takes it: one for all drones, or one for each.
 
     Args:

@@ -18,8 +18,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.influence import own_rates
-from crazysim.core.integration import Integrator, along
+from crazysim.core.influence import plugin_rates
+from crazysim.core.integration import Integrator, advance_record
 from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import RESERVED_SCOPES, Stage, tick
@@ -199,7 +199,7 @@ class Population(Plugin):
 
     def _integrated(self, scheme: Callable[..., Members], data: SimData) -> SimData:
         def rates(record: Members) -> dict[str, Array]:
-            return own_rates(self, self.write(data, record))
+            return plugin_rates(self, self.write(data, record))
 
         moved = scheme(self.read(data), rates, 1 / data.core.freq)
         return self.write(data, self.finish(moved))
@@ -211,22 +211,22 @@ Rates = Callable[[R], dict[str, Array]]
 
 def euler(record: R, rates: Rates, dt: float) -> R:
     """Return a record one explicit Euler step later."""
-    return along(record, rates(record), dt)
+    return advance_record(record, rates(record), dt)
 
 
 def symplectic_euler(record: R, rates: Rates, dt: float, positions: Sequence[str]) -> R:
     """Return a record one semi-implicit Euler step later: positions move with the new values of the other states."""
-    others = along(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
-    return along(others, {k: rate for k, rate in rates(others).items() if k in positions}, dt)
+    others = advance_record(record, {k: rate for k, rate in rates(record).items() if k not in positions}, dt)
+    return advance_record(others, {k: rate for k, rate in rates(others).items() if k in positions}, dt)
 
 
 def rk4(record: R, rates: Rates, dt: float) -> R:
     """Return a record one step of the classical Runge-Kutta method of order 4 later."""
     k1 = rates(record)
-    k2 = rates(along(record, k1, dt / 2))
-    k3 = rates(along(record, k2, dt / 2))
-    k4 = rates(along(record, k3, dt))
-    return along(record, jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), dt)
+    k2 = rates(advance_record(record, k1, dt / 2))
+    k3 = rates(advance_record(record, k2, dt / 2))
+    k4 = rates(advance_record(record, k3, dt))
+    return advance_record(record, jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), dt)
 
 
 def scheme_of(integrator: Integrator, positions: Sequence[str]) -> Callable[..., Any]:

@@ -41,7 +41,7 @@ SLOW_FREQ = 200
 stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
 
 
-def positive(name: str, value: object, at_most: int | None = None) -> int:
+def positive_integer(name: str, value: object, at_most: int | None = None) -> int:
     """Return a positive integer.
 
     Args:
@@ -59,7 +59,7 @@ def positive(name: str, value: object, at_most: int | None = None) -> int:
     return int(value)
 
 
-def flag(name: str, value: object) -> bool:
+def check_flag(name: str, value: object) -> bool:
     """Return a setting that is on or off.
 
     Args:
@@ -169,7 +169,7 @@ def check_settings(settings: Any) -> None:
         kinds = set(kinds) - {type(None)}
         classes = tuple(kinds - NUMERIC_TYPES)
         if kinds == {bool}:
-            flag(name, value)
+            check_flag(name, value)
         elif kinds == {NumbersByName}:
             if not isinstance(value, Mapping):
                 raise ConfigError(f"expected {name} as a dict of numbers by name, got {shown(value)}. {remedy}")
@@ -241,7 +241,7 @@ def physics_freq(freq: object) -> int:
     Raises:
         ConfigError: If it is no positive integer, or too high for float32.
     """
-    freq = positive("freq", freq)
+    freq = positive_integer("freq", freq)
     if freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise ConfigError(
             f"freq is {freq} Hz: above 10,000 Hz a step is lost in float32 rounding. Enable float64 first: "
@@ -250,7 +250,7 @@ def physics_freq(freq: object) -> int:
     return freq
 
 
-def member(enum: type[E], name: str, value: object) -> E:
+def enum_member(enum: type[E], name: str, value: object) -> E:
     """Return the member of an enum.
 
     Raises:
@@ -341,7 +341,7 @@ def check_rates(control: Control, freq: int, given: Mapping[Control, int | None]
         Control.rotor_vel: (),
     }.get(control, (control, Control.force_torque))
     for level, requested in given.items():
-        if requested is not None and freq % positive(f"{level.value}_freq", requested) and level in in_use:
+        if requested is not None and freq % positive_integer(f"{level.value}_freq", requested) and level in in_use:
             raise ConfigError(
                 f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
                 f"every whole number of steps. Use the nearest rate below, {_largest_divisor(freq, requested)} Hz."
@@ -409,7 +409,7 @@ def dividing_rate(name: str, rate: object, freq: int) -> int:
     Raises:
         ConfigError: If it does not divide ``freq``.
     """
-    rate = positive(name, rate)
+    rate = positive_integer(name, rate)
     if freq % rate:
         raise ConfigError(
             f"expected {name} to divide freq = {freq} Hz, got {rate} Hz. Use the nearest rate below, "
@@ -449,7 +449,7 @@ def controller_at_rates(
     for name, given_rate in requested.items():
         rate = getattr(controller, name) if given_rate is None else given_rate
         if given_rate is None and rate == own[name]:
-            defaults[name] = positive(name + of, rate)
+            defaults[name] = positive_integer(name + of, rate)
         else:
             rates[name] = dividing_rate(name + of, rate, freq)
     rates |= default_rates(freq, defaults, of)

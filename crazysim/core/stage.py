@@ -131,7 +131,7 @@ def tick(data: SimData, freq: int) -> Array | None:
     return None if period == 1 else data.core.steps % period == 0
 
 
-def at_the_start(data: SimData) -> Array:
+def is_first_step(data: SimData) -> Array:
     """Return True in the first step of an episode. (n_worlds, 1), or () for one
 
     Leading stages of a step with this condition run before the first step of a call.

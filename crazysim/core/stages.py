@@ -55,7 +55,7 @@ def build_step_pipeline(
     elif integrator.order == 1:
         deriv_fn = first_principles_euler_derivative
     if integrator != Integrator.euler:
-        deriv_fn = held_on_floor(deriv_fn)
+        deriv_fn = hold_on_floor(deriv_fn)
     stages["integration"] = Integration(INTEGRATORS[integrator], deriv_fn).stage()
     stages["clip_floor_pos"] = clip_floor_pos
     stages["increment_steps"] = increment_steps
@@ -120,7 +120,7 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
 
 
 @functools.cache  # the same function for equal derivatives, so that they share a trace
-def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
+def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
     """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
 
     Needed where positions move with velocities of the same step. Explicit Euler moves them with those of the last,
@@ -135,7 +135,7 @@ def held_on_floor(deriv_fn: DerivFn) -> DerivFn:
     return held
 
 
-def stopped_at(s: SimState, lowest: Array | float) -> SimState:
+def stop_below(s: SimState, lowest: Array | float) -> SimState:
     """Return states in which a drone below a height, m (..., 1), or on it and not rising, is on it, at rest."""
     height, climb = s.pos[..., 2:], s.vel[..., 2:]
     stopped = (height < lowest) | ((height == lowest) & (climb <= 0))
@@ -149,7 +149,7 @@ def stopped_at(s: SimState, lowest: Array | float) -> SimState:
 @_built_in("drone")
 def clip_floor_pos(data: SimData) -> SimData:
     """Stop drones at the floor."""
-    return data.replace(states=stopped_at(data.states, FLOOR_HEIGHT))
+    return data.replace(states=stop_below(data.states, FLOOR_HEIGHT))
 
 
 @_built_in("world")
@@ -158,13 +158,13 @@ def increment_steps(data: SimData) -> SimData:
     return data.replace(core=data.core.replace(steps=data.core.steps + 1))
 
 
-def watched(data: SimData) -> Any:
+def watched_records(data: SimData) -> Any:
     """Return the records whose NaN and infinities flag a world: states and commands of drones, other populations."""
     populations = [record for record in data.plugins.values() if isinstance(record, Members)]
     return data.states, data.controls, populations
 
 
-def nonfinite(data: SimData) -> Array:
+def nonfinite_worlds(data: SimData) -> Array:
     """Return True where a world was flagged, holds NaN or infinity in a state or command, or has counted too far.
 
     As a call takes at most ``MAX_STEPS``, a count beyond that is negative. For data of all worlds or of one world.
@@ -172,7 +172,7 @@ def nonfinite(data: SimData) -> Array:
     Returns:
         (n_worlds, 1), or () in one world
     """
-    records, core = watched(data), data.core
+    records, core = watched_records(data), data.core
     n_axes = max(core.steps.ndim - 1, 0)
     pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
     leaves = [x for scope, x in pairs if has_members(scope)]

@@ -16,7 +16,7 @@ from crazysim.core import functional as F
 from crazysim.core.data import SimData
 from crazysim.demos.common import FPS, counted, frames_of
 from crazysim.dynamics import first_principles
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import RenderError, not_installed
 from crazysim.media import Film, Flight, Recorder, View
 from crazysim.media.trail import COLORS
@@ -118,7 +118,7 @@ def touches(sim: Sim) -> np.ndarray:
     return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
 
-@compiled("n_drones")
+@jit_unless_traced("n_drones")
 def reference(time: Array, n_drones: int) -> Array:
     """Return the setpoint of every drone: figure eights offset by a quarter of a period and by 0.25 m in height.
 
@@ -147,7 +147,7 @@ def reference(time: Array, n_drones: int) -> Array:
     )
 
 
-@compiled("n_drones")
+@jit_unless_traced("n_drones")
 def feedforward(time: Array, n_drones: int) -> Array:
     """Return the jerk of every drone's setpoint, with zero snap and yaw rates, without which a turn lags behind.
 

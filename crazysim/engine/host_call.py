@@ -85,7 +85,7 @@ def _address(x: NDArray) -> int:
     return ctypes.addressof(ctypes.c_char.from_buffer(x)) if x.flags.writeable else x.ctypes.data  # type: ignore[arg-type]
 
 
-class _Place(NamedTuple):
+class _Offset(NamedTuple):
     """Place of an array in the memory of a call."""
 
     piece: int
@@ -98,7 +98,7 @@ class _Layout:
     """Pieces of memory that a call writes, and the places of its results in them."""
 
     def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
-        self.places: list[_Place] = []
+        self.places: list[_Offset] = []
         self.sizes: list[int] = []
         rounded = [
             -(-math.prod(shape) * dtype.itemsize // ALIGNMENT_BYTES) * ALIGNMENT_BYTES for _, shape, dtype in results
@@ -106,10 +106,10 @@ class _Layout:
         self.shared = sum(rounded) <= MAX_SHARED_BYTES
         for (_, shape, dtype), size in zip(results, rounded, strict=True):
             if self.shared and self.sizes:
-                self.places.append(_Place(0, self.sizes[0], shape, dtype))
+                self.places.append(_Offset(0, self.sizes[0], shape, dtype))
                 self.sizes[0] += size
             else:
-                self.places.append(_Place(len(self.sizes), 0, shape, dtype))
+                self.places.append(_Offset(len(self.sizes), 0, shape, dtype))
                 self.sizes.append(size)
         self.by_key = dict(zip((key for key, _, _ in results), self.places, strict=True))
         self.begins = [(place.piece, place.offset) for place in self.places]

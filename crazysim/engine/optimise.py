@@ -45,5 +45,5 @@ def apply(program: Program, passes: Iterable[Pass]) -> Program:
 def _inspect(program: Program, name: str) -> None:
     if os.environ.get(VERIFY_VARIABLE) == "1":
         verify(program)
-    if dump.enabled():
+    if dump.is_enabled():
         dump.write(f"program.{name}", listing.list_program(program))

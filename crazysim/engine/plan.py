@@ -26,13 +26,13 @@ from jax.sharding import PartitionSpec
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Stage, replace_leaves
-from crazysim.core.stages import watched
+from crazysim.core.stages import watched_records
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
 from crazysim.engine.host_call import HostCall, is_possible
 from crazysim.engine.ir.program import Program, Zeros
-from crazysim.engine.lowering.groups import Group, independent
-from crazysim.engine.lowering.relative import on_data
+from crazysim.engine.lowering.groups import Group, independent_groups
+from crazysim.engine.lowering.relative import on_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
@@ -47,7 +47,7 @@ BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "inter
 """Backends of the engines that run programs."""
 
 
-Apart = frozenset[int] | None
+SeparateLeaves = frozenset[int] | None
 """Leaves that stay arrays of their own where others become rows; None for no rows."""
 
 
@@ -108,7 +108,7 @@ class Planner(NamedTuple):
     reported: set[str]
     """Warnings that were given before, for data of another structure."""
 
-    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], apart: Apart = None) -> Plan:
+    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], apart: SeparateLeaves = None) -> Plan:
         """Return the plan of some data.
 
         Args:
@@ -147,7 +147,7 @@ class Planner(NamedTuple):
         )
         return plan
 
-    def _fast(self, data: SimData, zeros: Zeros, apart: Apart) -> tuple[Plan, list[str]]:
+    def _fast(self, data: SimData, zeros: Zeros, apart: SeparateLeaves) -> tuple[Plan, list[str]]:
         """Return a plan that runs a program, and what it does not support; that of ``plain`` on several devices."""
         limit = self._spread_limit(data)
         if limit:
@@ -156,7 +156,7 @@ class Planner(NamedTuple):
         # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
         known = tuple([(i, some) for i, some in zeros if kinds[i] == "shared"])
         tracer = Tracer()
-        groups = independent(self.stages, data, tracer)
+        groups = independent_groups(self.stages, data, tracer)
         lowered = [
             lower_stages(g.stages, data, known, _watched, population=g.population, tracer=tracer) for g in groups
         ]
@@ -172,7 +172,7 @@ class Planner(NamedTuple):
             return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
         engine, why, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
-            engine, why = "lanes", fused.missing(self.location.platform) or ""
+            engine, why = "lanes", fused.unavailable_reason(self.location.platform) or ""
             if not why:
                 try:
                     in_leaves = None if select is None else optimise(lowered[0])
@@ -212,7 +212,7 @@ class Planner(NamedTuple):
 
     @property
     def _has_kernels(self) -> bool:
-        return self.engine in ("auto", "fused") and fused.missing(self.location.platform) is None
+        return self.engine in ("auto", "fused") and fused.unavailable_reason(self.location.platform) is None
 
     def _wrap(
         self,
@@ -313,7 +313,7 @@ def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
 
 def _together(groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]) -> tuple[Run, tuple[int, ...]]:
     """Return one function that runs independent programs, and the leaves that it writes."""
-    runs = [on_data(program, run) for program, run in zip(programs, runs, strict=True)]
+    runs = [on_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
         return runs[0], tuple(programs[0].written)
     owned = [group.owned for group in groups]
@@ -333,7 +333,7 @@ def _together(groups: Sequence[Group], programs: Sequence[Program], runs: Sequen
 
 def _watched(data: SimData) -> list[Any]:
     """Return the leaves whose NaN and infinities flag a world: states and commands."""
-    return jax.tree.leaves(watched(data))
+    return jax.tree.leaves(watched_records(data))
 
 
 def _inputs(program: Program) -> list[int]:
@@ -344,7 +344,7 @@ def _inputs(program: Program) -> list[int]:
     moved = {i for leaf in program.leaves for i in leaf.rows_of}
     of_drones = [i for i, x in enumerate(program.leaves) if x.scope == "drone" and not x.rows_of and i not in moved]
     if program.fused:
-        needed = kernel.needed(program)
+        needed = kernel.needed_leaves(program)
         return [*needed, next((i for i in of_drones if i in needed), of_drones[0])]
     checked = [leaf for leaf, _ in program.check.reads] if program.check is not None else []
     return [*program.read, *program.written, *checked, of_drones[0]]

@@ -13,7 +13,7 @@ from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
 from crazysim.core.stage import Axes, Stage, replace_leaves
 from crazysim.engine.backends import fused
-from crazysim.engine.lowering.relative import on_data
+from crazysim.engine.lowering.relative import on_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.pytree import PyTree, leaf
@@ -64,7 +64,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     if program.unfused_stages:
         raise program.unfused_stages[0].error
     packed = [jnp.concatenate([given[i].ravel() for i in program.packed])] if program.packed else []
-    written, _ = on_data(program, fused.build(program, Location(platform)))([*given, *packed], 0)
+    written, _ = on_data_leaves(program, fused.build(program, Location(platform)))([*given, *packed], 0)
     found = treedef.unflatten(replace_leaves(given, program.written, written)).plugins[RECORD_NAME].rows
     return [
         tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])

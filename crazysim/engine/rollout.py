@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.engine.ir.program import Zeros
 from crazysim.engine.step import Step
 from crazysim.errors import ConfigError
@@ -63,8 +63,8 @@ def rollout(
         ConfigError: If a number is not a positive int, or does not divide.
         ValueError: If the policy returns a command of another shape.
     """
-    n_control_steps = positive("n_control_steps", n_control_steps)
-    n_substeps, every = positive("n_substeps", n_substeps), positive("every", every)
+    n_control_steps = positive_integer("n_control_steps", n_control_steps)
+    n_substeps, every = positive_integer("n_substeps", n_substeps), positive_integer("every", every)
     if n_control_steps % every:
         raise ConfigError(f"every={every} does not divide n_control_steps={n_control_steps}; choose a multiple of it")
     zeros = step.zeros(data) if zeros is None else zeros
@@ -88,7 +88,7 @@ def rollout(
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
 
-compiled = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
+compiled_rollout = functools.partial(jax.jit, static_argnames=STATIC_ARGUMENTS)(rollout)
 """``rollout`` in one compiled call; only the carries of its loops reuse buffers."""
 
 
@@ -108,13 +108,13 @@ def run(
     """
     zeros = step.zeros(data)
     if not progress:
-        return compiled(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
+        return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
     piece = max(n_control_steps // every // 100, 1) * every
     pieces, rest = divmod(n_control_steps, piece)
     kept = []
     with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
         for n in [piece] * pieces + [rest] * (rest > 0):
-            data, part = compiled(step, data, policy, params, n, every=every, zeros=zeros, **settings)
+            data, part = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
             jax.block_until_ready(part)
             kept.append(part)
             bar.update(n)

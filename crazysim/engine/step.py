@@ -23,8 +23,8 @@ from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.ir.program import Program, Zeros
-from crazysim.engine.lowering.relative import viewed
-from crazysim.engine.plan import ENGINES, Apart, Plan, Planner
+from crazysim.engine.lowering.relative import view_leaves
+from crazysim.engine.plan import ENGINES, Plan, Planner, SeparateLeaves
 from crazysim.errors import ConfigError, shown
 from crazysim.pytree import check_axes, lazy
 
@@ -133,7 +133,7 @@ class Step:
         """
         if engine not in ENGINES:
             raise ConfigError(f"engine {engine!r} does not exist; choose one of {', '.join(ENGINES)}")
-        if engine == "fused" and (missing := fused.missing(platform)):
+        if engine == "fused" and (missing := fused.unavailable_reason(platform)):
             raise ConfigError(f"engine 'fused' cannot run here: {missing}. Use engine='lanes', or 'auto'.")
         self.engine, self.platform, self.mesh, self.strict = engine, platform, mesh, strict
         devices = tuple(mesh.devices.flat) if mesh is not None else None if device is None else (device,)
@@ -184,7 +184,11 @@ class Step:
         return treedef.unflatten(after.leaves[: len(leaves)])
 
     def flatten(
-        self, data: SimData, zeros: Zeros | None = None, n_steps: int | Array | None = None, apart: Apart = None
+        self,
+        data: SimData,
+        zeros: Zeros | None = None,
+        n_steps: int | Array | None = None,
+        apart: SeparateLeaves = None,
     ) -> FlatData:
         """Return the data flattened for ``advance``.
 
@@ -204,7 +208,7 @@ class Step:
         treedef: Any,
         zeros: Zeros | None,
         n_steps: int | Array | None,
-        apart: Apart = None,
+        apart: SeparateLeaves = None,
     ) -> FlatData:
         plan = self._plan(data, leaves, treedef, zeros, n_steps, apart)
         return FlatData(self._all_leaves(plan, leaves), plan)
@@ -268,7 +272,7 @@ class Step:
     def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
         """Return the leaves of the data, and behind them those that the plan adds."""
         packed = [self._pack([leaves[i] for i in plan.packed])] if plan.packed else []
-        rows = [rows.pack(viewed(rows.program.views, leaves)) for rows in plan.rows]
+        rows = [rows.pack(view_leaves(rows.program.views, leaves)) for rows in plan.rows]
         in_rows = [i for rows in plan.rows for i in rows.members]
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
@@ -289,7 +293,7 @@ class Step:
         treedef: Any,
         zeros: Zeros | None,
         n_steps: int | Array | None = None,
-        apart: Apart = None,
+        apart: SeparateLeaves = None,
     ) -> Plan:
         zeros = self._zeros(data, leaves, treedef) if zeros is None else zeros
         elsewhere = self._elsewhere(data.states.pos)

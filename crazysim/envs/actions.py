@@ -13,7 +13,7 @@ from crazysim.core.airframes import Airframes, as_airframes
 from crazysim.core.data import SimParams
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles, fitted
-from crazysim.eager import to_host
+from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
 from crazysim.rotation import safe_clip
@@ -99,7 +99,7 @@ def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: f
 
 def _of_drone(airframe: Airframe, params: SimParams, control: Control, tilt: float, drone: int) -> Actions:
     """Return the map of one drone of the first world."""
-    params = jax.tree.map(lambda scope, x: to_host(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
+    params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
     each = float(airframe.value("rotors.thrust_max", ()))
     hover = float(hover_thrust(params)[0])

@@ -14,7 +14,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
-from crazysim.core.settings import as_mask, positive
+from crazysim.core.settings import as_mask, positive_integer
 from crazysim.core.sharding import default_device_of, put_on_device, shard
 from crazysim.core.stage import vmap_worlds
 from crazysim.eager import is_traced
@@ -271,7 +271,7 @@ class DroneEnv(Env):
                 rate does not divide, or the controller runs less often than actions come; if no plugin measures states
                 although ``measured`` is true.
         """
-        freq = positive("freq", freq)
+        freq = positive_integer("freq", freq)
         require_installed(sim, task)
         if sim.freq % freq:
             raise ConfigError(

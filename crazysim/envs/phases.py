@@ -20,7 +20,7 @@ from jax.tree_util import keystr, tree_leaves_with_path
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
 from crazysim.core.stage import Phase, Stage, vmap_worlds
-from crazysim.core.stages import nonfinite
+from crazysim.core.stages import nonfinite_worlds
 from crazysim.envs.actions import Actions
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
@@ -211,7 +211,7 @@ class Phases:
 def _flag_nonfinite(data: SimData, apply: Apply) -> SimData:
     """Return the data with worlds flagged that are not finite, which holds for one world and for all."""
     del apply
-    return data.replace(core=data.core.replace(nonfinite=nonfinite(data)))
+    return data.replace(core=data.core.replace(nonfinite=nonfinite_worlds(data)))
 
 
 def _as_before(data: SimData, state: EnvState) -> SimData:

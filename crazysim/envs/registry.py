@@ -15,7 +15,7 @@ import gymnasium
 
 from crazysim.control import Control
 from crazysim.core.plugin import Plugin, plugin_list
-from crazysim.core.settings import member, positive
+from crazysim.core.settings import enum_member, positive_integer
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.references import follow, is_reference, load
@@ -170,8 +170,8 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
             f"expected a name of lower case letters, digits and underscores that no built-in task has, got {name!r}. "
             f"Use for example 'two_hoops'."
         )
-    control = member(Control, "control", control).value
-    entry = Entry(_checked(task), _id(name), control, positive("n_drones", n_drones))
+    control = enum_member(Control, "control", control).value
+    entry = Entry(_checked(task), _id(name), control, positive_integer("n_drones", n_drones))
     TASKS[name] = entry
     _announce(name, entry)
     return entry.id

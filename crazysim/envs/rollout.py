@@ -8,7 +8,7 @@ from typing import Any
 import jax
 from jax import Array
 
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, validate_action
 from crazysim.pytree import PyTree, select_worlds
@@ -90,7 +90,7 @@ def rollout(
         ConfigError: If the number of steps is not a positive integer.
         ValueError: If the policy returns actions of another shape.
     """
-    n_steps = positive("n_steps", n_steps)
+    n_steps = positive_integer("n_steps", n_steps)
     memory = initial_memory if memory is None else memory
     start = env.flatten(state)
     carried = sorted({*start.plan.written, start.plan.synced})

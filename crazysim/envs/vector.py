@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
 from crazysim.cache import announced
-from crazysim.core.settings import as_mask, member, positive
+from crazysim.core.settings import as_mask, enum_member, positive_integer
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.random import as_seed
 from crazysim.envs.registry import make
@@ -56,7 +56,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ConfigError: If there is no such mode or world, or the environment resets automatically.
         """
-        mode = member(GymnasiumMode, "autoreset_mode", autoreset_mode)
+        mode = enum_member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
         self.sim, self.render_mode = env.sim, render_mode
         self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
@@ -234,7 +234,7 @@ def make_vector(
                 f"expected max_episode_steps or seconds, got {shown(max_episode_steps)} and "
                 f"{shown(options['seconds'])}: both are the length of an episode. Leave one out."
             )
-        options["seconds"] = positive("max_episode_steps", max_episode_steps) / positive(
+        options["seconds"] = positive_integer("max_episode_steps", max_episode_steps) / positive_integer(
             "freq", options.get("freq", 50)
         )
     env: DroneEnv = make(task, num_envs, **options)

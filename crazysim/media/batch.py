@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 from crazysim.media.view import View
 from crazysim.media.worlds import world_indices
@@ -55,6 +55,6 @@ def render_worlds(
     can_warp = camera != -1 and not len(sim.overlays) and sim.device.platform == "gpu" and batch_render.installed()
     if renderer == "warp" or (renderer == "auto" and can_warp):
         return np.asarray(sim.scene.render_worlds(sim.data, indices, camera, width, height))
-    whole = positive("height", height) * len(indices)
+    whole = positive_integer("height", height) * len(indices)
     column = View(indices.tolist(), width, whole, camera, cam_config, columns=1, border=0)
     return column.render(sim).reshape(-1, height, width, 3)

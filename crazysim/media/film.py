@@ -11,7 +11,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.core.settings import flag
+from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media.flight import Flight
 from crazysim.media.flight_recorder import Clock, put
@@ -86,7 +86,7 @@ class Film:
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
         self._ffmpeg: subprocess.Popen[bytes] | None = None
-        wanted = flag("progress", progress)
+        wanted = check_flag("progress", progress)
         self._bar = progress_bar(label="filming", required=True, total=total) if wanted else None
         self._clock = Clock()
 

@@ -12,7 +12,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from crazysim.core.functional import feedforward_of, stage_command, staged_leaves
-from crazysim.eager import to_host
+from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError
 from crazysim.media.flight import SAMPLE, SCENE, Flight, pack_sample, pack_scene
 from crazysim.media.journal import Journal
@@ -160,8 +160,8 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
     body_pos, body_quat = _bodies(sim, indices)
     return Flight(
         time=dt * np.arange(n),
-        pos=np.asarray(to_host(states.pos, (slice(None), indices)), float),
-        quat=np.asarray(to_host(states.quat, (slice(None), indices)), float),
+        pos=np.asarray(fetch_rows(states.pos, (slice(None), indices)), float),
+        quat=np.asarray(fetch_rows(states.quat, (slice(None), indices)), float),
         body_pos=np.broadcast_to(body_pos, (n, *body_pos.shape)),
         body_quat=np.broadcast_to(body_quat, (n, *body_quat.shape)),
         setpoint=np.zeros((n, len(indices), 0, 3)),

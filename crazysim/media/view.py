@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import check_settings, color, positive, setting
-from crazysim.eager import to_host
+from crazysim.core.settings import check_settings, color, positive_integer, setting
+from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError, shown
 from crazysim.media.trail import Trail, colors_of
 from crazysim.media.worlds import world_indices
@@ -77,10 +77,12 @@ class View:
             ConfigError: If a setting is invalid.
         """
         check_settings(self)
-        self.width, self.height = (positive(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height"))
+        self.width, self.height = (
+            positive_integer(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height")
+        )
         self.worlds = [self.worlds] if isinstance(self.worlds, (int, np.integer)) else list(self.worlds)
         if self.columns is not None:
-            positive("columns", self.columns)
+            positive_integer("columns", self.columns)
         if min(self.tile_size) < 1:
             raise ConfigError(
                 f"expected an image that {len(self.worlds)} worlds fit into, got {self.width} x {self.height} pixels. "
@@ -163,8 +165,8 @@ class View:
         if self.follow is not None and self.follow not in range(sim.n_drones):
             raise ConfigError(f"expected a drone from 0 to {sim.n_drones - 1} to follow, got {self.follow!r}")
         time, pos = (
-            np.asarray(to_host(sim.time, worlds)[:, 0], float),
-            np.asarray(to_host(sim.data.states.pos, worlds), float),
+            np.asarray(fetch_rows(sim.time, worlds)[:, 0], float),
+            np.asarray(fetch_rows(sim.data.states.pos, worlds), float),
         )
         if self._trail is not None:
             self._trail.add(time, pos)

@@ -19,8 +19,8 @@ from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import settings_of
-from crazysim.core.stage import Axes, Stage, at_the_start, vmap_drones, vmap_worlds
-from crazysim.eager import compiled
+from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_worlds
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.pytree import PyTree, n_batch_axes
@@ -237,7 +237,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         """
         plugins = tuple(self.values())
         if [*map(id, plugins)] != [*map(id, self._observing[0])]:
-            self._observing = plugins, compiled("measured")(functools.partial(_observations, plugins))
+            self._observing = plugins, jit_unless_traced("measured")(functools.partial(_observations, plugins))
         return self._observing[1](data, measured=measured)
 
     def measured_states(self, data: SimData) -> SimData:
@@ -297,10 +297,10 @@ def _placements(plugin: Plugin, sim: Simulation) -> object:
     placements = plugin.stages(sim)
     if not plugin.begins_episodes or not isinstance(placements, (list, tuple)):
         return placements
-    begins = Stage(plugin.begin_episode, "drone", at_the_start)
+    begins = Stage(plugin.begin_episode, "drone", is_first_step)
     before = plugin.begins_before
     if before is None:  # in front of all stages that do not begin an episode
-        before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not at_the_start)
+        before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)
     return [Placement(begins, before=before, name=_begin_name(plugin)), *placements]
 
 

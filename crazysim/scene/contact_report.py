@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
-from crazysim.core.settings import flag
+from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, distance
 from crazysim.pytree import PyTree, static
@@ -102,7 +102,7 @@ def build(
     Raises:
         ConfigError: If nothing is requested, or an object does not exist.
     """
-    floor, drones = flag("floor", floor), flag("drones", drones)
+    floor, drones = check_flag("floor", floor), check_flag("drones", drones)
     chosen = choose(model, objects, in_data=False)
     names = tuple(body.name for body in chosen)
     if not (chosen or floor or drones):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 from jax import Array
 
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import UnknownNameError
 from crazysim.scene import mjx
 
@@ -27,7 +27,7 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
     return _flags_of(contact.dist, contact.geom1, contact.geom2, is_of_body)
 
 
-@compiled()
+@jit_unless_traced()
 def _flags_of(dist: Array, geom1: Array, geom2: Array, is_of_body: Array) -> Array:
     """Return True for every slot that touches and has a geom of a body, given for each geom whether it is of it."""
     is_of_body = jnp.asarray(is_of_body)

@@ -15,7 +15,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.settings import flag
+from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import NOBODY
@@ -143,7 +143,7 @@ def build(
     """
     if along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
-    drones, hide_own = flag("drones", drones), flag("hide_own", hide_own)
+    drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
     for name, n in (("width", width), ("height", height)):
         if type(n) is not int or n < 1:
             raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")

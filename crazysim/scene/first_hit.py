@@ -16,8 +16,8 @@ from jax import Array, lax
 from jax.typing import DTypeLike
 
 from crazysim import rotation
+from crazysim.core.branches import any_lane, compute_where, table_rows
 from crazysim.core.data import SimData
-from crazysim.core.lanes import any_lane, compute_where, table_rows
 from crazysim.geometry import Shape
 from crazysim.geometry.bounds import bounding_box, bounding_radius
 from crazysim.geometry.fieldrays import PARALLEL, field_ray

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import put_on_device, shard_scene
-from crazysim.eager import to_host
+from crazysim.eager import fetch_rows
 from crazysim.scene import build, contacts, mjx
 from crazysim.scene.sync import sync_sim2mjx
 
@@ -84,7 +84,7 @@ class MjxScene:
             pos, quat, qpos = self._data.mocap_pos, self._data.mocap_quat, self._data.qpos
             if worlds is None:
                 return pos, quat, qpos
-            return to_host(pos, worlds), to_host(quat, worlds), to_host(qpos, worlds)
+            return fetch_rows(pos, worlds), fetch_rows(quat, worlds), fetch_rows(qpos, worlds)
         if self._rest is None:
             rest = mujoco.MjData(self._mj_model)
             each = (rest.mocap_pos, rest.mocap_quat, self._mj_model.qpos0)

@@ -15,8 +15,8 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import Objects, SimData
-from crazysim.core.settings import as_mask, flag, positive
-from crazysim.eager import compiled
+from crazysim.core.settings import as_mask, check_flag, positive_integer
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
@@ -113,7 +113,7 @@ class Handle:
         return _moved(old, value, mask, self.rows, what == "quat")
 
 
-@compiled("numbers", "is_quat")
+@jit_unless_traced("numbers", "is_quat")
 def _moved(old: Array, value: Array | NDArray, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
     """Return positions, attitudes or velocities of all objects with some rows replaced; attitudes are normalised."""
     n, size = len(numbers), old.shape[-1]
@@ -132,7 +132,7 @@ def _moved(old: Array, value: Array | NDArray, mask: Array | None, numbers: tupl
     return select_worlds(mask, new, old)
 
 
-@compiled("numbers")
+@jit_unless_traced("numbers")
 def _rows(old: Array, numbers: tuple[int, ...]) -> Array:
     """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
     return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
@@ -198,14 +198,14 @@ class SceneObjects:
     ) -> Handle:
         """Add bodies to a spec, and return their handle; see ``Scene.add``."""
         name = _default_name(what) if name is None else name
-        numbers = tuple(range(positive("count", count, MAX_OBJECTS)))
+        numbers = tuple(range(positive_integer("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
         taken = sorted({body.name for body in spec.bodies} & {name, *names})
         if taken or name == "drone":
             raise ConfigError(
                 f"expected a new name, got {(taken or ['drone:0'])[0]!r}, a body of the scene. Pass name=."
             )
-        n_worlds = self._n_worlds if flag("mocap", mocap) else None
+        n_worlds = self._n_worlds if check_flag("mocap", mocap) else None
         poses = [
             np.broadcast_to(np.asarray(as_poses(x, what, count, size, n_worlds)), (n_worlds or 1, count, size))
             for x, what, size in ((pos, "pos", 3), (quat, "quat", 4))

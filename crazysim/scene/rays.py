@@ -17,7 +17,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.engine.backends import fused
 from crazysim.engine.errors import report_unsupported
-from crazysim.engine.mapped import mapped
+from crazysim.engine.index_map import map_indices
 from crazysim.errors import UnsupportedError
 from crazysim.geometry import Shape, ray_distance
 from crazysim.geometry.points import components
@@ -330,22 +330,22 @@ class RayKernels:
             mesh: Devices over which its worlds are spread instead; None for one.
             strict: True to raise an error where XLA would be used with an ``EngineWarning``.
         """
-        has_kernels = mesh is None and engine in ("auto", "fused") and not fused.missing(device.platform)
+        has_kernels = mesh is None and engine in ("auto", "fused") and not fused.unavailable_reason(device.platform)
         return cls(device.platform if has_kernels else None, strict)
 
     def run(self, fn: Callable[..., Any], n: int, tables: Sequence[Array], targets: Targets) -> list[Array]:
-        """Return the results of a function of one ray for ``n`` rays; see ``mapped``."""
+        """Return the results of a function of one ray for ``n`` rays; see ``map_indices``."""
         where = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in a list"
         if self.platform is not None:
             try:
-                found = mapped(fn, n, tables, self.platform)
+                found = map_indices(fn, n, tables, self.platform)
                 self.used = f"one kernel with a lane for each ray; {where}"
                 return found
             except UnsupportedError as error:
                 problem, remedy = f"rays have no kernel: {error.reason}", "Leave out the geoms that need it"
                 report_unsupported([problem], self.strict, self.reported, remedy)
         self.used = f"XLA, without a kernel; {where}"
-        return mapped(fn, n, tables, None)
+        return map_indices(fn, n, tables, None)
 
 
 @jax.custom_jvp

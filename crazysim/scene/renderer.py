@@ -9,7 +9,7 @@ import mujoco
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.scene.batch_render import BatchRenderer
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import Viewer
@@ -69,7 +69,7 @@ class SceneRenderer:
 
     @max_visual_geom.setter
     def max_visual_geom(self, limit: int) -> None:
-        self.overlays.limit = positive("max_visual_geom", limit)
+        self.overlays.limit = positive_integer("max_visual_geom", limit)
         self.close()
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.data import SimData
-from crazysim.eager import compiled, to_host
+from crazysim.eager import fetch_rows, jit_unless_traced
 from crazysim.scene import mjx
 from crazysim.scene.kinematics import ONLY_DUMMY, kinematics
 
@@ -60,7 +60,7 @@ def _poses(data: SimData) -> list[tuple[Array, Array, Array]]:
     return owned
 
 
-@compiled()
+@jit_unless_traced()
 def _without_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
     """Return poses of objects without the axis of drones. (n_worlds, n, k)"""
     return pos[:, 0], quat[:, 0]
@@ -81,7 +81,7 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     )
 
 
-@compiled()
+@jit_unless_traced()
 def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
@@ -116,9 +116,9 @@ def sync_one_world(
     """
     mj_data.mocap_pos[:], mj_data.mocap_quat[:], mj_data.qpos[:] = poses
     states, objects = data.states, data.objects
-    owned = [(data.core.drone_mocap_ids, to_host(states.pos, world), to_host(states.quat, world))]
+    owned = [(data.core.drone_mocap_ids, fetch_rows(states.pos, world), fetch_rows(states.quat, world))]
     if objects is not None:
-        owned.append((objects.mocap_ids, to_host(objects.pos, world)[0], to_host(objects.quat, world)[0]))
+        owned.append((objects.mocap_ids, fetch_rows(objects.pos, world)[0], fetch_rows(objects.quat, world)[0]))
     for ids, pos, quat in owned:
         mj_data.mocap_pos[np.asarray(ids)] = pos
         mj_data.mocap_quat[np.asarray(ids)] = np.roll(quat, 1, axis=-1)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from operator import is_
 from typing import Any, Generic, TypeVar
 
-from crazysim.core.pipeline import Pipeline, checked
+from crazysim.core.pipeline import Pipeline, check_pipeline
 
 F = TypeVar("F")
 
@@ -37,7 +37,7 @@ class BuiltPipeline(Generic[F]):
 
     @stages.setter
     def stages(self, stages: Pipeline) -> None:
-        self._stages = checked(self._name, stages)
+        self._stages = check_pipeline(self._name, stages)
 
     def fn(self) -> F:
         """Return the function of the pipeline as it is now. It is called in every step: 0.3 us without an edit."""

@@ -19,15 +19,15 @@ from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import (
+    check_flag,
     check_rates,
     check_settings,
     control_freqs,
     controller_at_rates,
+    enum_member,
     find_device,
-    flag,
-    member,
     physics_freq,
-    positive,
+    positive_integer,
 )
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
@@ -118,10 +118,14 @@ class Configuration:
         Raises:
             ValueError: For an argument that is invalid or contradicts another, with what was expected.
         """
-        n_worlds, n_drones, freq = positive("n_worlds", n_worlds), positive("n_drones", n_drones), physics_freq(freq)
+        n_worlds, n_drones, freq = (
+            positive_integer("n_worlds", n_worlds),
+            positive_integer("n_drones", n_drones),
+            physics_freq(freq),
+        )
         n_drones = len(drone) if n_drones == 1 and is_list(drone) and len(drone) else n_drones
-        dynamics, control = member(Dynamics, "dynamics", dynamics), member(Control, "control", control)
-        integrator = member(Integrator, "integrator", integrator)
+        dynamics, control = enum_member(Dynamics, "dynamics", dynamics), enum_member(Control, "control", control)
+        integrator = enum_member(Integrator, "integrator", integrator)
         require_pair(dynamics, control)
         airframes = load_airframes(drone, n_drones)
         for airframe in dict.fromkeys(airframes):
@@ -138,7 +142,7 @@ class Configuration:
             require_freq(airframe, dynamics, freq)  # after the rates, which need a higher freq
         return Configuration(
             n_worlds, n_drones, airframes, dynamics, control, integrator, freq, freqs, controller, find_device(device),
-            mesh, engine, flag("strict", strict),
+            mesh, engine, check_flag("strict", strict),
         )  # fmt: skip
 
 

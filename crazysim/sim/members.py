@@ -19,7 +19,7 @@ from crazysim.core.data import command_shape
 from crazysim.core.locking import locked
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
-from crazysim.eager import compiled, on_host
+from crazysim.eager import is_on_host, jit_unless_traced
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.registry import PluginRegistry
 from crazysim.pytree import PyTree
@@ -142,26 +142,26 @@ def _row(x: Array | NDArray, index: int) -> Any:
     """Return the row of one drone or member. (n_worlds, ...)"""
     if isinstance(x, np.ndarray):
         return x[:, index]
-    if on_host(x) and not jaxcompat.is_key(x):
+    if is_on_host(x) and not jaxcompat.is_key(x):
         return jaxcompat.put_host_array(np.asarray(x)[:, index].copy(), x.sharding)
     return _row_on_device(x, index)
 
 
 def _with_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
     """Return rows with that of one drone or member replaced, on the host if all are there. (n_worlds, n, ...)"""
-    if on_host(x) and not isinstance(value, jax.Array):
+    if is_on_host(x) and not isinstance(value, jax.Array):
         rows = np.array(x)
         rows[:, index] = value
         return rows
     return _with_row_on_device(x, index, value)
 
 
-@compiled()
+@jit_unless_traced()
 def _row_on_device(x: Array, index: Array | int) -> Array:
     return x[:, index]
 
 
-@compiled()
+@jit_unless_traced()
 def _with_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Array:
     return x.at[:, index].set(value)
 

@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.control import Control, Setpoint
 from crazysim.core.data import SimData, SimState
 from crazysim.core.functional import stage_command
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.core.stage import Stage
 from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.parameter_tables import rotor_vel_limits
@@ -140,14 +140,14 @@ class MPPI:
                 f"expected a simulation with control as one of {', '.join(map(repr, map(str, LEVELS)))}, got "
                 f"{c.control.value!r}. Use Sim(control='attitude')."
             )
-        self.horizon, self.samples = positive("horizon", horizon), positive("samples", samples)
-        self.substeps, self.knots = positive("substeps", substeps), positive("knots", knots)
+        self.horizon, self.samples = positive_integer("horizon", horizon), positive_integer("samples", samples)
+        self.substeps, self.knots = positive_integer("substeps", substeps), positive_integer("knots", knots)
         if not 2 <= self.knots <= MAX_KNOTS or self.horizon < 2:
             raise ConfigError(f"expected 2 to {MAX_KNOTS} knots and a horizon from 2 on, got {knots} and {horizon}")
         if not 0 < temperature < np.inf:
             raise ConfigError(f"expected a positive, finite temperature, got {temperature!r}. Use 0.05.")
         self.temperature, self.cost, self._key = temperature, cost, jax.random.key(seed)
-        freq = c.freq if freq is None else positive("freq", freq)
+        freq = c.freq if freq is None else positive_integer("freq", freq)
         self._sim = Sim(
             sim.n_worlds * self.samples, sim.n_drones, c.airframes, c.dynamics, c.control, c.integrator, freq,
             device=c.device, engine=c.engine, controller=c.controller or "auto",

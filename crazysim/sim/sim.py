@@ -25,7 +25,7 @@ from crazysim.core.locking import locked
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.random import seed_sim
-from crazysim.core.settings import flag, positive
+from crazysim.core.settings import check_flag, positive_integer
 from crazysim.core.sharding import shard
 from crazysim.core.stages import build_step_pipeline, clip_floor_pos, increment_steps, reset
 from crazysim.drones import Airframe, Drone
@@ -494,7 +494,7 @@ class Sim:
             ConfigError: If it is not a positive integer, or a world would have taken more than
                 ``crazysim.core.data.MAX_STEPS`` since its last reset.
         """
-        n_steps = positive("n_steps", n_steps)
+        n_steps = positive_integer("n_steps", n_steps)
         self._adopt_scene()
         self.plugins.check()
         self._steps.fn()
@@ -531,9 +531,9 @@ class Sim:
             ValueError: If a number is invalid, or the policy returns a command of another shape.
         """
         n_substeps = self.freq // self.control_freq
-        self._stepper.count(n_substeps, positive("n_control_steps", n_control_steps))
+        self._stepper.count(n_substeps, positive_integer("n_control_steps", n_control_steps))
         data, kept = run_rollout(
-            self.step_fn, self.data, policy, params, n_control_steps, flag("progress", progress), every,
+            self.step_fn, self.data, policy, params, n_control_steps, check_flag("progress", progress), every,
             n_substeps=n_substeps, keep=keep,
         )  # fmt: skip
         self._stepper.accept(data)
@@ -547,7 +547,7 @@ class Sim:
         Args:
             measure: True to measure the cost of stages that are not fused, which compiles a second step.
         """
-        step, rays = explain(self.step_fn, self.data, flag("measure", measure)), self._scene.ray_kernels.used
+        step, rays = explain(self.step_fn, self.data, check_flag("measure", measure)), self._scene.ray_kernels.used
         return f"{step}\nrays: {rays}" if rays else step
 
     @locked
@@ -759,5 +759,5 @@ def use_box_collision(sim: Sim, enable: bool = True) -> None:
 
     Boxes follow the drone's outline more closely and cost more to check.
     """
-    use_boxes(sim.spec, sim.n_drones, flag("enable", enable))
+    use_boxes(sim.spec, sim.n_drones, check_flag("enable", enable))
     sim.build_mjx()

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.core.settings import as_rgba, flag
+from crazysim.core.settings import as_rgba, check_flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.overlays import RED
 from crazysim.sim.sim import Sim
@@ -69,7 +69,7 @@ def draw_capsule(
     first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
     if first.shape != (3,) or last.shape != (3,):
         raise ValueError(f"expected ends of shape (3,), got {first.shape} and {last.shape}")
-    sim.overlays.capsule(first, last, radius, RED if rgba is None else rgba, flag("cylinder", cylinder))
+    sim.overlays.capsule(first, last, radius, RED if rgba is None else rgba, check_flag("cylinder", cylinder))
 
 
 def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from crazysim.core.data import as_key
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.references import absolute, is_reference, reference_of, split
@@ -128,7 +128,7 @@ class TrainConfig:
         config = dataclasses.asdict(self.algorithm_config())
         values = {
             "seed": int(self.seed),
-            "n_worlds": positive("n_worlds", self.n_worlds),
+            "n_worlds": positive_integer("n_worlds", self.n_worlds),
             "config": config | {"hidden": list(config["hidden"])},
         }
         for name, value in values.items():

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 
 FRACTIONS = ("discount", "gae_lambda")
@@ -30,7 +30,7 @@ def check_hyperparameters(config: Any) -> None:
         if isinstance(default, tuple):
             value = _sizes(field.name, value)
         elif isinstance(default, int):
-            value = positive(field.name, value)
+            value = positive_integer(field.name, value)
         else:
             value = _number(field.name, value, default)
         object.__setattr__(config, field.name, value)
@@ -41,7 +41,7 @@ def _sizes(name: str, value: object) -> tuple[int, ...]:
         raise ConfigError(
             f"expected {name} as the sizes of the hidden layers, got {value!r}. Use for example [64, 64]."
         )
-    return tuple(positive(f"{name}[{i}]", size) for i, size in enumerate(value))
+    return tuple(positive_integer(f"{name}[{i}]", size) for i, size in enumerate(value))
 
 
 def _number(name: str, value: Any, default: Any) -> float:

@@ -20,7 +20,7 @@ from jax import Array
 
 import crazysim
 from crazysim.cache import announced, keep_programs
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
 from crazysim.envs.references import code_digest, is_reference, split
@@ -95,7 +95,7 @@ def train(
     folder = Path(folder)
     path = folder / CHECKPOINT
     started = time.perf_counter()
-    evaluation_worlds = positive("evaluation_worlds", evaluation_worlds)
+    evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
     meta = _meta(config)
     stored, curve, code = _stored(path, config) if resume else ({}, [], meta["code"])
     check_key = jax.random.key(CHECK)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import grid_2d
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 from crazysim.trajectories.shapes import as_positive, as_vector
 
@@ -28,7 +28,7 @@ def line(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    x = as_positive("spacing", spacing) * (np.arange(positive("n", n)) - (n - 1) / 2)
+    x = as_positive("spacing", spacing) * (np.arange(positive_integer("n", n)) - (n - 1) / 2)
     return _placed(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
 
 
@@ -44,7 +44,7 @@ def grid(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    return _placed(grid_2d(positive("n", n), as_positive("spacing", spacing)), center, yaw)
+    return _placed(grid_2d(positive_integer("n", n), as_positive("spacing", spacing)), center, yaw)
 
 
 def circle(
@@ -68,7 +68,7 @@ def circle(
     """
     if spacing is not None and radius is not None:
         raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")
-    angle = 2 * math.pi * np.arange(positive("n", n)) / n
+    angle = 2 * math.pi * np.arange(positive_integer("n", n)) / n
     if radius is None:
         side = as_positive("spacing", 1.0 if spacing is None else spacing)
         radius = side / (2 * math.sin(math.pi / n)) if n > 1 else 0.0

@@ -14,7 +14,7 @@ from jax import Array, lax
 from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError, shown
 from crazysim.pytree import PyTree, floating, leaf
 from crazysim.trajectories.interpolation import unit_coefficients
@@ -93,7 +93,7 @@ class Trajectory(PyTree):
         """Time from the start to the end, s. (...)"""
         return self.ends[..., -1]
 
-    @compiled()
+    @jit_unless_traced()
     def evaluate(self, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one trajectory at one time, with derivatives up to snap.
 

@@ -8,7 +8,7 @@ from cases import by_stages, with_states
 
 import crazysim as cs
 from crazysim import ConfigError, Sim, load_airframe
-from crazysim.core.airframes import for_drones
+from crazysim.core.airframes import create_per_drone
 from crazysim.dynamics import first_principles
 from crazysim.errors import UnknownNameError
 from crazysim.pytree import check_axes
@@ -261,7 +261,7 @@ def test_wrong_lists_are_refused(n_drones, fleet, error, message):
 def test_airframes_that_lack_gains_are_named():
     with pytest.raises(ConfigError, match=r"airframe 'bumblebee' lacks \[mellinger\] mass, mass_thrust, kp, "):
         Sim(drone=FLEET, control="state", controller="mellinger")
-    lacking = for_drones
+    lacking = create_per_drone
     records = {"cf21B_500": first_principles.Params.create(load_airframe("cf21B_500"))}
     records["bumblebee"] = records["cf21B_500"].replace(L=None)
     with pytest.raises(ConfigError, match="the same numbers for Params, got 'cf21B_500' and 'bumblebee'"):

@@ -35,7 +35,7 @@ from crazysim import (
 from crazysim.core.integration import INTEGRATORS, Integration
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.plugin import FunctionPlugin
-from crazysim.core.stage import at_the_start
+from crazysim.core.stage import is_first_step
 from crazysim.core.stages import first_principles_derivative
 from crazysim.engine import Step
 from crazysim.errors import UnknownNameError
@@ -381,7 +381,7 @@ def test_all_parts_of_the_package_begin_episodes_by_one_method():
     sim.add(ESKF([imu, sim.plugins["motion_capture"]], False))
     sim.add(Complementary([imu, sim.add(Barometer())], False))
     sim.add(WindField(Grid(np.zeros((2, 2, 2, 3))), spread=(1.0, 1.0, 1.0)))
-    begin = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is at_the_start}
+    begin = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is is_first_step}
     names = ("imu", "motion_capture", "kalman", "eskf", "complementary", "barometer", "wind_field")
     assert begin == {f"{name}_begin": sim.plugins[name].begin_episode for name in names}
     assert [*sim.reset_pipeline] == ["reset", "wind_field"], "the others begin at the state that they measure"

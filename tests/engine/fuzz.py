@@ -215,7 +215,7 @@ class Fuzzer:
             device: Platform that runs the programs, ``"cpu"`` or ``"gpu"``.
         """
         self.platform = device
-        self.engines = tuple(e for e in engines if e != "fused" or fused.missing(device) is None)
+        self.engines = tuple(e for e in engines if e != "fused" or fused.unavailable_reason(device) is None)
         self.rng = np.random.default_rng(seed)
         sim = Sim(n_worlds=N_WORLDS, n_drones=N_DRONES, control="rotor_vel", device=device)
         self.device, self.data = sim.device, sim.data

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from crazysim.core.lanes import any_lane, compute_where
+from crazysim.core.branches import any_lane, compute_where
 from crazysim.pytree import PyTree, leaf
 
 N_WORLDS, N_DRONES = 7, 3  # 21 lanes: not a multiple of any vector's or block's length

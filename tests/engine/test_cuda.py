@@ -45,16 +45,18 @@ def test_an_architecture_is_that_of_the_device():
 
 def test_kernels_for_several_gpus_run_on_the_oldest():
     """Code for an architecture runs on all later ones, and 10.0 is later than 9.0."""
-    assert cuda.weakest([NEW, OLD]) is OLD
-    assert cuda.weakest([NEW]) is NEW
-    assert cuda.weakest([Gpu("10.0"), NEW]) is NEW
-    assert cuda.weakest([]) is None
-    assert cuda.weakest([Gpu("0", platform="cpu")]) is None
+    assert cuda.weakest_device([NEW, OLD]) is OLD
+    assert cuda.weakest_device([NEW]) is NEW
+    assert cuda.weakest_device([Gpu("10.0"), NEW]) is NEW
+    assert cuda.weakest_device([]) is None
+    assert cuda.weakest_device([Gpu("0", platform="cpu")]) is None
 
 
 def test_each_architecture_has_its_own_code(source):
     """The key of what is kept holds the architecture."""
-    texts = [cuda.ptx(source, cuda.architecture(cuda.weakest(gpus))) for gpus in ([NEW], [OLD], [NEW, OLD], [NEW])]
+    texts = [
+        cuda.ptx(source, cuda.architecture(cuda.weakest_device(gpus))) for gpus in ([NEW], [OLD], [NEW, OLD], [NEW])
+    ]
     targets = [re.search(r"^\.target (\w+)", text, re.MULTILINE)[1] for text in texts]
     assert targets == ["sm_90", "sm_86", "sm_86", "sm_90"]
 

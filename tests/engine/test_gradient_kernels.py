@@ -14,8 +14,8 @@ from crazysim.engine.backends import cuda, kernel, native, reverse, xla
 from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.ir.verify import verify, verify_block
 from crazysim.engine.lowering.jaxprs import lower_function
-from crazysim.engine.lowering.tangents import block_with_tangents, with_tangents
-from crazysim.engine.lowering.transpose import transposed
+from crazysim.engine.lowering.tangents import add_block_tangents, add_tangents
+from crazysim.engine.lowering.transpose import transpose_block
 from crazysim.errors import EngineWarning
 
 COMMAND = np.array([0.05, -0.08, 0.1, 1.02 * 0.0434 * 9.81])
@@ -76,7 +76,7 @@ def test_a_block_with_tangents_is_what_jax_makes_of_the_function(fn, x64):
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, dx, dy = map(jnp.asarray, np.random.default_rng(1).normal(size=(4, 16)))
     for some, way in (((0, 1), (dx, dy)), ((1,), (jnp.zeros(16), dy))):
-        made = block_with_tangents(block, [block.inputs[k] for k in some])
+        made = add_block_tangents(block, [block.inputs[k] for k in some])
         verify_block(made)
         found = xla.run(made, [x, y, *(way[k] for k in some)], (16,))
         for a, b in zip(found, jax.jvp(jax.vmap(fn), (x, y), way), strict=True):
@@ -89,7 +89,7 @@ def test_a_transposed_block_is_what_jax_makes_of_the_function(name, x64):
     block = lower_function(fn, *[jax.ShapeDtypeStruct((), jnp.float64)] * 2)
     x, y, ct = np.random.default_rng(1).normal(size=(3, 16))
     _, pull = jax.vjp(jax.vmap(fn), jnp.asarray(x), jnp.asarray(y))
-    found = xla.run(transposed(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
+    found = xla.run(transpose_block(block, block.inputs), [jnp.asarray(v) for v in (x, y, ct)], (16,))
     for a, b in zip(found, pull(jnp.asarray(ct)), strict=True):
         np.testing.assert_allclose(np.broadcast_to(a, 16), b, rtol=1e-13, atol=1e-14)
 
@@ -201,11 +201,11 @@ def test_the_derivatives_of_every_pipeline_compile_for_a_gpu(dynamics, control):
         pytest.skip("no NVRTC here; CI has it")
     sim = shared_sim(n_worlds=2, n_drones=3, dynamics=dynamics, control=control)
     program = Step(sim.step_pipeline, "fused", "gpu").plan(sim.data).program
-    back = reverse.reverse(program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"])
+    back = reverse.reverse_program(program, [i for i, leaf in enumerate(program.leaves) if leaf.scope == "drone"])
     text = cuda.ptx(reverse.write(back, "cuda"), cuda.DEFAULT_ARCHITECTURE)
     stored = sum(program.leaves[i].size for i in back.perturbed) + len(back.carried)
     assert text.count("st.global") >= stored
-    ahead = with_tangents(program, back.perturbed)
+    ahead = add_tangents(program, back.perturbed)
     verify(ahead)
     assert all(ahead.leaves[i].name.startswith("tangent of ") for i in ahead.written)
     assert "st.global" in cuda.ptx(kernel.write(ahead, "cuda"), cuda.DEFAULT_ARCHITECTURE)

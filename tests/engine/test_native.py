@@ -291,8 +291,8 @@ def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place
 
 def test_without_any_compiler_one_line_names_the_remedy(monkeypatch, capsys):
     monkeypatch.setattr(native, "compiler", lambda: None)
-    fused._announce_missing.cache_clear()
-    assert fused.missing("cpu") == fused.missing("cpu") == native.MISSING_COMPILER
+    fused._announce_missing_compiler.cache_clear()
+    assert fused.unavailable_reason("cpu") == fused.unavailable_reason("cpu") == native.MISSING_COMPILER
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert "pip install 'crazysim[compiler]'" in told

@@ -19,7 +19,7 @@ from crazysim.envs.wrappers import AutoReset, Wrapper
 from crazysim.errors import ConfigError, EngineWarning
 from crazysim.pytree import CORE_NDIM_KEY, PyTree, leaf
 
-pytestmark = pytest.mark.skipif(fused.missing("cpu") is not None, reason="there is no C++ compiler")
+pytestmark = pytest.mark.skipif(fused.unavailable_reason("cpu") is not None, reason="there is no C++ compiler")
 N = 6
 
 

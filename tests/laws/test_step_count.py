@@ -64,7 +64,7 @@ def test_an_environment_that_never_resets_ends_where_its_count_wraps(engine):
     state = env.reset(jax.random.key(0))
     state = state.replace(data=counted(state.data, [MAX_STEPS - 5, MAX_STEPS - 10, 0]))
     after = jax.jit(env.step)(state, jnp.zeros_like(state.action))
-    is_fused = engine == "auto" and fused.missing("cpu") is None
+    is_fused = engine == "auto" and fused.unavailable_reason("cpu") is None
     assert env.explain().startswith("engine: fused\n") == is_fused
     np.testing.assert_array_equal(after.info["nonfinite"], [True, False, False])
     np.testing.assert_array_equal(after.terminated, [True, False, False])

@@ -68,7 +68,7 @@ class Resources:
     """Size of the compiled kernel, bytes."""
 
 
-def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Launch:
+def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Launch:
     """Compile a kernel for some GPUs, and return the function that launches it.
 
     Args:
@@ -78,9 +78,9 @@ def compiled(kernel: Kernel, devices: Sequence[jax.Device] | None = None) -> Lau
     Raises:
         KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
-    device = weakest(devices)
-    few = kernel if device is None else fitted(kernel, device)
-    many = few if device is None else widened(few, device)
+    device = weakest_device(devices)
+    few = kernel if device is None else fit_registers(kernel, device)
+    many = few if device is None else widen_blocks(few, device)
     ptx(few, architecture(device))  # raises here what it would raise at the first launch
 
     def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
@@ -122,7 +122,7 @@ def _with_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.nd
     return n_blocks, np.asarray([n_steps, here], np.int32), [jax.ShapeDtypeStruct((n_blocks, size // 4), np.uint32)]
 
 
-def weakest(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
+def weakest_device(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
     """Return the GPU of the lowest compute capability, whose code runs on all; None without a GPU.
 
     Args:
@@ -143,7 +143,7 @@ def architecture(device: jax.Device | None) -> str:
 
 
 @functools.cache
-def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
+def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
     """Return a kernel with as many blocks at once on a multiprocessor as its registers allow without spilling.
 
     More blocks hide more latency, until registers that no longer fit cost more than that.
@@ -158,7 +158,7 @@ def fitted(kernel: Kernel, device: jax.Device) -> Kernel:
     return next(suitable, kernel)
 
 
-def widened(kernel: Kernel, device: jax.Device) -> Kernel:
+def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
     """Return a kernel for many lanes: with larger blocks if its code exceeds the instruction cache.
 
     Kernels of gradients, of large worlds, and with few registers for each thread stay as they are.
@@ -178,7 +178,7 @@ def ptx(kernel: Kernel, arch: str) -> str:
     Raises:
         KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
-    if dump.enabled():
+    if dump.is_enabled():
         dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(NVRTC_OPTIONS)}\n{kernel.text}")
     return _compile(kernel.text, arch, "PTX").decode()
 

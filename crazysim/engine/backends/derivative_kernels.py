@@ -17,11 +17,11 @@ from crazysim.core.sharding import Location
 from crazysim.engine.backends import Run, kernel, lanes, reverse
 from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.native import Launch
-from crazysim.engine.backends.platforms import TARGETS, compiled, described
+from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel
 from crazysim.engine.backends.reverse import Reverse
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.program import Program
-from crazysim.engine.lowering.tangents import with_tangents
+from crazysim.engine.lowering.tangents import add_tangents
 from crazysim.errors import EngineWarning, warn
 
 Leaves = dict[int, Any]
@@ -57,7 +57,7 @@ class DerivativeKernels:
         It takes all leaves, tangents by leaf, the number of steps, the number of batches, and shapes and types of the
         tangents after the steps, which it returns.
         """
-        found = self._compiled("jvp", with_tangents, kernel.write, changing, platform)
+        found = self._compiled("jvp", add_tangents, kernel.write, changing, platform)
         return None if found is None else partial(_forward, self, *found)
 
     def reverse(self, changing: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
@@ -66,7 +66,7 @@ class DerivativeKernels:
         It takes all leaves, cotangents of the floats that are written, the number of steps and the number of batches,
         and returns cotangents by leaf, of a leaf that drones share one for each batch.
         """
-        found = self._compiled("gradient", reverse.reverse, reverse.write, changing, platform)
+        found = self._compiled("gradient", reverse.reverse_program, reverse.write, changing, platform)
         return None if found is None else partial(_reverse, self, *found)
 
     def _compiled(
@@ -89,8 +89,8 @@ class DerivativeKernels:
                 source = write(made, TARGETS[platform])
                 location = self.location if platform == self.location.platform else Location(platform)
                 with announced("compiling a derivative of the steps", "2 to 10 s"):
-                    self._launches[place] = compiled(source, location)
-                self.used[f"{kind}: one kernel, {described(source, platform, location.devices)}"] = None
+                    self._launches[place] = compile_kernel(source, location)
+                self.used[f"{kind}: one kernel, {describe_kernel(source, platform, location.devices)}"] = None
         except UnsupportedError as error:
             announce("compiling a derivative of the steps on lanes", "10 to 40 s")
             self.used[f"{kind}: on lanes ({error})"] = None
@@ -128,7 +128,7 @@ def _forward(
         )
 
     every = [*values, *(of_worlds(i, tangents[i]) if i in tangents else None for i in range(n))]
-    inputs = _inputs(every, kernel.needed(program))
+    inputs = _inputs(every, kernel.needed_leaves(program))
     outputs = [lanes.shape_of(program, i, n_worlds) for i in program.written]
     found = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
     by_leaf = dict(zip(program.written, found, strict=True))
@@ -152,7 +152,7 @@ def _reverse(
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
         return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
 
-    inputs = [*_inputs(values, reverse.needed(going_back)), *map(seed, own.floats)]
+    inputs = [*_inputs(values, reverse.needed_leaves(going_back)), *map(seed, own.floats)]
     leaves = [program.leaves[i] for i in going_back.perturbed]
     outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number) for x in leaves]
     found = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)

@@ -25,7 +25,7 @@ CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """A ``Run`` whose number of steps is an array."""
 
 
-def differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels | None = None) -> Run:
+def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels | None = None) -> Run:
     """Return a function that runs a program, with its derivatives.
 
     Args:
@@ -256,6 +256,10 @@ def _shapes(*args: Any, **params: Any) -> list[Any]:
 
 
 advance_p = jaxcompat.primitive_by_platform(
-    "crazysim_advance", _shapes, {"": _advanced}, derivative=_advanced_on_lanes, batched=jaxcompat.batched_as(_advanced)
+    "crazysim_advance",
+    _shapes,
+    {"": _advanced},
+    derivative=_advanced_on_lanes,
+    batched=jaxcompat.vmap_rule_of(_advanced),
 )
 """Steps of a kernel inside a derivative, whose own derivative is that of the program on lanes."""

@@ -84,7 +84,7 @@ def _epilogue(target: str) -> str:
     return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()
 
 
-def framed(
+def make_kernel(
     target: str,
     pointers: Sequence[str],
     shared: Sequence[str],

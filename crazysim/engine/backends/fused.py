@@ -22,9 +22,9 @@ from crazysim.core.sharding import Location
 from crazysim.core.stage import PHASES, Phase, replace_leaves
 from crazysim.engine.backends import Run, cuda, kernel, lanes, native
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
-from crazysim.engine.backends.derivatives import CountedRun, differentiable
+from crazysim.engine.backends.derivatives import CountedRun, make_differentiable
 from crazysim.engine.backends.native import Launch
-from crazysim.engine.backends.platforms import TARGETS, compiled, described
+from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.engine.passes.layout import rows_of
@@ -46,7 +46,7 @@ class Kernels:
             KernelError: If the compiler refuses the kernel or takes too long.
         """
         self.program = program
-        self.inputs, self.outputs = kernel.needed(program), tuple(program.written)
+        self.inputs, self.outputs = kernel.needed_leaves(program), tuple(program.written)
         self._launches = {location.platform: self._compiled(location)}
 
     def on(self, platform: str) -> Launch:
@@ -66,7 +66,7 @@ class Kernels:
         return self._launches[platform]
 
     def _compiled(self, location: Location) -> Launch:
-        return compiled(kernel.write(self.program, TARGETS[location.platform]), location)
+        return compile_kernel(kernel.write(self.program, TARGETS[location.platform]), location)
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
         """Return shapes and types of what the kernel writes: leaves, and flags of drones if it checks."""
@@ -90,7 +90,7 @@ launch_p = jaxcompat.primitive_by_platform(
 """Call of a kernel: number of steps and its inputs, to what it writes."""
 
 
-def missing(platform: str) -> str | None:
+def unavailable_reason(platform: str) -> str | None:
     """Return the reason why kernels cannot run on a platform, or None."""
     if platform == "gpu":
         return (
@@ -100,14 +100,14 @@ def missing(platform: str) -> str | None:
         return f"there are no kernels for {platform}"
     if native.compiler():
         return None
-    _announce_missing()
+    _announce_missing_compiler()
     return native.MISSING_COMPILER
 
 
 @functools.cache
-def _announce_missing() -> None:
+def _announce_missing_compiler() -> None:
     """Print, once, that simulations on the CPU are slow, and the remedy."""
-    print(f"simulations run on XLA, up to ten times slower: {native.MISSING}", file=sys.stderr)
+    print(f"simulations run on XLA, up to ten times slower: {native.MISSING_COMPILER}", file=sys.stderr)
 
 
 class FusedRun:
@@ -138,10 +138,12 @@ def build(program: Program, location: Location, in_leaves: Program | None = None
     kernels = Kernels(program, location) if program.fused else None
     run = _split(program, location) if kernels is None else _one_kernel(kernels)
     if in_leaves is not None:
-        return FusedRun(differentiable(_over_batches(program, run), _on_leaves(program, in_leaves, location)), kernels)
+        return FusedRun(
+            make_differentiable(_over_batches(program, run), _on_leaves(program, in_leaves, location)), kernels
+        )
     on_lanes = lanes.build(program, location)
     derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, on_lanes)
-    return FusedRun(differentiable(_over_batches(program, run), on_lanes, derivatives), kernels)
+    return FusedRun(make_differentiable(_over_batches(program, run), on_lanes, derivatives), kernels)
 
 
 DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
@@ -151,7 +153,7 @@ DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weak
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
     """Return the compiler of the kernels of a program, or on a GPU the registers that each takes, in lines."""
     sources = [kernel.write(part, TARGETS[platform]) for part in _parts(program) if part.fused]
-    return [f"kernel: {described(source, platform, devices)}" for source in sources]
+    return [f"kernel: {describe_kernel(source, platform, devices)}" for source in sources]
 
 
 def describe_derivatives(program: Program) -> list[str]:
@@ -254,7 +256,7 @@ def _split(program: Program, location: Location) -> CountedRun:
 
             start = leaves
             leaves = replace_leaves(start, in_loop, jax.lax.fori_loop(0, count, body, [start[i] for i in in_loop]))
-        flagged = lanes.nonfinite(program, lanes.LeafValues(program, leaves))
+        flagged = lanes.nonfinite_worlds(program, lanes.LeafValues(program, leaves))
         leaves = after("after", leaves, once)
         return [leaves[i] for i in program.written], flagged
 

@@ -260,7 +260,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
 
     def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
         arrays = replace_leaves([None] * len(leaves), given, [np.asarray(x) for x in values])
-        with subnormals.flushed() if on_cpu else contextlib.nullcontext():
+        with subnormals.flush_subnormals() if on_cpu else contextlib.nullcontext():
             return _steps(program, arrays, int(n_steps))
 
     values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
@@ -277,6 +277,6 @@ def _steps(program: Program, leaves: list[Any], n_steps: int) -> tuple[list[np.n
     constants = lanes.prepare(program, now)
     for _ in range(n_steps):
         lanes.run(program, now, "each", constants)
-    flagged = lanes.nonfinite(program, now)
+    flagged = lanes.nonfinite_worlds(program, now)
     lanes.run(program, now, "after", {})
     return [np.ascontiguousarray(now.array(i)) for i in program.written], flagged

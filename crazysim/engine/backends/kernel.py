@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from crazysim.core.stage import Phase
 from crazysim.engine.backends.exchange import exchange_for
-from crazysim.engine.backends.frame import Kernel, framed
+from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.source import TYPE_NAMES, Writer, require, type_name
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
@@ -38,7 +38,7 @@ def write(program: Program, target: str) -> Kernel:
     body.write_loop(hoisted)
     body.write_stores()
 
-    inputs, outputs, rank = needed(program), tuple(program.written), program.ranks
+    inputs, outputs, rank = needed_leaves(program), tuple(program.written), program.ranks
     pointers = [f"const {_type(program, i)}* __restrict__ p{rank[i]}" for i in inputs]
     pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if program.check is not None else []
@@ -153,7 +153,7 @@ class Body:
             kept: Numbers of a lane that it keeps for each step of an interval; None for a kernel that only goes ahead.
         """
         shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
-        return framed(
+        return make_kernel(
             self.target, pointers, shared, code, blocks, [*self.writer.tables, *self.exchange.declarations],
             inputs=inputs, outputs=outputs, in_place=in_place, group=self.program.group,
             in_memory=self.exchange.depth > 0, kept=kept,
@@ -195,7 +195,7 @@ def require_source(program: Program) -> None:
                 raise UnsupportedError(why, stage=", ".join(segment.stages))
 
 
-def needed(program: Program) -> tuple[int, ...]:
+def needed_leaves(program: Program) -> tuple[int, ...]:
     """Return the leaves that a kernel reads."""
     return tuple(sorted({leaf for leaf, _ in _loaded(program)}))
 

@@ -244,7 +244,7 @@ def steps(
     else:
         carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
     end = after(carry)
-    flagged = nonfinite(program, end)
+    flagged = nonfinite_worlds(program, end)
     run(program, end, "after", {})
     return [end.array(i) for i in program.written], flagged
 
@@ -269,7 +269,7 @@ def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
     return turns(carry, n % inner) if n % inner else carry
 
 
-def nonfinite(program: Program, values: LeafValues) -> Array:
+def nonfinite_worlds(program: Program, values: LeafValues) -> Array:
     """Return True for worlds that were flagged before, or have a watched number that is not finite. (n_worlds, 1)"""
     check = program.check
     if check is None:

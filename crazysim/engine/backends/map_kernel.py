@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from crazysim.engine.backends.frame import Kernel, framed
+from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.kernel import write_results
 from crazysim.engine.backends.source import Writer, require, type_name
 from crazysim.engine.ir.blocks import Block
@@ -27,4 +27,4 @@ def write_map(block: Block, target: str) -> Kernel:
     for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
         write_results(writer, f"q{k}", kind, 1, [x], 2)
     read, written = tuple(range(len(inputs))), tuple(range(len(outputs)))
-    return framed(target, pointers, [], writer.lines, [block], writer.tables, inputs=read, outputs=written)
+    return make_kernel(target, pointers, [], writer.lines, [block], writer.tables, inputs=read, outputs=written)

@@ -199,7 +199,7 @@ def target(kernel: Kernel) -> str:
         KernelError: If the compiler refuses it or takes too long, or the library cannot be loaded.
     """
     words = command()
-    if dump.enabled():
+    if dump.is_enabled():
         dump.write("kernel.cpp", f"// {shlex.join(words)} kernel.cpp\n{kernel.text}")
     key = kernel_cache.digest(*words, toolchain(tuple(words)), kernel.text)
     name = f"crazysim_advance_{key}"

@@ -15,7 +15,7 @@ from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import PHASES, Axes, Phase, Stage, replace_leaves
-from crazysim.core.stages import nonfinite
+from crazysim.core.stages import nonfinite_worlds
 from crazysim.engine.backends import Run
 from crazysim.pytree import leaf_flags
 
@@ -62,7 +62,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
         elif in_loop:
             out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), out)
         leaves = replace_leaves(leaves, in_loop, out)
-        flagged = nonfinite(axes.treedef.unflatten(leaves))
+        flagged = nonfinite_worlds(axes.treedef.unflatten(leaves))
         leaves = run["after"](*leaves)
         return [leaves[i] for i in every], flagged
 

@@ -15,7 +15,7 @@ TARGETS = {"cpu": "host", "gpu": "cuda"}
 """Targets of kernels by platform."""
 
 
-def compiled(kernel: Kernel, location: Location) -> Launch:
+def compile_kernel(kernel: Kernel, location: Location) -> Launch:
     """Compile a kernel for some devices, and return the function that calls it.
 
     Args:
@@ -25,17 +25,17 @@ def compiled(kernel: Kernel, location: Location) -> Launch:
     Raises:
         KernelError: If the compiler is missing, refuses the kernel or takes too long.
     """
-    return cuda.compiled(kernel, location.devices) if location.platform == "gpu" else native.HostLaunch(kernel)
+    return cuda.compile_kernel(kernel, location.devices) if location.platform == "gpu" else native.HostLaunch(kernel)
 
 
-def described(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | None) -> str:
+def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device] | None) -> str:
     """Return the compiler of a kernel, or on a GPU the registers that it takes."""
     if platform != "gpu":
         return f"compiled by {native.compiler()}"
-    device = cuda.weakest(devices)
+    device = cuda.weakest_device(devices)
     if device is None:
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
-    few = cuda.fitted(kernel, device)
-    many, used = cuda.widened(few, device), cuda.resources(few, device)
+    few = cuda.fit_registers(kernel, device)
+    many, used = cuda.widen_blocks(few, device), cuda.resources(few, device)
     wide = f", {many.threads} from {cuda.RESIDENT_LANES:,} drones on" if many is not few else ""
     return f"{few.threads} threads a block{wide}, {used.registers} registers, {used.spilled} bytes spilled"

@@ -21,8 +21,8 @@ from crazysim.engine.backends.source import type_name
 from crazysim.engine.errors import LimitError
 from crazysim.engine.ir.blocks import Block, Builder, Value, constant, inline
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.activity import changed, differentiable
-from crazysim.engine.lowering.transpose import transposed
+from crazysim.engine.lowering.activity import changed_slots, without_check
+from crazysim.engine.lowering.transpose import transpose_block
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Reverse:
         return sorted(places)
 
 
-def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
+def reverse_program(program: Program, perturbed: Collection[int]) -> Reverse:
     """Return the transposed derivatives of a program that one kernel can run.
 
     Args:
@@ -69,7 +69,7 @@ def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program, perturbed = differentiable(program, perturbed)
+    program, perturbed = without_check(program, perturbed)
     n = len(program.leaves)
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number) for x in program.leaves]
     each = [s for s in program.fused_segments if s.phase == "each"]
@@ -78,7 +78,7 @@ def reverse(program: Program, perturbed: Collection[int]) -> Reverse:
         for s in each
     ]
     extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
-    found, constants = changed(program, perturbed)
+    found, constants = changed_slots(program, perturbed)
     back = {}
     for s in program.fused_segments:
         where = 2 * n + each.index(s) if s in each else -1
@@ -116,7 +116,7 @@ def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Seq
               if slot in found and x.dtype.kind == "f" and not x.size]  # fmt: skip
     wanted_constants = [len(reads) + k for k in constants]
     outs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
-    pull = transposed(s.block, [s.block.inputs[k] for k in (*wanted, *wanted_constants)])
+    pull = transpose_block(s.block, [s.block.inputs[k] for k in (*wanted, *wanted_constants)])
     n_inputs = len(s.block.inputs)
 
     def copies(slot: Slot) -> list[Slot]:
@@ -165,7 +165,7 @@ def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int]
     reads = s.hoisted_reads
     wanted = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
               if slot in found and x.dtype.kind == "f"]  # fmt: skip
-    pull = transposed(s.hoisted, [s.hoisted.inputs[k] for k in wanted])
+    pull = transpose_block(s.hoisted, [s.hoisted.inputs[k] for k in wanted])
     builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
     primal = [builder.input(x.dtype, x.size) for x in s.hoisted.inputs]
     seeds, places = [], []
@@ -184,9 +184,9 @@ def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int]
     return Segment("drone", s.stages, "each", block, (*reads, *places, *targets), targets)
 
 
-def needed(reverse: Reverse) -> tuple[int, ...]:
+def needed_leaves(reverse: Reverse) -> tuple[int, ...]:
     """Return the leaves that the kernel reads; behind them come the cotangents of ``seeds``."""
-    return kernel.needed(reverse.program)
+    return kernel.needed_leaves(reverse.program)
 
 
 def write(reverse: Reverse, target: str) -> Kernel:
@@ -280,7 +280,7 @@ def write(reverse: Reverse, target: str) -> Kernel:
         _write_back(body, reverse, first, [()] * len(first), names | body.starts, 1)
     pointers = [f"const {type_name(program.leaves[i].number)}* __restrict__ "
                 f"p{rank[i]}"
-                for i in kernel.needed(program)]  # fmt: skip
+                for i in kernel.needed_leaves(program)]  # fmt: skip
     pointers += [f"const {type_name(program.leaves[i].number)}* __restrict__ s{rank[i]}" for i in reverse.seeds]
     for i in reverse.perturbed:
         number, pointer = type_name(program.leaves[i].number), f"d{rank[i]}"
@@ -288,7 +288,7 @@ def write(reverse: Reverse, target: str) -> Kernel:
         values = [names[n + i, k] for k in range(program.leaves[i].size)]
         kernel.write_results(writer, pointer, number, 1, values, 1)
     blocks = [*(s.block for s in each for _ in range(2)), *(reverse.back[s].block for s in each)]
-    return body.kernel(pointers, needed(reverse), (), (), blocks, len(carried))
+    return body.kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carried))
 
 
 def _write_back(

@@ -204,7 +204,7 @@ class Writer:
         for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
             if k in best:
                 better = self.new()
-                test = f"{ops.PLACES[combine]}_({out}, {best[k]})"
+                test = f"{ops.INDEX_REDUCTIONS[combine]}_({out}, {best[k]})"
                 self.line(f"const auto {better} = or_({test}, ne_({out}, {out}));", depth + 1)
                 self.line(f"{name}_{k} = select_n_({better}, {name}_{k}, i32_lanes(i32({turn})));", depth + 1)
                 self.line(f"{best[k]} = select_n_({better}, {best[k]}, {out});", depth + 1)

@@ -20,7 +20,7 @@ FLUSH_BITS = 0x8040
 
 
 @contextlib.contextmanager
-def flushed() -> Iterator[None]:
+def flush_subnormals() -> Iterator[None]:
     """Take subnormal numbers for zero in this thread; only on x86-64 Linux."""
     library = _library()
     if library is None:

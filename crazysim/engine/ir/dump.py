@@ -15,7 +15,7 @@ DUMP_VARIABLE = "CRAZYSIM_DUMP"
 _numbers = itertools.count()
 
 
-def enabled() -> bool:
+def is_enabled() -> bool:
     """Return True where a folder is set, so that text worth time to make is made."""
     return bool(os.environ.get(DUMP_VARIABLE))
 
@@ -31,7 +31,7 @@ def write(name: str, text: str) -> Path | None:
     Returns:
         The file, or None if no folder is set.
     """
-    if not enabled():
+    if not is_enabled():
         return None
     folder = Path(os.environ[DUMP_VARIABLE])
     folder.mkdir(parents=True, exist_ok=True)

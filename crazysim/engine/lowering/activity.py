@@ -15,7 +15,7 @@ from crazysim.engine.ir.blocks import Block, Value
 from crazysim.engine.ir.program import Program, Segment, Slot
 
 
-def differentiable(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
+def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
     """Return a program without its check, and the perturbed leaves that are floats and are used by it.
 
     Raises:
@@ -33,7 +33,7 @@ def differentiable(program: Program, perturbed: Collection[int]) -> tuple[Progra
     return program, some
 
 
-def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
+def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
     """Return the numbers that depend differentiably on the perturbed leaves, and such hoisted outputs by segment."""
     found = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     constants: dict[Segment, tuple[int, ...]] = {}
@@ -41,7 +41,7 @@ def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict
     def of(block: Block, slots: Sequence[Slot], more: Sequence[int] = ()) -> list[int]:
         wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in found and x.dtype.kind == "f"]
         wanted += [block.inputs[len(slots) + k] for k in more]
-        on_path = active(block, wanted)
+        on_path = active_values(block, wanted)
         return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
 
     def run(s: Segment) -> None:
@@ -64,7 +64,7 @@ def changed(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict
     return found, constants
 
 
-def active(block: Block, wanted: Collection[Value]) -> set[Value]:
+def active_values(block: Block, wanted: Collection[Value]) -> set[Value]:
     """Return the values of a block and of its inner blocks that depend differentiably on some of its inputs."""
     found = set(wanted)
     _spread(block, found)
@@ -91,7 +91,7 @@ def _spread(block: Block, found: set[Value]) -> None:
             found.update(x for x in op.results if x.dtype.kind == "f")
 
 
-def applied(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:
+def apply_operation(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:
     """Return the result of an operation as JAX computes it, which can be differentiated."""
     if name in ("convert_element_type", "bitcast_convert_type"):
         return getattr(lax, name)(args[0], dtype)

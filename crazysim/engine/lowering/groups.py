@@ -36,7 +36,7 @@ class _Access(NamedTuple):
         return self.read | self.written
 
 
-def independent(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
+def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
     """Return the groups of populations that do not depend on each other, that of the drones first.
 
     Two stages depend on each other if one reads or writes what the other writes. Stages of worlds alone, such as the

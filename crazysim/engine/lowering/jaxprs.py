@@ -99,7 +99,7 @@ class Lowering:
         if name not in RULES:
             raise UnsupportedError(f"primitive {name!r} has no rule", name)
         try:
-            with jaxcompat.reading(eqn) as equation:
+            with jaxcompat.read_equation(eqn) as equation:
                 return RULES[name](self, equation, args)
         except UnsupportedError as error:
             raise error.located(name) from None

@@ -58,22 +58,22 @@ class RelativeStage(Stage):
         """Return the viewed data of all worlds after the stage."""
         treedef, views = self.axes.treedef, self.axes.views
         before = jax.tree.leaves(data)
-        given = restored(views, before)
+        given = restore_leaves(views, before)
         after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(given)))
         if after_treedef != treedef:
             return after_treedef.unflatten(after)  # the caller refuses it
-        new = viewed(views, after)
+        new = view_leaves(views, after)
         unchanged = [x is y for x, y in zip(after, given, strict=True)]
         return treedef.unflatten([old if same else x for old, x, same in zip(before, new, unchanged, strict=True)])
 
 
-def viewed(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
+def view_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
     """Return leaves with those of other populations as leaves of the world. (n_worlds, 1, n_members, ...)"""
     return [_reshaped(x, (x.shape[0], 1, *x.shape[1:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
 
 
-def restored(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
+def restore_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
     """Return viewed leaves as they are in the data. (n_worlds, n_members, ...)"""
     return [_reshaped(x, (x.shape[0], *x.shape[2:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
@@ -83,17 +83,17 @@ def _reshaped(x: Any, shape: tuple[int, ...]) -> Any:
     return jax.ShapeDtypeStruct(shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x.reshape(shape)
 
 
-def on_data(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
+def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that runs a program on leaves as they are in the data, from one on viewed leaves."""
     views, written = program.views, program.written
     if not views:
         return run
 
     def steps(leaves: Sequence[Any], n_steps: Any) -> Any:
-        out, flagged = run(viewed(views, leaves), n_steps)
+        out, flagged = run(view_leaves(views, leaves), n_steps)
         numbered = dict(zip(written, out, strict=True))
         given = [numbered.get(i) for i in range(len(leaves))]
-        back = restored(views, given)
+        back = restore_leaves(views, given)
         return [back[i] for i in written], flagged
 
     return steps

@@ -12,7 +12,7 @@ INDEX_REDUCTION_OF = {"min": "argmin", "max": "argmax"}
 """Reductions, see ``ops.PLACES``, that find the drone with the smallest or largest number."""
 
 
-def with_selections(block: Block) -> Block:
+def add_selections(block: Block) -> Block:
     """Return a block with two loops for each such number: one finds the drone that has it, one adds its number."""
     if not any(map(_selects, block.operations)):
         return block

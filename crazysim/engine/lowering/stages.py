@@ -11,12 +11,12 @@ import numpy as np
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim.core.others import reduce_over_others_p
-from crazysim.core.stage import PHASES, Axes, Phase, Stage, at_the_start
+from crazysim.core.stage import PHASES, Axes, Phase, Stage, is_first_step
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
 from crazysim.engine.ir.program import TABLE_INDEX, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
 from crazysim.engine.lowering.jaxprs import Elements, Entry, Lowering, as_elements, inputs, scalars
-from crazysim.engine.lowering.relative import RelativeAxes, viewed
+from crazysim.engine.lowering.relative import RelativeAxes, view_leaves
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
 from crazysim.jaxcompat import equations, is_key
 from crazysim.pytree import leaf_flags
@@ -49,7 +49,7 @@ def lower_stages(
     """
     tracer = tracer or Tracer()
     axes = RelativeAxes(data, population)
-    leaves = viewed(axes.views, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(data)])
+    leaves = view_leaves(axes.views, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(data)])
     known = dict(zeros)
     n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
@@ -85,7 +85,7 @@ def _before_the_steps(
     """
     if sum(clock in s.written for s in segments) > 1:
         return list(segments)
-    begins = [stage.when is at_the_start and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)]
+    begins = [stage.when is is_first_step and isinstance(s, Segment) for stage, s in zip(stages, segments, strict=True)]
     n = (*begins, False).index(False)
     first = [dataclasses.replace(s, phase="before") for s in segments[:n] if isinstance(s, Segment)]
     return [*first, *segments[n:]]

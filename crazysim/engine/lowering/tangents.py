@@ -20,14 +20,14 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
-from crazysim.engine.lowering.activity import applied, changed, differentiable
+from crazysim.engine.lowering.activity import apply_operation, changed_slots, without_check
 from crazysim.engine.lowering.jaxprs import lower_function
-from crazysim.engine.lowering.selections import with_selections
+from crazysim.engine.lowering.selections import add_selections
 
 Values = dict[Value, Element]
 
 
-def with_tangents(program: Program, perturbed: Collection[int]) -> Program:
+def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     """Return the program that computes the tangents of a program's numbers besides the numbers.
 
     Leaf ``len(program.leaves) + i`` is the tangent of leaf ``i``; each world has its own tangent of a leaf that all
@@ -41,9 +41,9 @@ def with_tangents(program: Program, perturbed: Collection[int]) -> Program:
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
     """
-    program, perturbed = differentiable(program, perturbed)
+    program, perturbed = without_check(program, perturbed)
     n = len(program.leaves)
-    found, constants = changed(program, perturbed)
+    found, constants = changed_slots(program, perturbed)
     segments = [_segment(program, n, s, found, constants.get(s, ())) for s in program.fused_segments]
     zero = dict.fromkeys((i, k) for s in segments for i in s.written if i >= n and i - n not in perturbed
                          for k in range(program.leaves[i - n].size))  # fmt: skip
@@ -68,7 +68,7 @@ def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: 
     reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
     wanted = [k for k, slot in enumerate(reads) if slot in found and s.block.inputs[k].dtype.kind == "f"]
     wanted = [k for k in wanted if not s.block.inputs[k].size]
-    block = block_with_tangents(s.block, [s.block.inputs[k] for k in (*wanted, *(n_reads + k for k in constants))])
+    block = add_block_tangents(s.block, [s.block.inputs[k] for k in (*wanted, *(n_reads + k for k in constants))])
     primal, slopes = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
     inputs = (*primal[:n_reads], *slopes[: len(wanted)], *primal[n_reads:], *slopes[len(wanted) :])
     floats = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
@@ -79,7 +79,7 @@ def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: 
     hoisted, n_hoisted = s.hoisted, len(s.hoisted.outputs)
     if constants:
         some = [x for x, slot in zip(s.hoisted.inputs, s.hoisted_reads, strict=True) if slot in before]
-        hoisted = block_with_tangents(s.hoisted, some)
+        hoisted = add_block_tangents(s.hoisted, some)
         places = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
         kept = [hoisted.outputs[n_hoisted + places.index(k)] for k in constants]
         hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *kept))
@@ -93,7 +93,7 @@ def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: 
     )
 
 
-def block_with_tangents(block: Block, wanted: Sequence[Value]) -> Block:
+def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
     """Return the block that computes tangents beside a block's outputs.
 
     Args:
@@ -108,7 +108,7 @@ def block_with_tangents(block: Block, wanted: Sequence[Value]) -> Block:
         UnsupportedError: If an operation has no derivative in a kernel.
     """
     places = [block.inputs.index(x) for x in wanted]
-    block = with_selections(block)
+    block = add_selections(block)
     wanted = [block.inputs[k] for k in places]
     builder = Builder()
     values: Values = {x: builder.input(x.dtype, x.size) for x in block.inputs}
@@ -171,7 +171,7 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
         operands, tangents = args[: len(dtypes)], args[len(dtypes) :]
 
         def of(*some: Any) -> Any:
-            return applied(name, replace_leaves(operands, floats, some), dtype, params)
+            return apply_operation(name, replace_leaves(operands, floats, some), dtype, params)
 
         return jax.jvp(of, tuple([operands[k] for k in floats]), tangents)[1]
 

@@ -45,14 +45,14 @@ class TracedStage:
         used = _used(fn) | (_used(when) if when is not None else set())
         self.used = sorted(used)
         """Leaves that it reads: the inputs of ``fn`` and ``when``."""
-        self.fn = jaxcompat.with_inputs(fn, self.used)
-        self.when = jaxcompat.with_inputs(when, self.used) if when is not None else None
+        self.fn = jaxcompat.select_inputs(fn, self.used)
+        self.when = jaxcompat.select_inputs(when, self.used) if when is not None else None
         self.segments: dict[Any, Any] = {}
         """Segments that it was lowered to, by what they depend on besides."""
 
     def dump(self, name: str) -> None:
         """Write the jaxprs to the folder of dumps, if there is one."""
-        if dump.enabled():
+        if dump.is_enabled():
             dump.write(f"{name}.jaxpr", f"{self.fn}\n" + (f"\nwhen\n{self.when}\n" if self.when else ""))
 
 

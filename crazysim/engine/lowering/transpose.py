@@ -18,9 +18,9 @@ from crazysim.core.stage import replace_leaves
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
-from crazysim.engine.lowering.activity import active, applied
+from crazysim.engine.lowering.activity import active_values, apply_operation
 from crazysim.engine.lowering.jaxprs import lower_function
-from crazysim.engine.lowering.selections import with_selections
+from crazysim.engine.lowering.selections import add_selections
 
 MAX_UNROLLED = 4096
 """Most operations of a loop that is unrolled for its derivative."""
@@ -29,7 +29,7 @@ Cotangents = dict[Value, Element]
 """Cotangents by the values of the block that is differentiated."""
 
 
-def transposed(block: Block, wanted: Sequence[Value]) -> Block:
+def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
     """Return the block that computes cotangents of a block's inputs.
 
     Args:
@@ -44,9 +44,9 @@ def transposed(block: Block, wanted: Sequence[Value]) -> Block:
         UnsupportedError: If an operation between them has no derivative in a kernel.
     """
     places = [block.inputs.index(x) for x in wanted]
-    block = _unrolled(with_selections(block))
+    block = _unrolled(add_selections(block))
     wanted = [block.inputs[k] for k in places]
-    on_path = active(block, wanted)
+    on_path = active_values(block, wanted)
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     parts = _parts(block)
@@ -141,7 +141,7 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
         *operands, ct = args
 
         def of(some: list[Any]) -> Any:
-            return applied(name, replace_leaves(operands, floats, some), dtype, params)
+            return apply_operation(name, replace_leaves(operands, floats, some), dtype, params)
 
         return jax.vjp(of, [operands[k] for k in floats])[1](ct)[0]
 
@@ -193,7 +193,7 @@ def _custom_jvp(
 @functools.lru_cache(maxsize=256)
 def _transposed_slope(slope: Block) -> Block:
     tangents = slope.inputs[len(slope.inputs) // 2 :]
-    return transposed(slope, [x for x in tangents if x.dtype.kind == "f"])
+    return transpose_block(slope, [x for x in tangents if x.dtype.kind == "f"])
 
 
 def _over_others(

@@ -127,7 +127,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
         build: Builds what runs the program.
         tolerance: As in ``first_difference``.
     """
-    seen, operations = with_all_values(program)
+    seen, operations = expose_values(program)
     n_worlds = lanes.batch(program, leaves)[0]
     more = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in seen.leaves[len(leaves) :]]
     location = Location("cpu" if jax.default_backend() == "cpu" else "gpu")
@@ -143,7 +143,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
     return None
 
 
-def with_all_values(program: Program) -> tuple[Program, list[Operation]]:
+def expose_values(program: Program) -> tuple[Program, list[Operation]]:
     """Return a program of one segment with a further leaf for every result in it, and the operations of those.
 
     Results inside blocks of operations are left out: their block may not have run.

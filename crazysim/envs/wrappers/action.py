@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState
 from crazysim.envs.wrappers.base import Wrapper
@@ -25,7 +25,7 @@ class ActionDelay(Wrapper):
     def __init__(self, env: Env, n: int):
         """Take the environment and the delay, environment steps."""
         super().__init__(env)
-        self.n = positive("n", n)
+        self.n = positive_integer("n", n)
 
     def after_reset(self, state: EnvState) -> EnvState:
         """Return the state with a queue of zeros."""

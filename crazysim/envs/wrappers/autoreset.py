@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from crazysim.core.settings import member
+from crazysim.core.settings import enum_member
 from crazysim.envs.env import Env
 from crazysim.envs.reset_policy import POLICIES, AutoresetMode, ResetPolicy
 from crazysim.envs.wrappers.base import Wrapper
@@ -18,7 +18,7 @@ class AutoReset(Wrapper):
             ConfigError: If there is no such mode.
         """
         super().__init__(env)
-        self.mode = member(AutoresetMode, "mode", mode)
+        self.mode = enum_member(AutoresetMode, "mode", mode)
 
     @property
     def reset_policy(self) -> ResetPolicy | None:

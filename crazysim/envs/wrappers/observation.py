@@ -10,7 +10,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.random import normal, world_key
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs
 from crazysim.envs.statistics import RunningStats
@@ -134,7 +134,7 @@ class FrameStack(Wrapper):
     def __init__(self, env: Env, n: int):
         """Take the environment and the number of observations."""
         super().__init__(env)
-        self.n = positive("n", n)
+        self.n = positive_integer("n", n)
 
     def after_reset(self, state: EnvState) -> EnvState:
         """Return the state with the first observation repeated."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.closing import Closing
-from crazysim.core.settings import positive
+from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 from crazysim.lab.live.history import History, Snapshot
 from crazysim.lab.live.interaction import Interaction
@@ -78,7 +78,7 @@ class Live(Interaction, Closing):
         Raises:
             ConfigError: If a setting is invalid.
         """
-        control_freq = positive("control_freq", control_freq)
+        control_freq = positive_integer("control_freq", control_freq)
         if sim.freq % control_freq:
             raise ConfigError(f"expected a control_freq that divides freq={sim.freq} Hz, got {control_freq!r} Hz")
         for name, value in (("fps", fps), ("snapshot_s", snapshot_s)):
@@ -92,7 +92,7 @@ class Live(Interaction, Closing):
         self._dt = 1.0 / control_freq
         self._pace = Pace(self._dt, speed)
         self._commands = StagedCommands(sim)
-        self._history = History(positive("n_snapshots", n_snapshots))
+        self._history = History(positive_integer("n_snapshots", n_snapshots))
         self._snapshot_steps = max(round(snapshot_s * control_freq), 1)
         self._processes: list[Process] = []
         self._events: dict[int, list[Event]] = defaultdict(list)
@@ -137,7 +137,7 @@ class Live(Interaction, Closing):
 
     def advance(self, n_steps: int = 1) -> None:
         """Advance by control steps as fast as possible, even while paused: the single step of a paused simulation."""
-        n_steps = positive("n_steps", n_steps)
+        n_steps = positive_integer("n_steps", n_steps)
         self._between_steps(lambda _: self._advance(n_steps))
 
     def reset(self) -> None:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.core.settings import flag
+from crazysim.core.settings import check_flag
 from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import ConfigError
 from crazysim.lab.shows.flight import ShowFlight
@@ -57,7 +57,7 @@ def film(
         ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         RenderError: If this machine cannot draw, or the file cannot be written.
     """
-    if flag("night", night):
+    if check_flag("night", night):
         darken(flight.sim)
     with Film(path, view_of(flight, **view), fps=fps, progress=progress) as recording:
         return recording.play(flight.sim, media_flight(flight))

@@ -10,10 +10,10 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData, controls_of
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, of_airframes, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, airframe_numbers, check_parameter, parameter, per_drone
 from crazysim.core.stage import stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, leaf
 
@@ -91,12 +91,12 @@ class Battery(Plugin):
         require_rotors(sim, "battery sag")
         n_cells = self.n_cells
         if n_cells is None:
-            n_cells = of_airframes(sim, lambda a: a.values.get("battery.cells", np.ones(())).astype(int))
+            n_cells = airframe_numbers(sim, lambda a: a.values.get("battery.cells", np.ones(())).astype(int))
         counts = check_parameter(sim, "n_cells", n_cells, (1,), 1, dtype=jnp.int32)
         cells = counts.astype(sim.data.states.pos.dtype)
         full_speed_voltage = self.full_speed_voltage
         if full_speed_voltage is None:
-            known = of_airframes(sim, lambda a: a.full_thrust_voltage or 0.0)
+            known = airframe_numbers(sim, lambda a: a.full_thrust_voltage or 0.0)
             full_speed_voltage = np.where(known[..., None] > 0, known[..., None], NOMINAL_VOLTAGE * np.asarray(cells))
         charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0), 1)
         return self.filled(
@@ -113,7 +113,7 @@ class Battery(Plugin):
     def _own(self, sim: Simulation, key: str) -> ArrayLike:
         """Return a setting, or else the airframes' number."""
         given = getattr(self, key)
-        return of_airframes(sim, lambda a: a.value(f"battery.{key}", ())) if given is None else given
+        return airframe_numbers(sim, lambda a: a.value(f"battery.{key}", ())) if given is None else given
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that discharges the batteries."""
@@ -162,7 +162,7 @@ class Battery(Plugin):
         return self.write(data, battery)
 
 
-@compiled()
+@jit_unless_traced()
 def open_circuit_voltage(charge: Array, n_cells: Array) -> Array:
     """Return the open-circuit voltage of lithium-polymer cells in series, V.
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
-from crazysim.core.plugin import Placement, Plugin, Simulation, of_airframes, parameter
+from crazysim.core.plugin import Placement, Plugin, Simulation, airframe_numbers, parameter
 from crazysim.core.stage import stage
 from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics import first_principles
@@ -94,7 +94,7 @@ class Downwash(Plugin):
 
 def stream_diameter(sim: Simulation, radius: Array) -> Array:
     """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
-    factor = np.sqrt(2 * of_airframes(sim, lambda airframe: airframe.n_rotors))
+    factor = np.sqrt(2 * airframe_numbers(sim, lambda airframe: airframe.n_rotors))
     factor = factor[..., None] if factor.ndim else factor
     return device_array(factor * np.asarray(radius), radius.dtype)
 

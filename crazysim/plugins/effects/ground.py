@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.geometry.heightfield import FAR, surface
 from crazysim.pytree import PyTree, leaf, static
 
@@ -25,7 +25,7 @@ class TerrainData(PyTree):
     floor: bool = static()
     """True where a flat floor at z = 0 surrounds the terrain; False where its border extends outwards without end."""
 
-    @compiled()
+    @jit_unless_traced()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
         """Return height and normal of the ground at a place, whose z does not count.
 
@@ -59,7 +59,7 @@ class TerrainData(PyTree):
         return jnp.where(inside, gap, FAR) if self.floor else gap, normal
 
 
-@compiled()
+@jit_unless_traced()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
     """Return height and normal of the ground at a place, whose z does not count; flat and zero without terrain.
 

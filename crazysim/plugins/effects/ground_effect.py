@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, of_airframes, parameter
+from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, parameter
 from crazysim.drones import Airframe
 from crazysim.plugins.effects.ground import ground_below
 from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
@@ -60,7 +60,7 @@ def rotor_positions(sim: Simulation) -> Array:
         own = airframe.value("rotors.position")
         return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
 
-    return device_array(of_airframes(sim, of_one), sim.data.states.pos.dtype)
+    return device_array(airframe_numbers(sim, of_one), sim.data.states.pos.dtype)
 
 
 def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:

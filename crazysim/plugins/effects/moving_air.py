@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, check_parameter, of_airframes
+from crazysim.core.plugin import Simulation, airframe_numbers, check_parameter
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.drag import drag_force
 from crazysim.errors import ConfigError
@@ -101,5 +101,5 @@ def require_rotors(sim: Simulation, effect: str) -> None:
 def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:
     """Return the radius of propellers as ``check_parameter`` does, m; of None that of the airframes."""
     if radius is None:
-        radius = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
+        radius = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
     return check_parameter(sim, "propeller_radius", radius, positive=True)

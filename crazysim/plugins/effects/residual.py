@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter, parameter
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rotor import curve, rotor_torque
@@ -169,5 +169,5 @@ def _of_airframes(sim: Simulation) -> dict[str, Any]:
             f"expected residuals of one number of hidden units, got {sorted(sizes)}. Use airframes of equal networks."
         )
     keys = ("linear", "hidden", "output") if max(sizes) else ("linear",)
-    found = {key: of_airframes(sim, lambda a, key=key: a.value(f"residual.{key}")) for key in keys}
+    found = {key: airframe_numbers(sim, lambda a, key=key: a.value(f"residual.{key}")) for key in keys}
     return {"hidden": None, "output": None} | found

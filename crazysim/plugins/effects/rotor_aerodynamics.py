@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, check_parameter, of_airframes, parameter
+from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter, parameter
 from crazysim.drones import Airframe
 from crazysim.drones.estimate import AIR_DENSITY
 from crazysim.dynamics.inflow import blade_coefficient, ceiling_factor, disc_factor, thrust_in_flight
@@ -87,7 +87,7 @@ class RotorAerodynamics(Plugin):
         radius = checked_propeller_radius(sim, self.propeller_radius)
         density = check_parameter(sim, "air_density", self.air_density, positive=True)
         inflow = np.asarray(self._own(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
-        thrust, speed = of_airframes(sim, hover_thrust)[..., None], of_airframes(sim, hover_speed)[..., None]
+        thrust, speed = airframe_numbers(sim, hover_thrust)[..., None], airframe_numbers(sim, hover_speed)[..., None]
         disc = np.asarray(disc_factor(radius, density), np.float64)
         blade = blade_coefficient(inflow * speed, thrust, speed, disc)
         if self.ceiling is not None and not np.all(inflow > 0):
@@ -115,7 +115,9 @@ class RotorAerodynamics(Plugin):
         """Return a coefficient as it is set, or else from the airframes' linear drag in hover."""
         given = getattr(self, name)
         if given is None:
-            drag = of_airframes(sim, lambda a: of_drag(a.matrix("drag.coefficients")) / (a.n_rotors * hover_speed(a)))
+            drag = airframe_numbers(
+                sim, lambda a: of_drag(a.matrix("drag.coefficients")) / (a.n_rotors * hover_speed(a))
+            )
             given = drag[..., None] if drag.ndim else drag
             if not np.all(given > 0):
                 raise ConfigError(
@@ -129,7 +131,7 @@ class RotorAerodynamics(Plugin):
         """Return the positions of the hubs, body frame, m. (..., n_rotors, 3)"""
         height = self.hub_height
         if height is None:
-            height = of_airframes(sim, lambda airframe: airframe.value("shape.propeller_height", ()))
+            height = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_height", ()))
         up = np.asarray(check_parameter(sim, "hub_height", height))[..., None]
         pos = np.asarray(rotor_positions(sim))
         return device_array(pos + up * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)

@@ -15,7 +15,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData, SimState
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_mask, as_rgba
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.plugins.effects.ground import ground_height
 from crazysim.plugins.effects.moving_air import Exposed
 from crazysim.plugins.effects.wind import wind_at
@@ -147,7 +147,7 @@ def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple
     return jnp.concatenate([pos[..., :2], jnp.maximum(height, clearance)], axis=-1), vel
 
 
-@compiled("is_cable")
+@jit_unless_traced("is_cable")
 def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
     """Return position and velocity of a load that hangs at rest below its drone, or rests on the floor.
 
@@ -169,7 +169,7 @@ def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, 
     return top + offset, vel
 
 
-@compiled("name")
+@jit_unless_traced("name")
 def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     """Return the unit vector from attachment to load, world frame, and its rate, 1/s; of one drone or of all. (..., 3)
 

@@ -16,7 +16,7 @@ from crazysim.core.integration import euler
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.settings import color, setting
 from crazysim.core.stage import Stage
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError
 from crazysim.geometry.linear import solve
 from crazysim.plugins.payloads.body import LoadBody, rest_height
@@ -58,7 +58,7 @@ class SharedLoadData(PyTree):
     """Height of the load above the floor where it rests, m. (1,)"""
 
 
-@compiled()
+@jit_unless_traced()
 def below(states: SimState, length: Array, clearance: Array) -> tuple[Array, Array]:
     """Return position and velocity of a load at rest below the drones of each world.
 

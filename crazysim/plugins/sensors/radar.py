@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
 from crazysim.core.stage import Stage
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.rotation import safe_clip, safe_norm
@@ -41,7 +41,7 @@ class RadarData(PyTree):
     exposure: Array = leaf("drone", 1)
     """Time that a drone has been within each lobe since the last reset, s. (n_worlds, n_drones, n_radars)"""
 
-    @compiled()
+    @jit_unless_traced()
     def margin_at(self, pos: Array) -> Array:
         """Return the depth of a place within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
         offset = pos[..., None, :] - self.pos
@@ -117,7 +117,7 @@ class Radar(Plugin):
                 sim.scene.renderer.overlays.line(pos + curve, ALARM if detected[k] else CLEAR, 2.0, 2.0)
 
 
-@compiled()
+@jit_unless_traced()
 def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
     """Return the depth of a place within a radar's lobe along the normal to its axis, m, negative outside. (...)
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.eager import compiled
+from crazysim.eager import jit_unless_traced
 from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.path import Path
 from crazysim.plugins.vehicles.state import CarState, tilted, to_body, to_world
@@ -89,13 +89,13 @@ class CarData(Members):
         return self.replace(body_vel=to_body(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
 
 
-@compiled()
+@jit_unless_traced()
 def _level_vel(yaw: Array, body_vel: Array) -> Array:
     level = to_world(yaw, body_vel)
     return jnp.concatenate([level, jnp.zeros_like(yaw)], axis=-1)
 
 
-@compiled()
+@jit_unless_traced()
 def _about_z(yaw_rate: Array) -> Array:
     zero = jnp.zeros_like(yaw_rate)
     return jnp.concatenate([zero, zero, yaw_rate], axis=-1)

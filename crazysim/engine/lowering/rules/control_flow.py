@@ -20,12 +20,12 @@ from crazysim.engine.lowering.jaxprs import (
     rule,
     scalars,
 )
-from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, closed, expanded
+from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn, as_function, close_jaxpr, expand_primitive
 
 
 @rule("jit", "pjit", "closed_call", "core_call", "remat2", "checkpoint", "custom_lin", "run_state")
 def _call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    return ctx.lower(closed(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
+    return ctx.lower(close_jaxpr(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]), args)
 
 
 @rule("pure_callback", "io_callback")
@@ -36,7 +36,7 @@ def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Eleme
 
 @rule("custom_jvp_call")
 def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    return _with_derivative(ctx, eqn, args, closed(eqn.params["call_jaxpr"]))
+    return _with_derivative(ctx, eqn, args, close_jaxpr(eqn.params["call_jaxpr"]))
 
 
 @rule("stop_gradient")
@@ -57,7 +57,7 @@ def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elem
     tables where the operands are tables.
     """
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-    called = jax.make_jaxpr(expanded(eqn))(*avals)
+    called = jax.make_jaxpr(expand_primitive(eqn))(*avals)
     if not any(jax.numpy.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars):
         return ctx.lower(called, args)
     return _with_derivative(ctx, eqn, args, called)
@@ -87,14 +87,14 @@ def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[El
     n_before = lengths.matvec + lengths.vecmat
     solve = args[n_before : n_before + lengths.solve]
     n_all = n_before + lengths.solve + lengths.transpose_solve
-    return ctx.lower(closed(jaxprs.solve), [*solve, *args[n_all:]])
+    return ctx.lower(close_jaxpr(jaxprs.solve), [*solve, *args[n_all:]])
 
 
 @rule("cond")
 def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Compute all branches and select one: lanes differ in which."""
     which, *operands = args
-    branches = [closed(b) for b in eqn.params["branches"]]
+    branches = [close_jaxpr(b) for b in eqn.params["branches"]]
     index = which[()]
     if is_constant(index):
         return ctx.lower(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
@@ -124,7 +124,7 @@ def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[
 @rule("scan")
 def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     p, length = eqn.params, eqn.params["length"]
-    body = closed(p["jaxpr"])
+    body = close_jaxpr(p["jaxpr"])
     # Versions of JAX name the groups differently; operands per iteration have one axis more than in the body.
     n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
     n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
@@ -158,8 +158,8 @@ def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
     cond_fixed, body_fixed, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
     test, body = ctx.inner(), ctx.inner()
-    goes_on = test.finish(test.lower(closed(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
-    turn = body.finish(body.lower(closed(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
+    goes_on = test.finish(test.lower(close_jaxpr(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
+    turn = body.finish(body.lower(close_jaxpr(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
     return _results(ctx, "while", eqn, scalars(*carry), (goes_on, turn))
 
 

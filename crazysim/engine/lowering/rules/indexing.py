@@ -42,7 +42,7 @@ def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> E
     if is_constant(start) or last == 0:
         k = int(np.clip(start, 0, last)) if last else 0
         return np.take(x, range(k, k + size), axis)
-    table = tables.find(ctx, x, (axis,), last + 1)
+    table = tables.find_table(ctx, x, (axis,), last + 1)
     if table is not None:
         offsets = np.take(table.offsets, range(size), axis)
         return table.look_up(offsets, [table.base_at([start], [last])] * offsets.size)
@@ -103,11 +103,11 @@ def _check_range(n: int) -> None:
 @rule("gather")
 def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     x, indices = args
-    if known(indices):
+    if is_known(indices):
         p = eqn.params
         if p["mode"] == GatherScatterMode.FILL_OR_DROP:
-            return [_gather_filled(eqn, x, values(indices))]
-        return move_many(eqn, [x], [values(indices)])
+            return [_gather_filled(eqn, x, known_values(indices))]
+        return move_many(eqn, [x], [known_values(indices)])
     dims, mode, sizes = eqn.params["dimension_numbers"], eqn.params["mode"], eqn.params["slice_sizes"]
     limits = [x.shape[axis] - sizes[axis] for axis in dims.start_index_map]
     n_places = int(np.prod([limit + 1 for limit in limits]))
@@ -121,7 +121,7 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
         shape[axis] = size
     row_of = np.broadcast_to(np.arange(len(rows)).reshape(shape), out.shape).reshape(-1)
 
-    table = tables.find(ctx, x, dims.start_index_map, n_places)
+    table = tables.find_table(ctx, x, dims.start_index_map, n_places)
     if table is not None:
         zeros = np.zeros(indices.shape, np.int32)
         offsets = move_many(eqn, [table.offsets.astype(object)], [zeros])[0].reshape(-1)
@@ -259,11 +259,11 @@ def _combined(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Ele
     )
 
 
-def known(x: Elements) -> bool:
+def is_known(x: Elements) -> bool:
     """Return True where all elements are constants."""
     return all(map(is_constant, x.reshape(-1)))
 
 
-def values(x: Elements) -> np.ndarray:
+def known_values(x: Elements) -> np.ndarray:
     """Return known elements as numbers."""
     return np.array(x.reshape(-1).tolist(), x.reshape(-1)[0].dtype if x.size else np.int32).reshape(x.shape)

@@ -57,7 +57,7 @@ class Table:
         return as_elements(found, offsets.shape)
 
 
-def find(ctx: Lowering, x: Elements, axes: Sequence[int], n_places: int) -> Table | None:
+def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_places: int) -> Table | None:
     """Return an array as a table in which an index along some axes moves all entries alike, or None.
 
     Args:

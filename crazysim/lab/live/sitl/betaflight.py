@@ -7,7 +7,7 @@ import struct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.core.settings import flag
+from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, shown
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
 from crazysim.lab.live.sitl.measured import TURN, ZURICH, Measured, Origin, as_origin, frd
@@ -58,7 +58,11 @@ class Betaflight(FirmwareLink):
         Raises:
             ConfigError: If an argument is out of range, or the port of the motors is in use.
         """
-        self.gazebo, self.origin, self._rc_rate = flag("gazebo", gazebo), as_origin(origin), Rate("rc_freq", rc_freq)
+        self.gazebo, self.origin, self._rc_rate = (
+            check_flag("gazebo", gazebo),
+            as_origin(origin),
+            Rate("rc_freq", rc_freq),
+        )
         self._start: tuple[float, float] | None = None
         if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
             raise ConfigError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.core.airframes import as_airframes
-from crazysim.core.settings import dividing_rate, flag
+from crazysim.core.settings import check_flag, dividing_rate
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError, shown
 from crazysim.lab.live.attitude import rotate
@@ -84,7 +84,7 @@ class SoftwareInTheLoop(Closing):
             )
         if motors not in ("speed", "thrust"):
             raise ConfigError(f"expected motors as 'speed' or 'thrust', got {motors!r}")
-        reversed = flag("reversed", reversed)
+        reversed = check_flag("reversed", reversed)
         self._n_steps = sim.freq // freq
         airframes = [*as_airframes(sim.airframes, sim.n_drones)] * sim.n_worlds
         self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]

@@ -44,7 +44,7 @@ class MapKernels:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             if platform == "gpu":
-                self._launches[platform] = cuda.compiled(map_kernel.write_map(self._block, "cuda"))
+                self._launches[platform] = cuda.compile_kernel(map_kernel.write_map(self._block, "cuda"))
             else:
                 self._launches[platform] = native.HostLaunch(map_kernel.write_map(self._block, "host"))
         return self._launches[platform]
@@ -69,7 +69,7 @@ map_p = jaxcompat.primitive_by_platform(
 """Call of a kernel: its tables, to its results for all indices."""
 
 
-def mapped(fn: Function, n: int, tables: Sequence[Array], platform: str | None) -> list[Array]:
+def map_indices(fn: Function, n: int, tables: Sequence[Array], platform: str | None) -> list[Array]:
     """Return the results of a function for the indices 0 to ``n - 1``. (n,) each
 
     It has no derivative. Under ``vmap`` one call follows the other.

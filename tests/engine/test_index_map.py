@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crazysim.core.lanes import any_lane, compute_where, table_row, table_rows
-from crazysim.engine.mapped import lower_map, mapped
+from crazysim.core.branches import any_lane, compute_where, table_row, table_rows
+from crazysim.engine.index_map import lower_map, map_indices
 from crazysim.errors import UnsupportedError
 
 N = 1003  # a part of a vector is left over
@@ -46,7 +46,7 @@ def by_hand(numbers, places):
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_lanes_stop_and_skip_on_their_own(tables, platform):
-    found = jax.jit(lambda *tables: mapped(longest_run, N, tables, platform))(*tables)
+    found = jax.jit(lambda *tables: map_indices(longest_run, N, tables, platform))(*tables)
     for x, y in zip(found, by_hand(*map(np.asarray, tables)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
 
@@ -54,7 +54,7 @@ def test_lanes_stop_and_skip_on_their_own(tables, platform):
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_a_batch_of_tables_is_a_batch_of_calls(tables, platform):
     numbers = jnp.stack([tables[0], 2 * tables[0]])
-    found = jax.jit(jax.vmap(lambda x: mapped(longest_run, N, [x, tables[1]], platform)))(numbers)
+    found = jax.jit(jax.vmap(lambda x: map_indices(longest_run, N, [x, tables[1]], platform)))(numbers)
     for k in range(2):
         expected = by_hand(np.asarray(numbers[k]), np.asarray(tables[1]))
         np.testing.assert_allclose(found[0][k], expected[0], rtol=1e-5, atol=1e-6)
@@ -77,7 +77,7 @@ def test_lanes_that_walk_together_find_what_each_finds(tables, platform):
         start = jnp.int32(0), jnp.int32(0), jnp.int32(0)
         return jax.lax.while_loop(lambda carry: carry[0] < 9, turn, start)[1:]
 
-    count, own = jax.jit(lambda x: mapped(fn, N, [x], platform))(tables[0])
+    count, own = jax.jit(lambda x: map_indices(fn, N, [x], platform))(tables[0])
     index = np.arange(N)
     limit = index[:, None].astype(np.float32) / np.float32(N) - np.float32(0.5)
     np.testing.assert_array_equal(count, (np.asarray(tables[0])[:, 0] < limit).sum(axis=1))
@@ -85,7 +85,7 @@ def test_lanes_that_walk_together_find_what_each_finds(tables, platform):
 
 
 def test_a_kernel_for_a_gpu_is_compiled_without_one(tables):
-    fn = jax.jit(lambda *tables: mapped(longest_run, N, tables, "cpu"))
+    fn = jax.jit(lambda *tables: map_indices(longest_run, N, tables, "cpu"))
     assert ".visible .entry advance" in fn.trace(*tables).lower(lowering_platforms=("cuda",)).as_text()
 
 
