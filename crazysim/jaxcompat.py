@@ -1,7 +1,30 @@
 """All use of JAX beyond its documented, stable interface; a new release of JAX is met here first.
 
 Each name has a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the
-newest JAX that are supported.
+newest JAX that are supported. What each use would be replaced by, if a release took it away:
+
+- **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
+  ``jax.make_jaxpr``, which takes as long as the first time. A fallback here.
+- **batched_device_put** (``put_host_array``): ``jax.device_put``, ten times slower for a command. A fallback here, also
+  used where jaxlib lacks the function.
+- **Donation, and views of arrays of the CPU while one is donated** (``jit_donating``, ``view_on_host``): functions are
+  compiled without donation, and the host copies the arrays that kernels read. A fallback here.
+- **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
+  of XLA's foreign function interface, a ``ctypes`` callback registered by ``jax.ffi.register_ffi_target`` for
+  ``"CUDA"``. It would read the addresses of operands and results and the attributes (kernel, grid, block) from
+  ``XLA_FFI_CallFrame``, get the stream by ``XLA_FFI_Stream_Get``, load the PTX once in each context by
+  ``cuModuleLoadData``, and launch it by ``cuLaunchKernel``. Not written, since it can only be tried on a GPU; without
+  it ``engine="lanes"`` runs there.
+- **Primitives of our own** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
+  ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``. No fallback.
+- **Rules that read equations** (``Equation``, ``bind``, ``as_function``, ``expand_primitive``): nothing else shows what
+  a function computes. A stage with a primitive that has changed is run unfused.
+- **Threefry's primitive** (``threefry2x32_p``): its rounds written out, as in ``engine/backends/interpret.py``.
+- **The compilation cache of one thread** (``compilation_cache``): without it, programs are only kept in the folder that
+  JAX is configured with. It is used where these names are missing.
+- **_cache_size** (``n_compilations``): only tests need it.
+
+``CRAZYSIM_JAX_FALLBACKS=1`` selects all fallbacks, to try them.
 """
 
 from __future__ import annotations
@@ -10,6 +33,7 @@ import contextlib
 import dataclasses
 import functools
 import math
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -22,12 +46,17 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
 from jax.extend.random import threefry2x32_p, threefry_prng_impl
 from jax.interpreters import ad, batching, mlir
-from jaxlib.xla_client import batched_device_put
 
 from crazysim.errors import UnsupportedError
 
+try:
+    from jaxlib.xla_client import batched_device_put
+except ImportError:
+    batched_device_put = None
+
 __all__ = [
     "DIGAMMA_AT_ZERO",
+    "FALLBACKS",
     "ClosedJaxpr",
     "Equation",
     "Jaxpr",
@@ -51,6 +80,7 @@ __all__ = [
     "is_key",
     "is_symbolic_zero",
     "jaxpr_as_fun",
+    "jit_donating",
     "n_compilations",
     "primitive_by_platform",
     "put_host_array",
@@ -60,8 +90,12 @@ __all__ = [
     "threefry2x32_p",
     "threefry_prng_impl",
     "versions",
+    "view_on_host",
     "vmap_rule_of",
 ]
+
+FALLBACKS = os.environ.get("CRAZYSIM_JAX_FALLBACKS") == "1"
+"""Whether public functions of JAX are used wherever they can replace others, as listed above."""
 
 
 # Jaxprs ---------------------------------------------------------------------------------------------------------
@@ -80,10 +114,31 @@ def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
         inputs: Positions of the inputs to keep.
     """
     inner = jaxpr.jaxpr
+    if FALLBACKS:
+        unused = [_zeros(v.aval) for v in inner.invars]
+
+        def fn(*args: Any) -> list[Any]:
+            given = dict(zip(inputs, args, strict=True))
+            return jaxpr_as_fun(jaxpr)(*(given.get(i, zeros) for i, zeros in enumerate(unused)))
+
+        return _traced(fn, [inner.invars[i] for i in inputs])
     invars = [inner.invars[i] for i in inputs]
     return ClosedJaxpr(
         Jaxpr(inner.constvars, invars, inner.outvars, inner.eqns, inner.effects, inner.debug_info), jaxpr.consts
     )
+
+
+def _traced(fn: Callable[..., Any], variables: Sequence[Any]) -> ClosedJaxpr:
+    """Return the jaxpr of a function of some variables of another jaxpr."""
+    avals = [(v.aval, getattr(v.aval, "weak_type", False)) for v in variables]
+    return jax.make_jaxpr(fn)(*(jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=weak) for x, weak in avals))
+
+
+def _zeros(aval: Any) -> Any:
+    if not is_key(aval):
+        return np.zeros(aval.shape, aval.dtype)
+    with jax.ensure_compile_time_eval():
+        return jax.random.split(jax.random.key(0, impl=bits_generator(aval.dtype)), aval.shape)
 
 
 def equations(jaxpr: ClosedJaxpr) -> Iterator[Any]:
@@ -267,6 +322,10 @@ def _compiled_primitive(primitive: Primitive, **params: Any) -> Callable[..., An
 def constants_to_inputs(closed: ClosedJaxpr) -> ClosedJaxpr:
     """Return a jaxpr that takes what it closes over as its first inputs."""
     x = closed.jaxpr
+    if FALLBACKS:
+        n = len(closed.consts)
+        fn = lambda *args: jaxpr_as_fun(ClosedJaxpr(x, args[:n]))(*args[n:])  # noqa: E731
+        return _traced(fn, [*x.constvars, *x.invars])
     return ClosedJaxpr(Jaxpr((), [*x.constvars, *x.invars], x.outvars, x.eqns, x.effects, x.debug_info), ())
 
 
@@ -303,10 +362,10 @@ def put_host_array(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
 
     Args:
         x: The array, of a type that JAX has.
-        sharding: Its device; for several this is ``jax.device_put``.
+        sharding: Its device, or devices.
     """
     devices = sharding.device_set
-    if len(devices) > 1:
+    if len(devices) > 1 or FALLBACKS or batched_device_put is None:
         return jax.device_put(x, sharding)
     return batched_device_put(_aval(x.shape, x.dtype), sharding, [x], list(devices), True)
 
@@ -314,6 +373,19 @@ def put_host_array(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
 @functools.cache
 def _aval(shape: tuple[int, ...], dtype: Any) -> Any:
     return jax.core.ShapedArray(shape, dtype)
+
+
+def view_on_host(x: jax.Array) -> np.ndarray:
+    """Return an array of the CPU as a NumPy array of the same memory, contiguous.
+
+    JAX does not write into this memory while the view exists, not even if the array is donated.
+    """
+    return np.array(x) if FALLBACKS else np.ascontiguousarray(x)
+
+
+def jit_donating(fn: Callable[..., Any]) -> Any:
+    """Return ``jax.jit(fn)`` that may reuse the memory of its first argument, which must not be used any more."""
+    return jax.jit(fn) if FALLBACKS else jax.jit(fn, donate_argnums=0)
 
 
 # Random numbers -------------------------------------------------------------------------------------------------

@@ -2,6 +2,10 @@
 
 import dataclasses
 import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +45,12 @@ def test_a_jaxpr_drops_inputs_that_it_does_not_use():
     some = jaxcompat.select_inputs(jaxpr, [0, 2])
     assert len(some.jaxpr.invars) == 2
     assert jaxcompat.jaxpr_as_fun(some)(5.0, 3.0)[0] == 2.0
+
+
+def test_an_input_that_is_dropped_may_be_a_random_key():
+    jaxpr = jax.make_jaxpr(lambda key, x: (x + 1.0,))(jax.random.key(0), jnp.ones(3))
+    some = jaxcompat.select_inputs(jaxpr, [1])
+    np.testing.assert_array_equal(jaxcompat.jaxpr_as_fun(some)(jnp.zeros(3))[0], np.ones(3))
 
 
 def test_parameters_and_operands_of_an_equation_are_read():
@@ -204,6 +214,22 @@ def test_an_array_of_the_host_is_split_over_devices():
     np.testing.assert_array_equal(placed, np.arange(4.0))
 
 
+def test_an_array_of_the_cpu_is_viewed():
+    """Its memory is JAX's own, and stays as it is when the array is donated; fallbacks copy it."""
+    x = jnp.arange(3.0)
+    view = jaxcompat.view_on_host(x)
+    assert np.shares_memory(view, np.asarray(x)) != jaxcompat.FALLBACKS
+    np.testing.assert_array_equal(jaxcompat.jit_donating(lambda x: x + 7.0)(x), [7.0, 8.0, 9.0])
+    np.testing.assert_array_equal(view, [0.0, 1.0, 2.0])
+
+
+def test_an_argument_is_donated():
+    """Fallbacks donate nothing."""
+    x = jnp.arange(3.0)
+    np.testing.assert_array_equal(jaxcompat.jit_donating(lambda x, y: x + y)(x, 1.0), [1.0, 2.0, 3.0])
+    assert x.is_deleted() != jaxcompat.FALLBACKS
+
+
 # Random numbers ------------------------------------------------------------------------------------------------------
 
 
@@ -302,15 +328,11 @@ def test_versions_are_those_installed():
 
 
 def test_the_header_of_foreign_functions_is_there():
-    from pathlib import Path
-
     assert (Path(jaxcompat.ffi_include_folder()) / "xla" / "ffi" / "api" / "c_api.h").is_file()
 
 
 def test_only_one_module_goes_beyond_the_public_interface():
     """Whatever else a new JAX breaks, it breaks here."""
-    from pathlib import Path
-
     import crazysim
 
     private = ("jax.extend", "jax._src", "jax.interpreters", "jax.experimental", "jax.custom_batching", "SymbolicZero",
@@ -324,6 +346,22 @@ def test_only_one_module_goes_beyond_the_public_interface():
     }
     # Methods of ours by that name, for the tests of law 6.
     assert found == {"engine/step.py: _cache_size", "engine/backends/plain.py: _cache_size"}
+
+
+def test_the_engine_runs_without_what_jax_may_take_away():
+    """Every fallback, and simulations on them: on the host without XLA, and by the compiled step."""
+    tests = ["tests/test_jaxcompat.py", "tests/engine/test_host_call.py"]
+    some = ("inputs or dropped or closes_over or device or viewed or donate or leaves_are_made_once or compiled_step"
+            " and not devices_and_engines")  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *tests, "-k", some, "-n", "0"],
+        cwd=Path(__file__).parents[1],
+        env={k: v for k, v in os.environ.items() if "PYTEST" not in k} | {"CRAZYSIM_JAX_FALLBACKS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_digamma_at_zero_is_that_of_this_version():

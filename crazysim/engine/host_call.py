@@ -209,7 +209,7 @@ class HostCall:
         held = self._held.get(i)
         if held is None or held[0] is not x:
             numbers = jax.random.key_data(x) if jaxcompat.is_key(x) else x
-            held = self._held[i] = x, np.ascontiguousarray(numbers)
+            held = self._held[i] = x, jaxcompat.view_on_host(numbers)
         return held[1]
 
     def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:

@@ -93,4 +93,4 @@ class EnvStepper:
             state = EnvState(after.data())
             return [after.leaves[i] for i in carried], self._output(state), (state.terminated, state.truncated)
 
-        self.compiled = jax.jit(step, donate_argnums=0)  # no caller has what is carried
+        self.compiled = jaxcompat.jit_donating(step)  # no caller has what is carried

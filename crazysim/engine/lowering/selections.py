@@ -9,7 +9,7 @@ from __future__ import annotations
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 
 INDEX_REDUCTION_OF = {"min": "argmin", "max": "argmax"}
-"""Reductions, see ``ops.PLACES``, that find the drone with the smallest or largest number."""
+"""Reductions, see ``ops.INDEX_REDUCTIONS``, that find the drone with the smallest or largest number."""
 
 
 def add_selections(block: Block) -> Block:
