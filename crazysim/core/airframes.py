@@ -62,11 +62,7 @@ def as_airframes(airframes: Airframes, n_drones: int = 1) -> tuple[Airframe, ...
 
 
 def airframe_of(airframes: Airframes) -> Airframe:
-    """Return the airframe of all drones.
-
-    Raises:
-        ConfigError: If they have several.
-    """
+    """Return the airframe of all drones."""
     first, *others = as_airframes(airframes)
     if any(other is not first for other in others):
         names = ", ".join(dict.fromkeys(repr(airframe.name) for airframe in (first, *others)))
@@ -110,9 +106,6 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
         airframes: Airframe of each drone.
         create: From an airframe to its record, shared by all drones of it.
         n_worlds: Number of worlds.
-
-    Raises:
-        ConfigError: If the records have different fields.
     """
     airframes = as_airframes(airframes)
     kinds = list({id(airframe): airframe for airframe in airframes}.values())

@@ -29,11 +29,7 @@ class ControllerData(PyTree):
 
     @staticmethod
     def create(n_worlds: int, n_drones: int, controller: Controller, airframes: Airframes) -> ControllerData:
-        """Return a controller at rest, with the gains of each drone's airframe.
-
-        Raises:
-            ConfigError: If an airframe lacks a number, or a record has leaves of another scope or of other counts.
-        """
+        """Return a controller at rest, with the gains of each drone's airframe."""
         params = create_per_drone(airframes, controller.params, n_worlds)
         memory, one = (
             create_per_drone(airframes, controller.memory, n_worlds),
@@ -167,9 +163,6 @@ def require_same_controllers(controls: SimControls, like: SimControls, name: str
         controls: Commands and controllers to check.
         like: Those of the simulation.
         name: Name of the simulation's controller.
-
-    Raises:
-        ConfigError: If they differ.
     """
     given, needed = _controllers_of(controls), _controllers_of(like)
     if given == needed:  # the same objects
@@ -252,9 +245,6 @@ class SimControls(PyTree):
             airframes: Airframe of all drones, or of each.
             freqs: Rates at which commands of each level take effect, Hz.
             controller: Controller of the command level; None if commands need none.
-
-        Raises:
-            ConfigError: If the dynamics do not support the command level, or an airframe lacks gains.
         """
         shape = (n_worlds, n_drones)
         require_pair(dynamics, control)
@@ -298,11 +288,7 @@ class SimControls(PyTree):
 
 
 def require_pair(dynamics: Dynamics, control: Control) -> None:
-    """Check that a dynamics model supports a command level.
-
-    Raises:
-        ConfigError: If it does not.
-    """
+    """Check that a dynamics model supports a command level."""
     if dynamics != Dynamics.first_principles and control not in (Control.state, Control.attitude):
         raise ConfigError(
             f"control {control.value!r} needs rotors, which dynamics {dynamics.value!r} does not have. Use "
@@ -311,11 +297,7 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
 
 
 def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
-    """Check that controllers follow their levels, and that the dynamics follow the last command.
-
-    Raises:
-        ConfigError: If they do not.
-    """
+    """Check that controllers follow their levels, and that the dynamics follow the last command."""
     followers, last = controller_chain(controller, control)
     for level, each in followers:
         for member in each.members:

@@ -219,9 +219,6 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
         dynamics: Dynamics model.
         airframe: Airframe of all drones, or of each.
         n_worlds: Number of worlds.
-
-    Raises:
-        ConfigError: If an airframe has no parameters for the model.
     """
     n_rotors = n_rotors_of(airframe)
 
@@ -250,11 +247,7 @@ def command_shape(data: SimData, control: Control) -> tuple[int, int, int]:
 
 
 def as_key(seed: int | Array) -> Array:
-    """Return the typed random key of a seed; a key is returned unchanged.
-
-    Raises:
-        ConfigError: If it is neither an integer nor a key.
-    """
+    """Return the typed random key of a seed; a key is returned unchanged."""
     dtype = getattr(seed, "dtype", np.dtype(int) if type(seed) is int else None)
     is_key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     is_integer = dtype is not None and jnp.issubdtype(dtype, jnp.integer)

@@ -94,11 +94,7 @@ def check_setpoint(
 
 
 def _joined(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:
-    """Return the setpoint of some parts, on the host if all of them are. (n_worlds, n_drones, 16)
-
-    Raises:
-        ConfigError: If there is no position, or a part has another shape or type, or is NaN or infinite on the host.
-    """
+    """Return the setpoint of some parts, on the host if all of them are. (n_worlds, n_drones, 16)"""
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
     counts = data.states.pos.shape[:2]

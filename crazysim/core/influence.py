@@ -24,9 +24,6 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
     It may write what the dynamics read besides the states that they advance: ``states.force``, ``states.torque``, the
     rotor command (``controls.attitude.cmd`` in fitted dynamics), and ``params``. Anything else would be discarded
     without effect, or count in the derivative as a state that the drone does not have.
-
-    Raises:
-        ConfigError: If it wrote another field, or returned one in another shape.
     """
     where = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
     after = _called(where, plugin.influence, data)
@@ -58,11 +55,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
 
 
 def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
-    """Return the rates of the plugin's own states, checked.
-
-    Raises:
-        ConfigError: If a rate is not that of a state in the plugin's record, or has another shape or type.
-    """
+    """Return the rates of the plugin's own states, checked."""
     where = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
     rates = _called(where, plugin.derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):

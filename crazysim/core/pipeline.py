@@ -20,9 +20,6 @@ def check_pipeline(name: str, pipeline: object) -> Pipeline:
     Args:
         name: Name of the pipeline, for messages.
         pipeline: The pipeline.
-
-    Raises:
-        ConfigError: If it is not a dict from names to functions, or is empty.
     """
     if not isinstance(pipeline, dict) or not pipeline:
         raise ConfigError(

@@ -199,11 +199,7 @@ class Plugin:
             raise TypeError(f"plugin {cls.__name__} has no field 'name'; add one, such as name: str = 'my_plugin'")
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation.
-
-        Raises:
-            ConfigError: If one has another type than its field, or a number is not finite or out of its range.
-        """
+        """Check the settings that do not depend on a simulation."""
         check_settings(self)
 
     @property
@@ -256,9 +252,6 @@ class Plugin:
             sim: The simulation.
             kind: Class of the record.
             given: Fields as they are to be. Settings of those that are None are checked nevertheless.
-
-        Raises:
-            ConfigError: If a setting is invalid.
         """
         settings = {name: each for name, each in settings_of(type(self)).items() if each.is_parameter}
         values = dict(given)
@@ -389,9 +382,6 @@ def plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
     Args:
         name: Name of the argument in messages.
         plugins: The plugins.
-
-    Raises:
-        ConfigError: If they are not a list of plugins.
     """
     if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
         example = "IMU()" if name == "sensors" else "Wind()"
@@ -427,21 +417,16 @@ class FunctionPlugin(Plugin):
 
     @property
     def is_dynamic(self) -> bool:
-        """True if there is an influence."""
         return self.influence_fn is not None
 
     def record(self, sim: Simulation) -> PyTree | None:
-        """Return the record."""
         return self.data
 
     def default_record(self, sim: Simulation) -> PyTree | None:
-        """Return the record that resets restore."""
         return self.data if self.default is None else self.default
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages."""
         return self.placements
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data as the dynamics are to use it."""
         return data if self.influence_fn is None else self.influence_fn(data)

@@ -61,11 +61,7 @@ class Population(Plugin):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the members, in order.
-
-        Raises:
-            ConfigError: If the members are neither a positive number nor distinct names.
-        """
+        """Names of the members, in order."""
         members, kind = self.members, type(self).__name__
         if isinstance(members, (int, np.integer)) and not isinstance(members, bool):
             if members > MAX_MEMBERS:
@@ -106,9 +102,6 @@ class Population(Plugin):
             kind: Class of the record.
             fields: Values of its fields: for a leaf of members of shape (), (*core), (n_members, *core) or
                 (n_worlds, n_members, *core); other leaves and records within it as they are.
-
-        Raises:
-            ConfigError: If the members are invalid, or a value has another shape.
         """
         self.check(sim)
         counts = sim.n_worlds, self.n_members
@@ -121,11 +114,7 @@ class Population(Plugin):
         return kind(population=self.name, n_members=self.n_members, member_id=ids, **values)  # type: ignore[call-arg]
 
     def check(self, sim: Simulation) -> None:
-        """Check the name of the population and the rate of its controller.
-
-        Raises:
-            ConfigError: If one is invalid.
-        """
+        """Check the name of the population and the rate of its controller."""
         if self.name in (*RESERVED_SCOPES, "drone", "world"):
             raise ConfigError(f"expected a name of a population, got {self.name!r}, a scope of stages. Use name=.")
         if self.control_freq is not None:
@@ -249,11 +238,7 @@ def _fields(record: Members) -> set[str]:
 
 
 def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: Any) -> Array | np.ndarray:
-    """Return a command of some shape as an array of a type.
-
-    Raises:
-        ValueError: If it has another shape, or a number on the host is NaN or infinite.
-    """
+    """Return a command of some shape as an array of a type."""
     on_host = not isinstance(command, jax.Array)
     array = np.asarray(command, dtype) if on_host else command
     if array.shape != shape:
@@ -267,11 +252,7 @@ def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: 
 
 
 def _of_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
-    """Return a value repeated for every member of every world.
-
-    Raises:
-        ConfigError: If its shape does not allow that.
-    """
+    """Return a value repeated for every member of every world."""
     array = np.asarray(value)
     is_integer = array.dtype.kind in "iu" and hasattr(
         value, "dtype"

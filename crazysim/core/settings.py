@@ -48,9 +48,6 @@ def positive_integer(name: str, value: object, at_most: int | None = None) -> in
         name: Name of the setting, for messages.
         value: The setting.
         at_most: Largest value; None for any.
-
-    Raises:
-        ConfigError: If the value is anything else.
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ConfigError(f"{name} is {shown(value)}; it must be a positive whole number")
@@ -65,9 +62,6 @@ def check_flag(name: str, value: object) -> bool:
     Args:
         name: Name of the setting, for messages.
         value: The setting.
-
-    Raises:
-        ConfigError: If it is anything but True or False; ``"no"`` and 2 would count as true.
     """
     if not isinstance(value, (bool, np.bool_)):
         raise ConfigError(f"expected {name} as True or False, got {shown(value)}")
@@ -155,9 +149,6 @@ def check_settings(settings: Any) -> None:
     finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and those of
     ``Callable`` and ``Mapping`` functions and mappings of any kind. None is accepted where the annotation or the
     default allows it. Shapes that depend on the simulation, as those of parameters do, are checked with it.
-
-    Raises:
-        ConfigError: If a field has anything else.
     """
     kind = type(settings)
     for field in dataclasses.fields(settings):
@@ -225,22 +216,14 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
 
 
 def check_softness(freq: int, softness: ArrayLike) -> None:
-    """Check the time constant with which an overlap is pushed out, s, at ``freq`` steps per second, Hz.
-
-    Raises:
-        ConfigError: If it is shorter than two steps.
-    """
+    """Check the time constant with which an overlap is pushed out, s, at ``freq`` steps per second, Hz."""
     numbers(
         "softness", softness, Range(f"from two steps, {2 / freq:.4g} s, to {MAX_SOFTNESS:g}", 2 / freq, MAX_SOFTNESS)
     )
 
 
 def physics_freq(freq: object) -> int:
-    """Return the rate of physics steps, Hz.
-
-    Raises:
-        ConfigError: If it is no positive integer, or too high for float32.
-    """
+    """Return the rate of physics steps, Hz."""
     freq = positive_integer("freq", freq)
     if freq > 10_000 and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise ConfigError(
@@ -294,9 +277,6 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
     Args:
         rgba: Red, green, blue and opacity, 0 to 1.
         n: Number of things that may have a colour each, for (n, 4); None for one colour.
-
-    Raises:
-        ConfigError: If it is anything else, such as a name.
     """
     shapes = ((4,),) if n is None else ((4,), (n, 4))
     return numbers("rgba", rgba, bounds(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
@@ -311,9 +291,6 @@ def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Arra
         mask: One bool for each world, or for each of something else.
         shapes: Shapes that it may have: (n_worlds,), or () in functions of one world.
         each: Name of the things that have one bool each, for the message.
-
-    Raises:
-        ConfigError: If it has another type or shape. Numbers, indices and single bools are not broadcast.
     """
     if mask is None:
         return None
@@ -331,11 +308,7 @@ def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Arra
 
 
 def check_rates(control: Control, freq: int, given: Mapping[Control, int | None]) -> None:
-    """Check requested rates, Hz; None is that of a controller.
-
-    Raises:
-        ConfigError: If one is not positive, or does not divide ``freq`` at or below the command level.
-    """
+    """Check requested rates, Hz; None is that of a controller."""
     in_use = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
@@ -360,9 +333,6 @@ def control_freqs(
         freq: Rate of physics steps, Hz.
         given: Requested rates, Hz; None for the default, the largest divisor of ``freq`` up to 500 Hz.
         controller: Controller of the command level, from ``controller_at_rates``; None if commands need none.
-
-    Raises:
-        ConfigError: If a default is far below 500 Hz.
     """
     followers, last = controller_chain(controller, control)
     freqs = {}
@@ -382,10 +352,6 @@ def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[
         freq: Rate of physics steps, Hz.
         defaults: Default rates by the names of their settings, Hz.
         of: End of the names in the message.
-
-    Raises:
-        ConfigError: If a rate is below half of its default; where ``freq`` is below the default, if it is below half
-            of ``freq`` or of ``SLOW_FREQ``. The message names the nearest ``freq`` that is good for all.
     """
 
     def low(freq: int) -> list[str]:
@@ -431,9 +397,6 @@ def controller_at_rates(
         control: Command level.
         freq: Rate of physics steps, Hz.
         given: Requested rates, Hz; None for those of the controller.
-
-    Raises:
-        ConfigError: If a rate does not divide ``freq``, or is far below its default.
     """
     if isinstance(controller, Switch):
         members = tuple(controller_at_rates(member, control, freq, given) for member in controller.controllers)

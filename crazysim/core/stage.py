@@ -153,7 +153,6 @@ class Axes:
     """Names and batch axes of all leaves of a simulation's data."""
 
     def __init__(self, data: SimData):
-        """Take the data of all worlds."""
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
         self.numbers = leaf_indices(data)
@@ -161,11 +160,7 @@ class Axes:
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
     def written(self, before: list[Array], after: SimData, stage: Stage) -> list[int]:
-        """Return the numbers of the leaves that a stage wrote, and check that it may.
-
-        Raises:
-            ConfigError: If it changed the structure, or a leaf's shape or type, or wrote a leaf beyond its scope.
-        """
+        """Return the numbers of the leaves that a stage wrote, and check that it may."""
         name = stage.__name__
         new, treedef = jax.tree.flatten(after)
         if treedef != self.treedef:
@@ -191,11 +186,7 @@ class Axes:
         return written
 
     def writable(self, stage: Stage) -> list[str] | None:
-        """Return the scopes of the leaves that a stage may write; None for all.
-
-        Raises:
-            ConfigError: If the stage is declared for a population that does not exist.
-        """
+        """Return the scopes of the leaves that a stage may write; None for all."""
         if stage.scope == "batch":
             return None
         populations = list(dict.fromkeys(scope for scope in self.scopes if has_members(scope)))

@@ -121,7 +121,6 @@ class Results:
     __slots__ = ("_layout", "_memory", "_starts", "addresses")
 
     def __init__(self, layout: _Layout):
-        """Allocate their memory."""
         self._layout = layout
         self._memory = [np.empty(size + ALIGNMENT_BYTES, np.uint8) for size in layout.sizes]
         begins = [_address(x) for x in self._memory]
@@ -130,7 +129,7 @@ class Results:
         self.addresses = [first[piece] + offset for piece, offset in layout.begins]
 
     def array(self, key: Any) -> NDArray:
-        """Return one of them. Where several share memory it is a copy, so that who keeps it keeps it alone."""
+        """Return the array of a key; a copy if several share memory, so that keeping it keeps no other array alive."""
         piece, offset, shape, dtype = self._layout.by_key[key]
         x = np.ndarray(shape, dtype, self._memory[piece], self._starts[piece] + offset)
         return x.copy() if self._layout.shared else x

@@ -31,10 +31,6 @@ class MapKernels:
         Args:
             block: The function.
             platform: ``"cpu"`` or ``"gpu"``.
-
-        Raises:
-            UnsupportedError: If an operation or type has no source.
-            KernelError: If the compiler refuses the kernel or takes too long.
         """
         self._block = block
         self._launches: dict[str, Launch] = {}
@@ -104,9 +100,6 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
     Args:
         fn: The function.
         tables: Tables, or their shapes and types.
-
-    Raises:
-        UnsupportedError: If it has a primitive without a rule.
     """
     avals = [jax.ShapeDtypeStruct((max(len(x.shape) and x.shape[0], 2), *x.shape[1:]), x.dtype) for x in tables]
     lowering = Lowering()

@@ -35,7 +35,7 @@ class FlatData:
     __slots__ = ("_record", "leaves", "plan")
 
     def __init__(self, leaves: list[Any] | HostLeaves, plan: Plan):
-        """Hold the leaves: those of the data, None for one that is in rows, and behind them those that passes add."""
+        """Hold the leaves of the data, with None for a leaf in rows, followed by the leaves that passes add."""
         self.leaves: Any = leaves
         self.plan = plan
         self._record: SimData | None = None
@@ -152,11 +152,7 @@ class Step:
         return self.of([stage for stage in self.stages if stage.__name__ not in names])
 
     def of(self, stages: Sequence[Stage]) -> Step:
-        """Return the step of other stages, with the same engine and devices.
-
-        Raises:
-            ConfigError: If two of them have the same name.
-        """
+        """Return the step of other stages, with the same engine and devices."""
         names = [stage.__name__ for stage in stages]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ConfigError(f"expected stages of different names, got {', '.join(twice)} twice. Rename yours.")
@@ -333,11 +329,7 @@ class Step:
 
 
 def _check_steps(n_steps: Any) -> None:
-    """Check a number of steps.
-
-    Raises:
-        ConfigError: If it is no integer from 0 to ``MAX_STEPS``, nor an array of one.
-    """
+    """Check a number of steps."""
     is_array = isinstance(n_steps, (jax.Array, np.ndarray, np.generic))
     is_integer = jnp.issubdtype(n_steps.dtype, jnp.integer) if is_array else isinstance(n_steps, int)
     if not is_integer or isinstance(n_steps, bool) or np.shape(n_steps):

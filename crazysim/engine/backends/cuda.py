@@ -173,11 +173,7 @@ def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
 
 @functools.cache
 def ptx(kernel: Kernel, arch: str) -> str:
-    """Return a kernel's PTX.
-
-    Raises:
-        KernelError: If NVRTC is missing, or refuses the source, with its message.
-    """
+    """Return a kernel's PTX."""
     if dump.is_enabled():
         dump.write(f"kernel.{arch}.cu", f"// NVRTC --gpu-architecture={arch} {' '.join(NVRTC_OPTIONS)}\n{kernel.text}")
     return _compile(kernel.text, arch, "PTX").decode()
@@ -245,9 +241,6 @@ def _compile(source: str, arch: str, kind: str) -> bytes:
         source: The source.
         arch: Architecture.
         kind: ``"PTX"`` or ``"CUBIN"``.
-
-    Raises:
-        KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
     library = nvrtc()
     if library is None:

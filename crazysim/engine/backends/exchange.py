@@ -98,12 +98,10 @@ class OneLane:
     depth = 0
 
     def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
-        """Write a variable, and return its name."""
         writer.line(f"auto {name} = {value};", depth)
         return name
 
     def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
-        """Write a constant, and return its name."""
         writer.line(f"const auto {name} = {value};", depth)
         return name
 
@@ -118,7 +116,6 @@ class Registers(OneLane):
     """Lanes of one warp or vector, which read each other's registers."""
 
     def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
-        """Return how numbers are read from the registers of another lane."""
         names = []
         for kind, value in values:
             names.append(writer.new())
@@ -127,7 +124,6 @@ class Registers(OneLane):
 
     @property
     def declarations(self) -> list[str]:
-        """Return no lines."""
         return []
 
 
@@ -135,11 +131,7 @@ class SharedMemory(OneLane):
     """Threads of one block of a GPU, which read what the others wrote to the block's memory."""
 
     def __init__(self, lanes: int):
-        """Exchange numbers between so many lanes.
-
-        Raises:
-            UnsupportedError: If a block has not as many threads.
-        """
+        """Exchange numbers between so many lanes."""
         if lanes > MAX_THREADS:
             raise UnsupportedError(f"the drones of a world read each other's numbers, up to {MAX_THREADS} on a GPU")
         self.lanes = lanes
@@ -183,7 +175,6 @@ class Sweeps:
     depth = 1
 
     def __init__(self) -> None:
-        """Begin without numbers in memory."""
         self.kept: list[str] = []
 
     def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
@@ -224,11 +215,7 @@ class Sweeps:
 
 
 def exchange_for(target: str, group: int) -> Exchange:
-    """Return how the drones of a world read each other's numbers on a target.
-
-    Raises:
-        UnsupportedError: If there are too many drones.
-    """
+    """Return how the drones of a world read each other's numbers on a target."""
     if target == "cuda":
         return Registers() if group <= WARP_THREADS else SharedMemory(lanes_of_block(group)[1])
     return Registers() if group <= MAX_IN_VECTOR else Sweeps()

@@ -40,21 +40,13 @@ class Kernels:
         Args:
             program: The program, which one kernel can run.
             location: The devices.
-
-        Raises:
-            UnsupportedError: If an operation or type has no source.
-            KernelError: If the compiler refuses the kernel or takes too long.
         """
         self.program = program
         self.inputs, self.outputs = kernel.needed_leaves(program), tuple(program.written)
         self._launches = {location.platform: self._compiled(location)}
 
     def on(self, platform: str) -> Launch:
-        """Return the function that calls the kernel of a platform.
-
-        Raises:
-            ConfigError: If it has none.
-        """
+        """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             try:
                 self._launches[platform] = self._compiled(Location(platform))
@@ -114,7 +106,6 @@ class FusedRun:
     """A ``Run``, and the kernel that it calls."""
 
     def __init__(self, run: Run, kernels: Kernels | None):
-        """Take the function, and its kernel; None if there are several."""
         self._run, self.kernels = run, kernels
 
     def __call__(self, leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:

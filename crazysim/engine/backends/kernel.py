@@ -28,9 +28,6 @@ def write(program: Program, target: str) -> Kernel:
     Args:
         program: The program.
         target: ``"cuda"`` or ``"host"``.
-
-    Raises:
-        UnsupportedError: If there is no source for an operation or a type; the error names the stage.
     """
     require_source(program)
     body = Body(program, target)
@@ -180,11 +177,7 @@ class Body:
 
 
 def require_source(program: Program) -> None:
-    """Check that a program has source.
-
-    Raises:
-        UnsupportedError: If it has none; the error names the stage.
-    """
+    """Check that a program has source."""
     for segment in program.fused_segments:
         require(segment.hoisted)
         require(segment.block)

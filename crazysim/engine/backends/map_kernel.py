@@ -14,9 +14,6 @@ def write_map(block: Block, target: str) -> Kernel:
     Args:
         block: The function: its inputs are the index and the tables, its outputs single numbers.
         target: ``"cuda"`` or ``"host"``.
-
-    Raises:
-        UnsupportedError: If there is no source for an operation or a type.
     """
     require(block)
     writer, tables = Writer(), block.inputs[1:]

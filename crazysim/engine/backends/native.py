@@ -85,11 +85,7 @@ class HostLaunch:
     """A compiled kernel: called, it is an operation of a traced function."""
 
     def __init__(self, kernel: Kernel):
-        """Compile a kernel.
-
-        Raises:
-            KernelError: If the compiler refuses it or takes too long, with its message.
-        """
+        """Compile a kernel."""
         self._name, self._aliases, self._kept = target(kernel), kernel.aliases(), kernel.kept
 
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
@@ -116,11 +112,7 @@ class HostLaunch:
 
 @functools.cache
 def compiler() -> str | None:
-    """Return the C++ compiler: that of the variable CXX, else g++, clang++ or that of ziglang; None if there is none.
-
-    Raises:
-        ConfigError: If there is no such program as CXX names.
-    """
+    """Return the C++ compiler: CXX if it is set, else g++, clang++ or zig; None without any."""
     chosen = _words("CXX")
     if not chosen:
         return next((path for name in ("g++", "clang++") if (path := shutil.which(name))), None) or _zig()
@@ -144,10 +136,6 @@ def command(options: bool = True) -> list[str]:
 
     Args:
         options: False to leave out those of CXXFLAGS.
-
-    Raises:
-        ConfigError: If CXX or CXXFLAGS is wrong.
-        KernelError: If there is no compiler.
     """
     program = compiler()
     if program is None:
@@ -162,11 +150,7 @@ def command(options: bool = True) -> list[str]:
 
 
 def _words(variable: str) -> list[str]:
-    """Return the words of an environment variable, none if it is not set.
-
-    Raises:
-        ConfigError: If a quotation does not end.
-    """
+    """Return the words of an environment variable, none if it is not set."""
     text = os.environ.get(variable, "")
     try:
         return shlex.split(text)
@@ -175,11 +159,7 @@ def _words(variable: str) -> list[str]:
 
 
 def limit() -> float:
-    """Return the time that the compiler may take, s.
-
-    Raises:
-        ConfigError: If the variable CRAZYSIM_COMPILE_TIMEOUT is no such number.
-    """
+    """Return the time that the compiler may take, s."""
     given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", COMPILE_TIMEOUT)
     try:
         seconds = float(given)
@@ -263,12 +243,7 @@ def _loaded(path: Path) -> ctypes.CDLL | None:
 
 
 def _compile(words: Sequence[str], source: str) -> bytes:
-    """Compile a kernel, and return the library's contents.
-
-    Raises:
-        ConfigError: If CXX, CXXFLAGS or the limit of time is wrong.
-        KernelError: If the compiler refuses it or takes too long.
-    """
+    """Compile a kernel, and return the library's contents."""
     seconds, n_lines = limit(), source.count("\n")
     if n_lines + (SELECTING_LINE_WEIGHT - 1) * len(SELECTING_LINE.findall(source)) > LINES_IN_ONE_SECOND * math.sqrt(
         seconds
@@ -295,9 +270,6 @@ def _check_settings(work: Path) -> None:
 
     Args:
         work: Folder for its files.
-
-    Raises:
-        ConfigError: With the variable, and the compiler's message.
     """
     (work / "empty.cpp").write_text("")
 
@@ -346,9 +318,6 @@ def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = Non
         work: Folder of its temporary files.
         seconds: Time that it may take, s.
         cwd: Working directory; None for that of this process.
-
-    Raises:
-        KernelError: If it cannot be run, or takes too long.
     """
     pipe = subprocess.PIPE
     reader, writer = os.pipe()

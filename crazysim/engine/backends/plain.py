@@ -85,7 +85,6 @@ class Reset:
     """
 
     def __init__(self, pipeline: Pipeline):
-        """Take the functions of a pipeline as they are now."""
         self._stages = tuple(pipeline.items())
         self._compiled = jax.jit(self.plain)
 
@@ -96,9 +95,6 @@ class Reset:
             data: The simulation.
             default_data: The data to return to.
             mask: True in the worlds to reset; None for all. (n_worlds,)
-
-        Raises:
-            ConfigError: If the mask has another shape or type.
         """
         mask = as_mask(mask, data.core.steps.shape[:1])
         with keep_programs(when=not self._cache_size()):

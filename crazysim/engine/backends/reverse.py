@@ -198,9 +198,6 @@ def write(reverse: Reverse, target: str) -> Kernel:
     Args:
         reverse: The transposed derivatives.
         target: ``"cuda"`` or ``"host"``.
-
-    Raises:
-        UnsupportedError: If there is no source for an operation or a type.
     """
     program, n = reverse.program, reverse.n_leaves
     if target == "host" and program.group > MAX_IN_VECTOR:

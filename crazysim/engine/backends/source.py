@@ -63,12 +63,10 @@ class Writer:
         self._count = 0
 
     def new(self, prefix: str = "v") -> str:
-        """Return a name that is not in use."""
         self._count += 1
         return f"{prefix}{self._count}"
 
     def line(self, text: str, depth: int) -> None:
-        """Write a line."""
         self.lines.append(INDENT * depth + text)
 
     def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
@@ -87,7 +85,6 @@ class Writer:
         return [self.element(x) for x in block.outputs]
 
     def forget(self) -> None:
-        """Forget shared intermediate results: their variables are not defined behind this place."""
         self.pairs, self.fours = {}, dict.fromkeys(self.fours, "")
 
     def element(self, x: Element) -> str:
@@ -302,11 +299,7 @@ def _same(a: Element, b: Element) -> bool:
 
 
 def type_name(dtype: DTypeLike) -> str:
-    """Return what a type is called in the source.
-
-    Raises:
-        UnsupportedError: If it has no name there.
-    """
+    """Return what a type is called in the source."""
     dtype = np.dtype(dtype)
     if dtype not in TYPE_NAMES:
         raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")

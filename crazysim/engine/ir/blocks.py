@@ -35,7 +35,6 @@ class Numbers:
     """Entries of a table that are known before the program runs; equal to those of the same type and bits."""
 
     def __init__(self, array: np.ndarray):
-        """Hold a flat array."""
         self.array = array
         self._key = (array.dtype, array.tobytes())
 

@@ -36,11 +36,7 @@ def verify(program: Program) -> Program:
 
 
 def verify_block(block: Block) -> Block:
-    """Return a block unchanged, or say what is wrong with it.
-
-    Raises:
-        VerificationError: If it is not well formed.
-    """
+    """Return a block unchanged, or say what is wrong with it."""
     _verify_block(block, set())
     return block
 

@@ -16,11 +16,7 @@ from crazysim.engine.ir.program import Program, Segment, Slot
 
 
 def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
-    """Return a program without its check, and the perturbed leaves that are floats and are used by it.
-
-    Raises:
-        UnsupportedError: If its derivatives have no kernel.
-    """
+    """Return a program without its check, and the perturbed leaves that are floats and are used by it."""
     if not program.fused:
         raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
     if program.rows:

@@ -105,11 +105,7 @@ class Lowering:
             raise error.located(name) from None
 
     def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
-        """Return an operation on every element; scalars stand for arrays of any shape.
-
-        Raises:
-            UnsupportedError: If the operation is not defined for elements of these types.
-        """
+        """Return an operation on every element; scalars stand for arrays of any shape."""
         shapes = {x.shape for x in args}
         shape = args[0].shape if len(shapes) == 1 else np.broadcast_shapes(*shapes)
         rows = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
@@ -162,11 +158,7 @@ class Rows:
         self._table = builder.input(aval.dtype, self._size)
 
     def row(self, ctx: Lowering, index: Element, sizes: Sequence[int]) -> Elements:
-        """Return the row at an index, which is in range. (1, k)
-
-        Raises:
-            UnsupportedError: If not one whole row is read.
-        """
+        """Return the row at an index, which is in range. (1, k)"""
         if tuple(sizes) != (1, self._size):
             raise UnsupportedError(f"a part of shape {tuple(sizes)} of a table; only whole rows are read")
         base = ctx.scalar("mul", index, constant(self._size, np.int32))
@@ -204,9 +196,6 @@ def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> 
         builder: Takes the inputs.
         aval: Shape and type of the array.
         zeros: Flat indices of elements that are known to be zero: they are no inputs.
-
-    Raises:
-        UnsupportedError: If the engine has no numbers of this type.
     """
     size = int(np.prod(aval.shape, dtype=int))
     if is_key(aval):

@@ -19,10 +19,12 @@ if TYPE_CHECKING:
 
 
 class RelativeAxes(Axes):
-    """Batch axes of all leaves as seen from one population, whose scope is ``drone`` here."""
+    """Batch axes of all leaves with one population in the role of the drones: its scope is ``drone``.
+
+    Leaves of other populations become leaves of the world, in the data as ``view_leaves`` returns it.
+    """
 
     def __init__(self, data: Any, population: str):
-        """Take the data of all worlds, not viewed."""
         super().__init__(data)
         self.original = Axes(data)
         """Batch axes as declared."""
@@ -34,15 +36,14 @@ class RelativeAxes(Axes):
         ]
 
     def stage(self, stage: Stage) -> Stage:
-        """Return a stage on viewed data."""
+        """Return a stage for data from ``view_leaves``."""
         return stage if self.original.scopes == self.scopes else RelativeStage(stage, self)
 
 
 class RelativeStage(Stage):
-    """A stage on viewed data."""
+    """A stage for data from ``view_leaves``, made from a stage for the original data."""
 
     def __init__(self, stage: Stage, axes: RelativeAxes):
-        """Take a stage on data that is not viewed."""
         self.original, self.axes = stage, axes
         fn, scope, when = stage.fn, stage.scope, stage.when
         if scope == "batch":
@@ -55,7 +56,6 @@ class RelativeStage(Stage):
         super().__init__(fn, scope, when, name=stage.__name__, why=stage.why, phase=stage.phase)
 
     def __call__(self, data: Any) -> Any:
-        """Return the viewed data of all worlds after the stage."""
         treedef, views = self.axes.treedef, self.axes.views
         before = jax.tree.leaves(data)
         given = restore_leaves(views, before)
@@ -68,13 +68,13 @@ class RelativeStage(Stage):
 
 
 def view_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
-    """Return leaves with those of other populations as leaves of the world. (n_worlds, 1, n_members, ...)"""
+    """Return leaves, with leaves of other populations reshaped to leaves of the world. (n_worlds, 1, n_members, ...)"""
     return [_reshaped(x, (x.shape[0], 1, *x.shape[1:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
 
 
 def restore_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
-    """Return viewed leaves as they are in the data. (n_worlds, n_members, ...)"""
+    """Undo ``view_leaves``. (n_worlds, n_members, ...)"""
     return [_reshaped(x, (x.shape[0], *x.shape[2:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
 
@@ -84,7 +84,7 @@ def _reshaped(x: Any, shape: tuple[int, ...]) -> Any:
 
 
 def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that runs a program on leaves as they are in the data, from one on viewed leaves."""
+    """Return a function of the leaves of the data, from one of leaves from ``view_leaves``."""
     views, written = program.views, program.written
     if not views:
         return run

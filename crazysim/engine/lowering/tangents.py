@@ -103,9 +103,6 @@ def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
     Returns:
         The block from the inputs of ``block``, and behind them the tangents of ``wanted``, to the outputs of ``block``,
         and behind them a tangent of each that is a float.
-
-    Raises:
-        UnsupportedError: If an operation has no derivative in a kernel.
     """
     places = [block.inputs.index(x) for x in wanted]
     block = add_selections(block)

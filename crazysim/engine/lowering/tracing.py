@@ -60,7 +60,6 @@ class Tracer:
     """Cache of traced stages: each is traced once for leaves of the same shapes and types."""
 
     def __init__(self) -> None:
-        """Begin with an empty cache."""
         self._found: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:

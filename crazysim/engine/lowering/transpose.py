@@ -39,9 +39,6 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
     Returns:
         The block from the inputs of ``block``, and behind them a cotangent for each output that is a float, to the
         cotangents of ``wanted``.
-
-    Raises:
-        UnsupportedError: If an operation between them has no derivative in a kernel.
     """
     places = [block.inputs.index(x) for x in wanted]
     block = _unrolled(add_selections(block))

@@ -43,11 +43,7 @@ def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, E
 
 
 def require(block: Block) -> None:
-    """Check that CasADi has a form for all operations of a block.
-
-    Raises:
-        UnsupportedError: If it has none for one; the error names the stage.
-    """
+    """Check that CasADi has a form for all operations of a block."""
     refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
     if refused:
         drawn = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # says most
