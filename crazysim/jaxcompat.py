@@ -142,7 +142,7 @@ def _zeros(aval: Any) -> Any:
 
 
 def equations(jaxpr: ClosedJaxpr) -> Iterator[Any]:
-    """Iterate over the equations of a jaxpr, those of jaxprs among their parameters included."""
+    """Iterate over the equations of a jaxpr, including jaxprs among their parameters."""
     for eqn in jaxpr.jaxpr.eqns:
         yield eqn
         for value in eqn.params.values():
@@ -335,7 +335,7 @@ def bind(eqn: Any, *args: Any, **params: Any) -> list[Any]:
     Args:
         eqn: The equation.
         args: The operands.
-        params: Parameters that replace those of the equation.
+        params: Parameters that replace parameters of the equation.
     """
     out = eqn.primitive.bind(*args, **(dict(eqn.params) | params))
     return list(out) if eqn.primitive.multiple_results else [out]
@@ -440,7 +440,7 @@ def compilation_cache(folder: str) -> Iterator[None]:
     """Let JAX keep the programs that this thread compiles in a block; its configuration stays as it is.
 
     JAX opens the cache once a process. So that a folder which is configured later is used, the last of the blocks that
-    overlap, those of other threads included, closes it. Without these names of JAX nothing is kept.
+    overlap, including blocks of other threads, closes it. Without these names of JAX nothing is kept.
     """
     try:
         from jax._src import compilation_cache as cache

@@ -141,7 +141,7 @@ def _present_fields(cls: Any) -> list[tuple[str, bool]]:
 class Members(PyTree):
     """Base class of records of a population: all things of one kind in a world, such as cars.
 
-    The name of the population is the scope of its leaves, those of records within it included.
+    The name of the population is the scope of its leaves, including records within it.
     """
 
     population: str = static()

@@ -25,7 +25,7 @@ class ControllerData(PyTree):
     params: Any
     """Gains and constants, a record of the controller's own, or None."""
     freq: int = static()
-    """Rate of the controller, Hz; an outer loop has that of the command."""
+    """Rate of the controller, Hz; an outer loop runs at the rate of the command."""
 
     @staticmethod
     def create(n_worlds: int, n_drones: int, controller: Controller, airframes: Airframes) -> ControllerData:
@@ -95,7 +95,7 @@ class _LevelData(PyTree):
         return None if self.controller is None else getattr(self.controller.memory, name, None)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with the given fields replaced; ``params`` are those of the controller."""
+        """Return a copy with the given fields replaced; ``params`` replaces the parameters of the controller."""
         if self.controller is not None and "params" in changes:
             controller = changes.get("controller", self.controller)
             changes["controller"] = controller.replace(params=changes.pop("params"))
@@ -192,7 +192,7 @@ def _described(controller: ControllerData) -> str:
 
 
 def _kind(record: object) -> str:
-    """Return the name of a record's type, with those of several controllers in it."""
+    """Return the name of a record's type, with the types of the controllers in it."""
     name, members = type(record).__name__, getattr(record, "controllers", ())
     return f"{name}({', '.join(map(_kind, members))})" if members else name
 
@@ -205,7 +205,7 @@ class SimControls(PyTree):
     state: StateControlData | None
     """State commands."""
     attitude: AttitudeControlData | None
-    """Attitude commands: those of the simulation, or of the controller that follows state commands."""
+    """Attitude commands of the simulation, or of the controller that follows state commands."""
     body_rate: BodyRateControlData | None
     """Body-rate commands."""
     force_torque: ForceTorqueControlData | None
@@ -219,7 +219,7 @@ class SimControls(PyTree):
         return getattr(getattr(self, self.mode.value), "controller", None)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with the given fields replaced; ``controller`` is that of the command level."""
+        """Return a copy with the given fields replaced; ``controller`` replaces the controller of the command level."""
         if "controller" in changes:
             level = changes.get(self.mode.value, getattr(self, self.mode.value))
             changes[self.mode.value] = level.replace(controller=changes.pop("controller"))

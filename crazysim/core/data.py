@@ -24,7 +24,7 @@ from crazysim.pytree import PyTree, host_array, leaf, static
 SimParams = first_principles.Params | fitted.Params
 
 MAX_STEPS = 2**31 - 1
-"""Largest number of steps since a reset, that of an int32: 24.9 days at 1000 Hz."""
+"""Largest number of steps since a reset, the largest int32: 24.9 days at 1000 Hz."""
 
 
 class SimState(PyTree):
@@ -153,7 +153,7 @@ class Objects(PyTree):
     names: tuple[str, ...] = static()
     """Names of the bodies of the objects."""
     recorded: bool = static(default=False)
-    """True where the poses are those of a recording, also of objects that plugins place, such as loads."""
+    """True where poses come from a recording, also of objects that plugins place, such as loads."""
 
     def with_poses(self, rows: Mapping[str, tuple[Array, Array]]) -> Objects:
         """Return the objects of one world with some at other poses.

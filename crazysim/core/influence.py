@@ -102,7 +102,7 @@ def _called(where: str, method: Callable[[SimData], T], data: SimData, scope: st
 
 
 def _check_params(where: str, before: Any, after: Any) -> None:
-    """Check that parameters have shapes of one drone; curves may become those of every rotor."""
+    """Check that parameters have the shapes of one drone; a curve may become one curve per rotor."""
     for f in dataclasses.fields(before):
         old, new = getattr(before, f.name), getattr(after, f.name)
         if new is old:

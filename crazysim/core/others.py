@@ -39,7 +39,7 @@ def largest(x: Array, axis: int) -> Array:
 REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": smallest, "max": largest}
 
 MAX_PAIRS = 2**20
-"""Pairs of a world that are computed at once; those of a larger swarm follow in turns, which bounds the memory."""
+"""Pairs of a world that are computed at once. A larger swarm is computed in several turns, which bounds the memory."""
 
 
 def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Reduction = "sum") -> Any:

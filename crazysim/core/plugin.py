@@ -138,7 +138,7 @@ def check_parameter(
         core: Shape of the value of one drone.
         low: Least value allowed.
         high: Largest value allowed.
-        dtype: Type; None for that of the states.
+        dtype: Type; None for the type of the states.
         positive: Refuse zero and negative values.
         per_axis: Accept one number for a vector, for each axis.
 
@@ -186,7 +186,7 @@ class Plugin:
     """Influences are applied in ascending order, those of the same order by name. Negative: replaces commands that
     the others limit."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
-    """Data that ``constrain`` is written for: those of one drone, or of one world."""
+    """Whether ``constrain`` is written for the data of one drone or of one world."""
     begins_before: ClassVar[str | None] = None
     """Name of the stage of an episode's first step in front of which ``begin_episode`` is called, if it uses what that
     step has computed so far; None to call it at resets, and in front of all stages in worlds that were not reset."""
@@ -251,7 +251,7 @@ class Plugin:
         Args:
             sim: The simulation.
             kind: Class of the record.
-            given: Fields as they are to be. Settings of those that are None are checked nevertheless.
+            given: Values of fields. If one is None, the setting of its name is checked nevertheless.
         """
         settings = {name: each for name, each in settings_of(type(self)).items() if each.is_parameter}
         values = dict(given)

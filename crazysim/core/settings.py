@@ -30,7 +30,7 @@ E = TypeVar("E", bound=Enum)
 MAX_ITERATIONS = 1000
 """Most iterations of a solver of contacts; the defaults are 8 to 20."""
 MAX_FRICTION = 1000.0
-"""Largest coefficient of friction; that of rubber is about 1."""
+"""Largest coefficient of friction; rubber has about 1."""
 MAX_SOFTNESS = 10.0
 """Largest softness of contacts, s."""
 
@@ -77,7 +77,7 @@ class NumbersByName:
 
 
 TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
-"""Names of types for messages, where they are not those of the classes."""
+"""Names of types for messages, where they differ from the names of the classes."""
 
 
 class Setting(NamedTuple):
@@ -92,7 +92,7 @@ class Setting(NamedTuple):
     dtype: DTypeLike | None = None
     """Type of the numbers; None for real ones."""
     shapes: Shapes | None = None
-    """Shapes of its array; None for any, or for those that the simulation decides."""
+    """Shapes of its array; None for any, or where the simulation decides."""
 
 
 def setting(
@@ -308,7 +308,7 @@ def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Arra
 
 
 def check_rates(control: Control, freq: int, given: Mapping[Control, int | None]) -> None:
-    """Check requested rates, Hz; None is that of a controller."""
+    """Check requested rates, Hz; None stands for the rate of a controller."""
     in_use = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
@@ -396,7 +396,7 @@ def controller_at_rates(
         controller: The controller.
         control: Command level.
         freq: Rate of physics steps, Hz.
-        given: Requested rates, Hz; None for those of the controller.
+        given: Requested rates, Hz; None for the rates of the controller.
     """
     if isinstance(controller, Switch):
         members = tuple(controller_at_rates(member, control, freq, given) for member in controller.controllers)

@@ -99,7 +99,7 @@ class ZerosCache:
 
 
 def _fixed(arrays: list[Any]) -> list[Any]:
-    """Return the arrays, None in place of those of NumPy: their owner may change them, so they never count as equal."""
+    """Return the arrays, with None for NumPy arrays, which never count as equal because their owner may change them."""
     return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 

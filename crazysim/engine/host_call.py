@@ -1,7 +1,7 @@
 """Steps on the host without XLA: compiled kernels are called on the memory of arrays.
 
 A call of a compiled function of JAX takes some 30 us, most of it for its operands and results. A loop that commands,
-steps and reads needs few of them as arrays of JAX, so those are made when they are read.
+steps and reads needs few of them as JAX arrays, so these are made when they are read.
 
 Nothing that a kernel reads or has written changes afterwards. It reads arrays of JAX through views of NumPy, and as
 long as there is a view JAX copies a buffer that it would otherwise reuse for a donated array; commands, which are
@@ -145,7 +145,7 @@ class _Launch(NamedTuple):
     inputs: tuple[int, ...]
     """Leaves that it reads."""
     outputs: slice
-    """Results that it writes, among those of all kernels."""
+    """Its results among the results of all kernels."""
     packed: struct.Struct
     """Form of the addresses of both."""
 
@@ -193,7 +193,7 @@ class HostCall:
         """Return leaves that can be stepped.
 
         Args:
-            leaves: Leaves of the data on the device, and behind them those that passes add.
+            leaves: Leaves of the data on the device, followed by the leaves that passes add.
             sharding: The device.
         """
         items = list(leaves)
@@ -204,7 +204,7 @@ class HostCall:
         return HostLeaves(items, addresses, views, sharding)
 
     def _view(self, i: int, x: Any) -> NDArray:
-        """Return a view of an array of JAX once it is computed; that of the same array again costs nothing."""
+        """Return a view of a JAX array once it is computed. The view of the same array is kept."""
         held = self._held.get(i)
         if held is None or held[0] is not x:
             numbers = jax.random.key_data(x) if jaxcompat.is_key(x) else x

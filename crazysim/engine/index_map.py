@@ -23,7 +23,7 @@ Function = Callable[..., Sequence[Array]]
 
 
 class MapKernels:
-    """Kernels of one function: that of the platform it is made for, and those of others once JAX lowers it there."""
+    """Kernels of one function: one for the platform that it is made for, and others when JAX lowers it there."""
 
     def __init__(self, block: Block, platform: str):
         """Compile the kernel for a platform.

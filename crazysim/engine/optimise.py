@@ -23,7 +23,7 @@ def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = N
 
     Args:
         program: The program, from ``lower_stages``.
-        rows: From the leaves that are written to those that are stored as rows of one number of all drones each.
+        rows: From the written leaves to the leaves that are stored as rows, each of one number of all drones.
         pack: True to read shared numbers from one leaf.
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]

@@ -65,9 +65,9 @@ class Plan:
     location: Location
     """Devices that it runs on."""
     inputs: tuple[int, ...]
-    """Leaves that are passed to the compiled step: those of the data, and behind them those that passes add."""
+    """Leaves that are passed to the compiled step: leaves of the data, followed by the leaves that passes add."""
     packed: tuple[int, ...]
-    """Shared leaves that are passed as one, which is the first behind those of the data."""
+    """Shared leaves that are passed as one, the first leaf after the leaves of the data."""
     rows: tuple[Rows, ...]
     """Leaves of rows, behind that; empty where the data is stepped as it is."""
     written: tuple[int, ...]
@@ -148,7 +148,7 @@ class Planner(NamedTuple):
         return plan
 
     def _fast(self, data: SimData, zeros: Zeros, apart: SeparateLeaves) -> tuple[Plan, list[str]]:
-        """Return a plan that runs a program, and what it does not support; that of ``plain`` on several devices."""
+        """Return a plan that runs a program, and what it does not support; a plan of ``plain`` on several devices."""
         limit = self._spread_limit(data)
         if limit:
             return self._plain(data, limit), []
@@ -277,7 +277,7 @@ class Planner(NamedTuple):
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
     def _of_one_stage(self, error: UnsupportedError, data: SimData) -> UnsupportedError:
-        """Return the error of the one stage that has no source, for that of a kernel of several stages."""
+        """Return the error of the stage that has no source, given the error of a kernel of several stages."""
         for stage in self.stages:
             try:
                 kernel.require_source(optimise(lower_stages([stage], data)))

@@ -72,7 +72,7 @@ class FlatData:
         Args:
             like: The data, or its shapes and devices.
             command: Command, which nothing writes into any more. (n_worlds, n_drones, k)
-            feedforward: Feedforward of a setpoint; None for that of ``stage_command``.
+            feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
         """
         numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
         on_host = isinstance(self.leaves, HostLeaves)
@@ -266,7 +266,7 @@ class Step:
         return sum(called) + sum(count(plan.dynamic) + count(plan.static) for plan in self._plans.values())
 
     def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
-        """Return the leaves of the data, and behind them those that the plan adds."""
+        """Return the leaves of the data, followed by the leaves that the plan adds."""
         packed = [self._pack([leaves[i] for i in plan.packed])] if plan.packed else []
         rows = [rows.pack(view_leaves(rows.program.views, leaves)) for rows in plan.rows]
         in_rows = [i for rows in plan.rows for i in rows.members]

@@ -81,7 +81,7 @@ class Stepper:
         Args:
             command: Command in the units of the command level, which nothing writes into any more.
                 (n_worlds, n_drones, k)
-            feedforward: Feedforward of a setpoint; None for that of ``crazysim.core.functional.stage_command``.
+            feedforward: Feedforward of a setpoint; None for the default of ``crazysim.core.functional.stage_command``.
         """
         traced = isinstance(command, jax.core.Tracer) or isinstance(feedforward, jax.core.Tracer)
         if isinstance(self._data, FlatData) and not traced:

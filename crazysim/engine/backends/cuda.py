@@ -73,7 +73,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
 
     Args:
         kernel: The kernel.
-        devices: GPUs that will run it; None for those of this machine.
+        devices: GPUs that will run it; None for the GPUs of this machine.
 
     Raises:
         KernelError: If NVRTC is missing, or refuses the source, with its message.
@@ -126,7 +126,7 @@ def weakest_device(devices: Sequence[jax.Device] | None = None) -> jax.Device | 
     """Return the GPU of the lowest compute capability, whose code runs on all; None without a GPU.
 
     Args:
-        devices: GPUs to choose from; None for those of this machine.
+        devices: GPUs to choose from; None for the GPUs of this machine.
     """
     if devices is None:
         try:

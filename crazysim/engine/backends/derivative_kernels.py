@@ -48,7 +48,7 @@ class DerivativeKernels:
         self._launches: dict[Any, Launch | None] = {}
 
     def is_own(self, leaf: int) -> bool:
-        """Return True for a leaf of which each drone or world has its own numbers."""
+        """Return True for a leaf with numbers of its own for each drone or world."""
         return self.program.leaves[leaf].scope in ("drone", "world")
 
     def forward(self, changing: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:

@@ -31,7 +31,7 @@ def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels 
     Args:
         run: The function.
         other: The same function with derivatives: the program on lanes, taken for a number of steps that is an array.
-        kernels: Kernels of the derivatives; None to take those of ``other``.
+        kernels: Kernels of the derivatives; None for the derivatives of ``other``.
     """
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -104,7 +104,7 @@ class Case(NamedTuple):
         return list(args[len(self.present) :])
 
     def is_own(self, leaves: Sequence[int]) -> list[bool]:
-        """Return True for leaves of which each drone or world has numbers of its own."""
+        """Return True for leaves with numbers of their own for each drone or world."""
         return list(map(self.kernels.is_own, leaves))
 
     def over_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear: Sequence[int],
@@ -223,7 +223,7 @@ cotangent_p = jaxcompat.primitive_by_platform(
     derivative=_cotangents_on_lanes,
     batched=_batched,
 )
-"""Cotangents before some steps, from those of the floats after them."""
+"""Cotangents before some steps, from the cotangents of the floats after them."""
 
 tangent_p = jaxcompat.primitive_by_platform(
     "crazysim_tangents",
@@ -233,7 +233,7 @@ tangent_p = jaxcompat.primitive_by_platform(
     transposed=_transposed,
     batched=_batched,
 )
-"""Tangents of the floats after some steps, from those before them."""
+"""Tangents of the floats after some steps, from the tangents before them."""
 
 
 # The steps in a derivative -----------------------------------------------------------------------------------------
@@ -262,4 +262,4 @@ advance_p = jaxcompat.primitive_by_platform(
     derivative=_advanced_on_lanes,
     batched=jaxcompat.vmap_rule_of(_advanced),
 )
-"""Steps of a kernel inside a derivative, whose own derivative is that of the program on lanes."""
+"""Steps of a kernel inside a derivative; they are differentiated as the program on lanes."""

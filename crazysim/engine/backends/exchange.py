@@ -138,7 +138,7 @@ class SharedMemory(OneLane):
         self._records: dict[str, int] = {}
 
     def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
-        """Write a record of numbers for each thread, and return how those of another are read."""
+        """Write a record of numbers for each thread, and return how the numbers of another thread are read."""
         order = sorted(range(len(values)), key=lambda k: -TYPE_BYTES[values[k][0]])
         text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
         record = f"Record{self._records.setdefault(text, len(self._records))}"

@@ -51,7 +51,7 @@ class Kernel:
         return dataclasses.replace(self, text=self.text.replace(ANY_NUMBER_OF_BLOCKS, f"{n}"))
 
     def with_threads(self, n: int) -> Kernel:
-        """Return the kernel with blocks of ``n`` threads on a GPU, a multiple of those that it has."""
+        """Return the kernel with blocks of ``n`` threads on a GPU, a multiple of its present number."""
         text = self.text.replace(BLOCK_THREADS.format(self.threads), BLOCK_THREADS.format(n))
         return dataclasses.replace(self, text=text, threads=n, lanes=self.lanes * n // self.threads)
 
@@ -132,7 +132,7 @@ def make_kernel(
 
 
 def _n_operations(block: Block) -> int:
-    """Return the number of operations of a block, with those for each of the others of a world."""
+    """Return the number of operations of a block; operations for other drones of a world count once for each."""
     inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
     return len(block.operations) + sum(inner)
 

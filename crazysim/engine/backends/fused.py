@@ -32,7 +32,7 @@ from crazysim.errors import ConfigError
 
 
 class Kernels:
-    """Kernels of one program: that of the platform it is planned for, and those of others once JAX lowers it there."""
+    """Kernels of one program: one for the platform that it is planned for, and others when JAX lowers it there."""
 
     def __init__(self, program: Program, location: Location):
         """Compile the kernel for some devices.
@@ -213,7 +213,7 @@ def _one_kernel(kernels: Kernels) -> CountedRun:
 
 
 def _parts(program: Program) -> list[Program]:
-    """Return programs that run one after the other: those of one kernel each, and those of one unfused stage each."""
+    """Return programs that run one after the other, each of one kernel or of one unfused stage."""
     return [program] if program.fused else list(program.parts())
 
 

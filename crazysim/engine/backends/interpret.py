@@ -118,7 +118,7 @@ _PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKe
 
 
 def _prepare(block: Block, places: dict[Any, int], constants: list[Any]) -> _Prepared:
-    """Return a block prepared, and add places of its values and constants to those of the blocks around it."""
+    """Prepare a block, and add the indices of its values and constants to the indices of the blocks around it."""
 
     def place(x: Any) -> int:
         if isinstance(x, Value):

@@ -48,7 +48,7 @@ def digest(*parts: str | bytes) -> str:
 
 
 def folder() -> Path:
-    """Return the folder of compiled kernels: in that of compiled programs, or of this process alone."""
+    """Return the folder of compiled kernels: in the folder of compiled programs, or one of this process alone."""
     kept = cache.folder()
     if kept is not None:
         shared = kept / "crazysim"
@@ -136,7 +136,7 @@ def _abandoned(name: str, age: float) -> bool:
     """Return True if no process needs a file or folder any more.
 
     Args:
-        name: Its name, with that of its process.
+        name: Its name, which contains the name of its process.
         age: Time since it was written, s.
     """
     named = re.search(r"[.-]([0-9a-f]{8})-(\d+)-", name)
@@ -153,7 +153,7 @@ def _abandoned(name: str, age: float) -> bool:
 
 
 def find(place: Path, key: str) -> Iterator[Path]:
-    """Yield the intact files of a key; damaged ones are removed, and those of other users are left out."""
+    """Yield the intact files of a key. Damaged files are removed, and files of other users are left out."""
     for path in sorted(place.glob(f"{key}-*")):
         if path.suffix == ".tmp" or distrust(path):
             continue

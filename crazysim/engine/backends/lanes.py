@@ -110,7 +110,7 @@ class LeafValues:
 
 
 def batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
-    """Return the number of worlds and drones: under a mesh, of those on this device."""
+    """Return the number of worlds and drones; under a mesh, on this device."""
     drone = next(
         i
         for i, (leaf, x) in enumerate(zip(program.leaves, leaves, strict=True))
@@ -120,7 +120,7 @@ def batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
 
 
 def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
-    """Return shape and type of a leaf of all worlds that a program writes; of random keys those of their integers."""
+    """Return shape and type of a leaf of all worlds that a program writes; random keys are written as integers."""
     example = program.leaves[leaf]
     of_leaf = (n_worlds, *example.shape[1:])
     if leaf in program.rows:
@@ -163,7 +163,7 @@ def _run_drones(segment: Segment, values: LeafValues, constants: Sequence[Any]) 
 
 
 def _run_worlds(segment: Segment, values: LeafValues) -> None:
-    """Run a segment of worlds: a drone's numbers are those of its world, at its place."""
+    """Run a segment of worlds. In it, the numbers of a drone are numbers of its world."""
     leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
 
     def of_world(slot: Slot) -> Any:

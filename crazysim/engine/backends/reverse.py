@@ -1,4 +1,4 @@
-"""Reverse mode of many steps in one kernel: cotangents of the leaves before them from those of the leaves after them.
+"""Reverse mode of many steps in one kernel: from cotangents of the leaves after the steps to cotangents before them.
 
 The kernel takes the steps once more, keeps the numbers that each begins with, and goes back from the last to the first.
 From more steps than ``interval`` on it keeps the beginnings of intervals, and takes the steps of each once more on the
@@ -30,13 +30,13 @@ class Reverse:
     """Transposed derivatives of the segments of a program."""
 
     program: Program
-    """The program without check; behind its leaves those of cotangents, of which every drone has its own."""
+    """The program without check, with further leaves for the cotangents of every drone."""
     n_leaves: int
     """Number of its leaves without cotangents."""
     perturbed: tuple[int, ...]
     """Leaves whose cotangents are computed."""
     back: dict[Segment, Segment]
-    """Segments that go back, by those that go ahead."""
+    """Segments of the backward pass, by the forward segment."""
     back_hoisted: dict[Segment, Segment]
     """The same for what is computed once before the steps."""
     carried: tuple[Slot, ...]
@@ -64,7 +64,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> Reverse:
 
     Args:
         program: The program.
-        perturbed: Leaves whose cotangents are computed; those that are no floats have none.
+        perturbed: Leaves whose cotangents are computed; only floats have cotangents.
 
     Raises:
         UnsupportedError: If a part of it has no derivative in a kernel.
@@ -105,7 +105,7 @@ def _float_of(block: Block) -> np.dtype:
 
 
 def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:
-    """Return the segment that replaces the cotangents after a segment by those before it.
+    """Return the segment that replaces the cotangents after a segment by the cotangents before it.
 
     In a segment of worlds, each drone has a copy of what belongs to the world, and a cotangent for it; the sum of all
     is that of the first drone afterwards.

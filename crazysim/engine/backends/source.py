@@ -141,7 +141,7 @@ class Writer:
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
 
     def _lookup(self, op: Operation, args: list[str], depth: int) -> None:
-        """Write a read of an entry, with its three neighbours if those are read too."""
+        """Write a read of an entry, with its three neighbours if they are read too."""
         offset, key = op.param("offset"), _four_of(op)
         if key not in self.fours:
             name = self.names[op.results[0]] = self.new()
@@ -222,7 +222,7 @@ class Writer:
         self.line("}", depth)
 
     def _shared_carry(self, op: Operation) -> list[bool]:
-        """Return which numbers that a loop carries are single, and mark those that begin its turns as such."""
+        """Return which carried numbers of a loop are shared by all lanes, and mark them as such in its iterations."""
         shared = shared_carry(op, self.shared)
         for block in op.blocks:
             self.shared.update(x for x, same in zip(block.inputs, shared, strict=True) if same)

@@ -32,7 +32,7 @@ class Value:
 
 
 class Numbers:
-    """Entries of a table that are known before the program runs; equal to those of the same type and bits."""
+    """Entries of a table that are known before the program runs. Two with the same type and bits are equal."""
 
     def __init__(self, array: np.ndarray):
         self.array = array
@@ -76,14 +76,14 @@ class Operation(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Block:
-    """Operations in order, from inputs to outputs. An inner block may use the values of those around it."""
+    """Operations in order, from inputs to outputs. An inner block may use values of the blocks around it."""
 
     inputs: tuple[Value, ...] = ()
     operations: tuple[Operation, ...] = ()
     outputs: tuple[Element, ...] = ()
 
     def walk(self) -> Iterator[Operation]:
-        """Iterate over all operations, those of inner blocks included."""
+        """Iterate over all operations, including inner blocks."""
         for operation in self.operations:
             yield operation
             for block in operation.blocks:
@@ -97,7 +97,7 @@ class Block:
                 yield from block.blocks()
 
     def uses(self) -> set[Value]:
-        """Return the values that operations and outputs use, those of inner blocks included."""
+        """Return the values that operations and outputs use, including inner blocks."""
         used = {x for x in self.outputs if isinstance(x, Value)}
         for operation in self.operations:
             used.update(x for x in operation.args if isinstance(x, Value))
@@ -222,7 +222,7 @@ def _prune(block: Block, needed: set[Value]) -> Block:
 
 
 def _narrowed(op: Operation, needed: Collection[Value]) -> Operation:
-    """Return a ``when`` with those of its results that are needed."""
+    """Return a ``when`` without the results that are not needed."""
     (mask, *old), (block,) = op.args, op.blocks
     kept = [k for k, x in enumerate(op.results) if x in needed]
     if len(kept) == len(op.results):
@@ -254,7 +254,7 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
     Args:
         builder: Takes the operations.
         block: The block.
-        values: Elements that stand for the block's inputs and for values around it; those of its own values are added.
+        values: Elements that stand for the block's inputs and for values around it. The block's own values are added.
     """
 
     def mapped(x: Element) -> Element:

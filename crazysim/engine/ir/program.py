@@ -39,7 +39,7 @@ class Leaf:
     name: str
     """Path of the field in ``SimData``."""
     scope: str
-    """Scope of the field: ``drone``, ``world``, ``shared``, or that of an opaque leaf."""
+    """Scope of the field: ``drone``, ``world``, ``shared`` or ``opaque``."""
     shape: tuple[int, ...]
     """Shape, for all worlds."""
     dtype: Any
@@ -112,7 +112,7 @@ class UnfusedStage:
     phase: Phase
     """When it runs."""
     jaxpr: Any
-    """The stage, from the leaves in ``used`` to those in ``written``."""
+    """The stage, from the leaves in ``used`` to the leaves in ``written``."""
     used: tuple[int, ...]
     """Leaves that it reads."""
     written: tuple[int, ...]
@@ -141,7 +141,7 @@ class Program:
     """Program of a step, and of the stages that run before the first step and after the last."""
 
     leaves: tuple[Leaf, ...]
-    """Arrays of the data; behind them those that passes add."""
+    """Arrays of the data, followed by the arrays that passes add."""
     n_drones: int
     """Drones of a world."""
     segments: tuple[Segment | UnfusedStage, ...]
@@ -151,7 +151,7 @@ class Program:
     scratch: frozenset[int] = frozenset()
     """Leaves that only carry numbers from one stage to another: what is written there is not kept."""
     packed: tuple[int, ...] = ()
-    """Shared leaves whose numbers are also those of one leaf, one after the other."""
+    """Shared leaves that one further leaf holds one after the other."""
     population: str = "drone"
     """Population whose members it computes side by side; here they are called drones, with scope ``drone``."""
     views: frozenset[int] = frozenset()
@@ -202,7 +202,7 @@ class Program:
 
     @functools.cached_property
     def group(self) -> int:
-        """Number of drones that read each other's numbers: those of a world, if a segment needs that; otherwise 1."""
+        """Number of drones that read each other's numbers: all of a world if a segment needs that, otherwise 1."""
         return self.n_drones if any(s.couples for s in self.fused_segments) else 1
 
     def of(self, phase: Phase) -> list[Any]:
@@ -210,7 +210,7 @@ class Program:
         return [segment for segment in self.segments if segment.phase == phase]
 
     def per_drone(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
-        """Return the slots of a segment as those of one drone: in a segment of worlds they count all its drones."""
+        """Return the slots of a segment as slots of one drone. In a segment of worlds they count all of its drones."""
         if segment.scope == "drone":
             return list(slots)
         return [(i, k if k == TABLE_INDEX else k % self.leaves[i].size) for i, k in slots]

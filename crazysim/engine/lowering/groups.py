@@ -16,7 +16,7 @@ class Group(NamedTuple):
     """Stages that run together, step by step."""
 
     population: str
-    """Population whose members the engine computes side by side; those of others are unrolled for each world."""
+    """Population whose members the engine computes in lanes. Members of other populations are unrolled."""
     stages: tuple[Stage, ...]
     """The stages, in order."""
     owned: frozenset[int] | None
@@ -37,7 +37,7 @@ class _Access(NamedTuple):
 
 
 def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
-    """Return the groups of populations that do not depend on each other, that of the drones first.
+    """Return the groups of populations that do not depend on each other, first the group of the drones.
 
     Two stages depend on each other if one reads or writes what the other writes. Stages of worlds alone, such as the
     clock, are repeated in every group that reads their results.

@@ -115,7 +115,7 @@ def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
 
 
 def _tangents_of(elements: Sequence[Element], tangents: Values) -> list[Element]:
-    """Return the tangents of those of some elements that are floats, zeros where they have none."""
+    """Return the tangents of the floats among some elements, with zeros where there is none."""
     return [_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
 
 
@@ -130,8 +130,8 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
     Args:
         builder: Takes the operations.
         block: The block.
-        values: Elements of the builder for the block's inputs and the values around it; those of its results are added.
-        tangents: Tangents of these values that are not zero; those of its results are added.
+        values: Elements of the builder for the block's inputs and the values around it. Its results are added.
+        tangents: Tangents of these values that are not zero. The tangents of its results are added.
     """
     for op in block.operations:
         builder.stage = op.stage
@@ -161,7 +161,7 @@ def _record(results: Sequence[Value], found: Sequence[Element], tangents: Values
 
 @functools.lru_cache(maxsize=1024)
 def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block from operands, and tangents of those that are floats, to the tangent of an operation."""
+    """Return the block from operands, and the tangents of floats among them, to the tangent of an operation."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def push(*args: Any) -> Any:
@@ -229,7 +229,7 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
 
 
 def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Publish tangents beside the numbers that a drone publishes, and add up those of the sums."""
+    """Publish tangents beside the numbers that a drone publishes, and add up the tangents of sums."""
     (body,) = op.blocks
     *others, is_self = body.inputs
     inner = Builder(builder)

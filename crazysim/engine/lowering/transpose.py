@@ -1,4 +1,4 @@
-"""Reverse mode on blocks: from the cotangents of a block's outputs to those of its inputs.
+"""Reverse mode on blocks: from the cotangents of a block's outputs to the cotangents of its inputs.
 
 An operation has the derivative that JAX gives it: its rule is traced once for each operation and types, and lowered
 like any other function. What the derivative needs of the block's own results is computed in the same block again: the
@@ -92,7 +92,7 @@ def _again(
 
 
 def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents) -> None:
-    """Go through a block backwards, from the cotangents of its results to those of what it uses.
+    """Go through a block backwards, from the cotangents of its results to the cotangents of the values that it uses.
 
     Args:
         builder: Takes the operations.
@@ -146,7 +146,7 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
 
 
 Found = Sequence[Element | None]
-"""Cotangents of the results of an operation; None for those that nothing uses."""
+"""Cotangents of the results of an operation; None for unused results."""
 
 
 def _when(builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents) -> None:

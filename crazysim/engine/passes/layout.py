@@ -41,7 +41,7 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
 
     Args:
         program: The program.
-        select: From the leaves that are written to those that become rows; random keys stay as they are.
+        select: From the written leaves to the leaves that become rows; random keys stay as they are.
     """
     leaves = list(program.leaves)
     chosen = [i for i in sorted(select(program.written)) if not is_key(leaves[i])]
@@ -70,7 +70,7 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
 
 
 class Rows(NamedTuple):
-    """A leaf of rows, and the leaves whose numbers are its rows; arrays are those of a program, with its views."""
+    """A leaf of rows, and the leaves whose numbers are its rows; arrays are as the program takes them."""
 
     program: Program
     """The program, after ``as_rows``."""

@@ -144,7 +144,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
 
 
 def expose_values(program: Program) -> tuple[Program, list[Operation]]:
-    """Return a program of one segment with a further leaf for every result in it, and the operations of those.
+    """Return a program of one segment with a further leaf for every result in it, and the operations of these results.
 
     Results inside blocks of operations are left out: their block may not have run.
     """

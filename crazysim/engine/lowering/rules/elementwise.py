@@ -166,7 +166,7 @@ def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
 
 @rule("clz")
 def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Set all bits behind the first one, and count those that are left."""
+    """Set all bits behind the first one, and count the bits that are left."""
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
     x, shift = bits.of(args[0]), 1

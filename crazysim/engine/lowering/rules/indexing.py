@@ -167,7 +167,7 @@ def _select_windows(
 
 
 def _gather_filled(eqn: JaxprEqn, x: Elements, indices: np.ndarray) -> Elements:
-    """Gather at known places; those outside the array are filled."""
+    """Gather at known indices; indices outside of the array are filled."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (places,) = run_now(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]

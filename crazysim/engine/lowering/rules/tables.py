@@ -83,7 +83,7 @@ def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_places: int) -
 
 
 def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Table | None:
-    """Return an array of constants as a table; those that are the same at all places stay constants."""
+    """Return an array of constants as a table. Entries that are equal at all indices stay constants."""
     numbers = np.array([item.item() for item in x.reshape(-1)], x.reshape(-1)[0].dtype)
     if not np.all(np.isfinite(numbers)):
         return None
