@@ -128,7 +128,7 @@ class AttitudeControlData(_LevelData):
     freq: int = static()
     """Rate at which commands take effect, Hz."""
     staged_ang_vel_des: Array | None = leaf("drone", 1)
-    """Desired body rates that take effect at the next tick, rad/s: those of a state command, or zero. None with
+    """Desired body rates that take effect at the next tick, rad/s: from a state command, or zero. None with
     controllers other than Crazyflow's. (n_worlds, n_drones, 3)"""
 
 

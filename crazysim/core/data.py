@@ -200,8 +200,8 @@ class SimData(PyTree):
     ) -> SimData:
         """Return data of drones at rest, without plugins.
 
-        ``airframe`` is that of all drones, or a list of those of each; ``freqs`` are the rates of commands, Hz;
-        ``controller`` is None where commands need none.
+        ``airframe`` is one airframe for all drones, or a list with one for each. ``freqs`` are the rates of commands,
+        Hz. ``controller`` is None where commands need none.
         """
         airframes = as_airframes(airframe, n_drones)
         return SimData(

@@ -46,8 +46,8 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     """Return the reduction of a function of pairs over all drones of the world, for use in functions of one drone.
 
     ``fn`` also runs for the pair of the drone with itself, where ``is_self`` is true. Values of the drone itself are
-    those that ``fn`` closes over. What depends on the other drone alone belongs into ``values``: it is computed once
-    for each drone, and ``fn`` once for each pair.
+    captured by ``fn``. What depends on the other drone alone belongs into ``values``: it is computed once for each
+    drone, and ``fn`` once for each pair.
 
         gap = reduce_over_others(
             lambda other, is_self: jnp.where(is_self, jnp.inf, rotation.norm(pos - other)), pos, "min"
@@ -141,5 +141,5 @@ def _of_all(
 
 
 reduce_over_others_p = batched_primitive("reduce_over_others", _results, _batched, _outside)
-"""The reduction as a primitive: operands are the values that the function closes over, then those that are published.
-``jaxpr`` maps them and ``is_self`` to results, for one pair; ``n_own`` is the number of the first."""
+"""The reduction as a primitive: its operands are the values that the function captures, then the published ones.
+``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_own`` is the number of captured values."""

@@ -66,7 +66,7 @@ class Simulation(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """A stage of a plugin and its place in the step pipeline."""
+    """A stage of a plugin and its position in the step pipeline."""
 
     stage: Callable[[SimData], SimData]
     """The stage, declared with ``crazysim.stage``."""
@@ -91,8 +91,8 @@ def parameter(
     """Declare a field of a plugin whose value only fills numbers of its record.
 
     ``sim.replace`` exchanges such numbers without compiling the step again. The plugin's stages, ``influence`` and
-    ``derivative`` must read the number from the record, never from the field. Its range is checked as that of
-    ``setting`` is, its shape by ``Plugin.filled``, or as it is given here.
+    ``derivative`` must read the number from the record, never from the field. Its range is checked as in
+    ``setting``, and its shape by ``Plugin.filled`` or ``shapes``.
     """
     declared = Setting(bounds(low, high, positive), True, per_axis, dtype, shapes)
     return dataclasses.field(default=default, metadata={"setting": declared})
@@ -183,7 +183,7 @@ class Plugin:
     name: str
     """Name of the plugin: the key of its record in ``data.plugins``, and the name of its stage."""
     order: ClassVar[int] = 0
-    """Influences are applied in ascending order, those of the same order by name. Negative: replaces commands that
+    """Influences are applied in ascending order, and by name within the same order. Negative: replaces commands that
     the others limit."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
     """Whether ``constrain`` is written for the data of one drone or of one world."""
@@ -276,7 +276,7 @@ class Plugin:
         """
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages of the plugin with their places, in the order in which they are inserted."""
+        """Return the stages of the plugin with their positions, in the order in which they are inserted."""
         return ()
 
     def begin_episode(self, data: SimData) -> SimData:
@@ -390,7 +390,7 @@ def plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
 
 
 def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
-    """Return the data of one drone with the states that plugins measure in place of the true ones.
+    """Return the data of one drone with the states that plugins measure instead of the true ones.
 
     Args:
         plugins: The plugins; of several that measure one state, the last one counts.
@@ -409,7 +409,7 @@ class FunctionPlugin(Plugin):
     data: PyTree | None = None
     """The record for all worlds."""
     placements: Sequence[Placement] = ()
-    """The stages with their places."""
+    """The stages with their positions."""
     influence_fn: Callable[[SimData], SimData] | None = None
     """The influence on the dynamics, for one drone; None for none."""
     default: PyTree | None = None

@@ -39,8 +39,8 @@ class Population(Plugin):
     for one member: leaves of the population and of worlds come without batch axes, leaves of other populations, drones
     included, as (n_members, ...), to be read only. ``self.read(data)`` is the record of the member.
 
-    The stages of a population are its controller, before the integration of the drones, and its integration, behind
-    that of the drones. Both carry its name as scope.
+    A population has two stages, whose scope is its name: its controller runs before the integration of the drones, its
+    own integration after it.
     """
 
     members: int | Sequence[str] = 1

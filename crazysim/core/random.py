@@ -106,8 +106,8 @@ def uniform(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array
 def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
     """Return random multiples of 2^-23, in float64 of 2^-52, from zero to below one, (*shape).
 
-    None for keys and types for which JAX's own functions are used. In float64 those need 64-bit integers, which
-    kernels do not have.
+    None for keys and types for which JAX's own functions are used. In float64 these functions need 64-bit integers,
+    which kernels do not have.
     """
     if dtype not in (jnp.float32, jnp.float64) or bits_generator(key.dtype) != threefry_prng_impl.name:
         return None

@@ -146,9 +146,9 @@ def check_settings(settings: Any) -> None:
     """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
 
     Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
-    finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and those of
-    ``Callable`` and ``Mapping`` functions and mappings of any kind. None is accepted where the annotation or the
-    default allows it. Shapes that depend on the simulation, as those of parameters do, are checked with it.
+    finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and fields
+    of ``Callable`` and ``Mapping`` have functions and mappings of any kind. None is accepted where the annotation or
+    the default allows it. Shapes that depend on the simulation, such as shapes of parameters, are checked with it.
     """
     kind = type(settings)
     for field in dataclasses.fields(settings):
@@ -389,8 +389,8 @@ def controller_at_rates(
 ) -> Controller:
     """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
 
-    The requested rate of the command's level is that of the outer loop if there is one, and that of attitude then that
-    of ``update``. A rate that is the default of its class becomes one of ``default_rates``.
+    The requested rate of the command level is the rate of the outer loop if there is one; then the requested rate of
+    attitude is the rate of ``update``. A rate that is the default of its class becomes one of ``default_rates``.
 
     Args:
         controller: The controller.

@@ -96,13 +96,13 @@ def stage(
     A stage without a declared scope receives the full batch.
 
     ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
-    ``steps`` (). Leaves of other populations come as (n_members, ...). The stage writes leaves of drones, and reads
-    those of other drones by ``reduce_over_others``.
+    ``steps`` (). Leaves of other populations come as (n_members, ...). The stage writes leaves of its drone, and reads
+    leaves of other drones by ``reduce_over_others``.
 
     ``@stage("cars")``: the data of one member of the population of that name, likewise. Leaves of drones come as
     (n_drones, ...). The stage writes leaves of the population.
 
-    ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), those of other populations as
+    ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), leaves of other populations as
     (n_members, ...), leaves of worlds without batch axes. The stage writes leaves of any of these.
 
     Args:
@@ -224,9 +224,10 @@ def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence
 def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
     """Return a function of one world as a function of all worlds.
 
-    In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), those of
-    other populations as (n_members, ...), leaves of worlds and batched leaves without batch axes, and all others as
-    they are, which it must return unchanged. An array outside of a record has worlds as its first axis.
+    In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), leaves
+    of other populations as (n_members, ...), and leaves of worlds and batched leaves without batch axes. It receives
+    all other leaves as they are, and must return them unchanged. An array outside of a record has worlds as its first
+    axis.
 
     Args:
         fn: The function of one world: from any trees of arrays to one.

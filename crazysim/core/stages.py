@@ -123,8 +123,8 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
 def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
     """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
 
-    Needed where positions move with velocities of the same step. Explicit Euler moves them with those of the last,
-    which ``clip_floor_pos`` has set to zero.
+    Needed where positions move with velocities of the same step. Explicit Euler moves them with velocities of the step
+    before, which ``clip_floor_pos`` has set to zero.
     """
 
     def held(data: SimData) -> SimStateDeriv:

@@ -59,7 +59,7 @@ _compiled = jax.jit(_concatenated)
 class ZerosCache:
     """Elements of shared parameters that are zero: an inertia without products, a force without a component.
 
-    These are parameters of drones and controllers, and those of plugins that are declared sparse.
+    These are parameters of drones and controllers, and parameters of plugins that are declared sparse.
 
     Values are read once for each array. Under a trace they are unknown, and no element counts as zero.
     """
@@ -70,15 +70,15 @@ class ZerosCache:
 
     def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:
         """Return the elements of a simulation's data, which is also passed flattened."""
-        places = self._indices(data, leaves, treedef)
-        arrays = [leaves[i] for i in places]
+        indices = self._indices(data, leaves, treedef)
+        arrays = [leaves[i] for i in indices]
         before, zeros = self._last
         if _same(arrays, before):
             return zeros
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return ()
         found = [
-            (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(places, arrays, strict=True)
+            (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(indices, arrays, strict=True)
         ]
         zeros = tuple([(i, some) for i, some in found if some])
         self._last = _fixed(arrays), zeros

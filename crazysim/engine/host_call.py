@@ -45,7 +45,7 @@ class HostLeaves:
         Args:
             items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``Results``.
             addresses: Address of each leaf that kernels read.
-            views: Whatever keeps the memory of arrays of JAX.
+            views: Views that keep the memory of JAX arrays.
             sharding: Device that arrays of JAX are made on.
         """
         self.items, self.addresses, self._views, self._sharding = items, addresses, views, sharding
@@ -86,7 +86,7 @@ def _address(x: NDArray) -> int:
 
 
 class _Offset(NamedTuple):
-    """Place of an array in the memory of a call."""
+    """Offset of an array in the memory of a call."""
 
     piece: int
     offset: int
@@ -95,10 +95,10 @@ class _Offset(NamedTuple):
 
 
 class _Layout:
-    """Pieces of memory that a call writes, and the places of its results in them."""
+    """Pieces of memory that a call writes, and the offsets of its results in them."""
 
     def __init__(self, results: Sequence[tuple[Any, tuple[int, ...], np.dtype]]):
-        self.places: list[_Offset] = []
+        self.offsets: list[_Offset] = []
         self.sizes: list[int] = []
         rounded = [
             -(-math.prod(shape) * dtype.itemsize // ALIGNMENT_BYTES) * ALIGNMENT_BYTES for _, shape, dtype in results
@@ -106,13 +106,13 @@ class _Layout:
         self.shared = sum(rounded) <= MAX_SHARED_BYTES
         for (_, shape, dtype), size in zip(results, rounded, strict=True):
             if self.shared and self.sizes:
-                self.places.append(_Offset(0, self.sizes[0], shape, dtype))
+                self.offsets.append(_Offset(0, self.sizes[0], shape, dtype))
                 self.sizes[0] += size
             else:
-                self.places.append(_Offset(len(self.sizes), 0, shape, dtype))
+                self.offsets.append(_Offset(len(self.sizes), 0, shape, dtype))
                 self.sizes.append(size)
-        self.by_key = dict(zip((key for key, _, _ in results), self.places, strict=True))
-        self.begins = [(place.piece, place.offset) for place in self.places]
+        self.by_key = dict(zip((key for key, _, _ in results), self.offsets, strict=True))
+        self.begins = [(x.piece, x.offset) for x in self.offsets]
 
 
 class Results:

@@ -60,8 +60,8 @@ class Plan:
     why: str
     """Reason why it is not a faster one."""
     programs: tuple[Program, ...]
-    """Programs that it runs, that of the drones first: one for each group of populations that depend on each other;
-    none for ``plain``."""
+    """Programs that it runs, one for each group of populations that depend on each other, first the group of the
+    drones; none for ``plain``."""
     location: Location
     """Devices that it runs on."""
     inputs: tuple[int, ...]

@@ -37,7 +37,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     """Return the results of some functions for every drone. (n_worlds, n_drones, ...) each
 
     Args:
-        queries: The functions; their data is that of stages: a function of one world gets (n_drones, ...) in front.
+        queries: The functions. They receive data as stages do: a function of one world gets leaves (n_drones, ...).
         data: The simulation.
         platform: ``"cpu"`` or ``"gpu"``.
 

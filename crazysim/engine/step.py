@@ -104,8 +104,8 @@ class Step:
     ``n_steps`` as an array: one compilation serves every number. As a Python number: the loop can be differentiated
     in reverse.
 
-    Data that is spread over devices is stepped where it is. Under a trace its devices are unknown, and those that the
-    step was built for are taken.
+    Data is stepped on the devices that hold it. Under a trace these are unknown, and the step runs on the devices that
+    it was built for.
     """
 
     def __init__(

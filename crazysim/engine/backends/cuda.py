@@ -248,14 +248,14 @@ def _compile(source: str, arch: str, kind: str) -> bytes:
     major, minor = ctypes.c_int(), ctypes.c_int()
     library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     key = kernel_cache.digest(source, arch, kind, *NVRTC_OPTIONS, f"{major.value}.{minor.value}")
-    place = kernel_cache.folder()
-    for path in kernel_cache.find(place, key):
+    cache_folder = kernel_cache.folder()
+    for path in kernel_cache.find(cache_folder, key):
         with contextlib.suppress(OSError):  # another process has removed it
             return path.read_bytes()
     image = _run(library, source, arch, kind)
-    if place != kernel_cache.temporary():
+    if cache_folder != kernel_cache.temporary():
         with contextlib.suppress(OSError):  # its disk is full
-            kernel_cache.store(place, key, image, f".{kind.lower()}")
+            kernel_cache.store(cache_folder, key, image, f".{kind.lower()}")
     return image
 
 

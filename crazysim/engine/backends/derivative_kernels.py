@@ -78,25 +78,25 @@ class DerivativeKernels:
         platform: str,
     ) -> tuple[Any, Launch] | None:
         """Return the transformed program and the function that calls its kernel; None where there is none."""
-        key, place = (kind, changing), (kind, changing, platform)
+        key, launch_key = (kind, changing), (kind, changing, platform)
         try:
             if key not in self._programs:
                 self._programs[key] = None
                 self._programs[key] = transformed(self.program, changing)
             made = self._programs[key]
-            if made is not None and place not in self._launches:
-                self._launches[place] = None
+            if made is not None and launch_key not in self._launches:
+                self._launches[launch_key] = None
                 source = write(made, TARGETS[platform])
                 location = self.location if platform == self.location.platform else Location(platform)
                 with announced("compiling a derivative of the steps", "2 to 10 s"):
-                    self._launches[place] = compile_kernel(source, location)
+                    self._launches[launch_key] = compile_kernel(source, location)
                 self.used[f"{kind}: one kernel, {describe_kernel(source, platform, location.devices)}"] = None
         except UnsupportedError as error:
             announce("compiling a derivative of the steps on lanes", "10 to 40 s")
             self.used[f"{kind}: on lanes ({error})"] = None
             if not isinstance(error, LimitError):
                 warn(f"the {kind} of the step runs on 'lanes': {error}", EngineWarning)
-        launch = self._launches.get(place)
+        launch = self._launches.get(launch_key)
         return None if launch is None else (self._programs[key], launch)
 
 

@@ -49,7 +49,7 @@ class Lines(Protocol):
         ...
 
     def forget(self) -> None:
-        """Forget shared intermediate results: their variables are not defined behind this place."""
+        """Forget shared intermediate results: their variables are not defined after this line."""
         ...
 
 
@@ -65,7 +65,7 @@ class Exchange(Protocol):
         Args:
             writer: Takes the lines.
             values: The numbers.
-            live: Values that are defined, and used behind this place, with their types.
+            live: Values that are defined here and used later, with their types.
             depth: Depth of the lines.
         """
         ...
@@ -153,8 +153,8 @@ class SharedMemory(OneLane):
         writer.line("__syncthreads();", depth)
         writer.line(f"if (threadIdx.x < {self.lanes}) {where}[threadIdx.x] = {record}{{{numbers}}};", depth)
         writer.line("__syncthreads();", depth)
-        place = {k: n for n, k in enumerate(order)}
-        return [lambda j, n=place[k]: f"{where}[world + {j}].x{n}" for k in range(len(values))]
+        position = {k: n for n, k in enumerate(order)}
+        return [lambda j, n=position[k]: f"{where}[world + {j}].x{n}" for k in range(len(values))]
 
     @property
     def declarations(self) -> list[str]:
@@ -191,13 +191,13 @@ class Sweeps:
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
     def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
-        """Write a number of the lanes to memory, and return its place."""
+        """Write a number of the lanes to memory, and return the expression that reads it."""
         self.kept.append(f"{kind}v {name}[VECTORS];")
         writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
         return f"w.{name}[v]"
 
     def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
-        """Write a number of the lanes to memory, and return its place."""
+        """Write a number of the lanes to memory, and return the expression that reads it."""
         return self.variable(writer, name, kind, value, depth)
 
     def begin(self, writer: Lines, depth: int) -> None:

@@ -44,9 +44,9 @@ def run(
         Its outputs, of the lanes' shape.
     """
     if block not in _PREPARED_BLOCKS:
-        places: dict[Any, int] = {}
+        indices: dict[Any, int] = {}
         constants: list[Any] = []
-        _PREPARED_BLOCKS[block] = _prepare(block, places, constants), constants
+        _PREPARED_BLOCKS[block] = _prepare(block, indices, constants), constants
     prepared, constants = _PREPARED_BLOCKS[block]
     given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
     with np.errstate(all="ignore"):
@@ -76,35 +76,35 @@ class _Call(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """A block whose values have places in a list, with the functions of its operations at hand."""
+    """A block whose values have indices in a list, with the function of each operation."""
 
     inputs: list[int]
     """Places of the inputs."""
     calls: list[_Call]
     """Operations in order."""
     outputs: list[int]
-    """Places of the outputs."""
+    """Indices of the outputs."""
 
     def run(self, values: list[Any], given: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
         """Return the outputs for some inputs.
 
         Args:
-            values: Constants, and values of the blocks around it, at their places. It gets those of this block: of the
-                lanes' shape, or scalars, or tables.
+            values: Constants and values of the blocks around it, by their indices. Values of this block are added: of
+                the lanes' shape, or scalars, or tables.
             given: Its inputs.
             shape: Shape of the lanes.
             observe: Gets every operation with its results.
         """
-        for place, x in zip(self.inputs, given, strict=True):
-            values[place] = x
+        for i, x in zip(self.inputs, given, strict=True):
+            values[i] = x
         for op, fn, args, results, dtype, blocks in self.calls:
             if fn is not None:
                 x = fn(*[values[k] for k in args])
                 values[results[0]] = x if x.dtype == dtype else np.asarray(x).astype(dtype)
             else:
                 runs = [lambda given, block=block: block.run(values, given, shape, observe) for block in blocks]
-                for place, x in zip(results, _structured(op, [values[k] for k in args], shape, runs), strict=True):
-                    values[place] = x
+                for i, x in zip(results, _structured(op, [values[k] for k in args], shape, runs), strict=True):
+                    values[i] = x
             if observe is not None:
                 observe(op, [values[k] for k in results])
         return [values[k] for k in self.outputs]
@@ -114,30 +114,30 @@ _Run = Callable[[Sequence[Any]], list[Any]]
 """Runs a block: from its inputs to its outputs."""
 
 _PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
-"""Blocks that were run, prepared, with the constants at their places and None elsewhere."""
+"""Prepared blocks of earlier runs, with a list of constants by their indices, and None for other values."""
 
 
-def _prepare(block: Block, places: dict[Any, int], constants: list[Any]) -> _Prepared:
+def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Prepared:
     """Prepare a block, and add the indices of its values and constants to the indices of the blocks around it."""
 
-    def place(x: Any) -> int:
+    def index_of(x: Any) -> int:
         if isinstance(x, Value):
-            if x not in places:
-                places[x] = len(constants)
+            if x not in indices:
+                indices[x] = len(constants)
                 constants.append(None)
-            return places[x]
+            return indices[x]
         constants.append(x)
         return len(constants) - 1
 
-    inputs = [place(x) for x in block.inputs]
+    inputs = [index_of(x) for x in block.inputs]
     calls = []
     for op in block.operations:
-        args = [place(x) for x in op.args]
-        blocks = [_prepare(inner, places, constants) for inner in op.blocks]
-        results = [place(x) for x in op.results]
+        args = [index_of(x) for x in op.args]
+        blocks = [_prepare(inner, indices, constants) for inner in op.blocks]
+        results = [index_of(x) for x in op.results]
         dtype = op.dtype if op.results else np.dtype(bool)
         calls.append(_Call(op, _numpy(op), args, results, dtype, blocks))
-    return _Prepared(inputs, calls, [place(x) for x in block.outputs])
+    return _Prepared(inputs, calls, [index_of(x) for x in block.outputs])
 
 
 def _numpy(op: Operation) -> Callable[..., Any] | None:

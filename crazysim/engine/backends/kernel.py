@@ -63,8 +63,8 @@ class Body:
         """Write loads and the stages before the steps; return the hoisted values of each segment of the loop.
 
         Args:
-            registers: Registers of a lane; where the numbers are more, those that all lanes share are read where they
-                are used. None to read them before the steps.
+            registers: Registers of a lane. If there are more numbers than that, numbers that all lanes share are read
+                where they are used. None to read all before the steps.
         """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()

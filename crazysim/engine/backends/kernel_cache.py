@@ -87,9 +87,9 @@ def temporary() -> Path:
 
 @functools.cache
 def _temporary(pid: int) -> Path:
-    place = Path(tempfile.gettempdir())
-    sweep(place, "crazysim-*")
-    folder = Path(tempfile.mkdtemp(prefix=f"crazysim-{owner()}-", dir=place))
+    parent = Path(tempfile.gettempdir())
+    sweep(parent, "crazysim-*")
+    folder = Path(tempfile.mkdtemp(prefix=f"crazysim-{owner()}-", dir=parent))
 
     def remove() -> None:
         if os.getpid() == pid:
@@ -114,14 +114,14 @@ def _machine() -> str:
     return digest(platform.node(), numbering)[:8]
 
 
-def sweep(place: Path, pattern: str) -> None:
+def sweep(cache_folder: Path, pattern: str) -> None:
     """Remove files and folders of processes that have ended without removing them.
 
     Args:
-        place: Folder that holds them.
+        cache_folder: Folder that holds them.
         pattern: Pattern of their names.
     """
-    for path in place.glob(pattern):
+    for path in cache_folder.glob(pattern):
         with contextlib.suppress(OSError):
             status = path.lstat()
             if not _abandoned(path.name, time.time() - status.st_mtime) or distrust(path):
@@ -152,9 +152,9 @@ def _abandoned(name: str, age: float) -> bool:
     return False
 
 
-def find(place: Path, key: str) -> Iterator[Path]:
+def find(cache_folder: Path, key: str) -> Iterator[Path]:
     """Yield the intact files of a key. Damaged files are removed, and files of other users are left out."""
-    for path in sorted(place.glob(f"{key}-*")):
+    for path in sorted(cache_folder.glob(f"{key}-*")):
         if path.suffix == ".tmp" or distrust(path):
             continue
         try:
@@ -168,11 +168,11 @@ def find(place: Path, key: str) -> Iterator[Path]:
                 path.unlink()
 
 
-def store(place: Path, key: str, content: bytes, suffix: str) -> Path:
+def store(cache_folder: Path, key: str, content: bytes, suffix: str) -> Path:
     """Write a file into a folder, under the name of its key and contents, and return it.
 
     Args:
-        place: The folder.
+        cache_folder: The folder.
         key: The key.
         content: Contents.
         suffix: End of the name, such as ``".so"``.
@@ -180,8 +180,8 @@ def store(place: Path, key: str, content: bytes, suffix: str) -> Path:
     Raises:
         OSError: If the folder cannot be written, or its disk is full.
     """
-    path = place / f"{key}-{digest(content)}{suffix}"
-    part = place / f"{path.stem}.{owner()}-{threading.get_ident()}.tmp"
+    path = cache_folder / f"{key}-{digest(content)}{suffix}"
+    part = cache_folder / f"{path.stem}.{owner()}-{threading.get_ident()}.tmp"
     try:
         part.touch(mode=0o700)
         part.write_bytes(content)

@@ -1,7 +1,7 @@
 """Lanes: every number of a drone as a vector with a lane for each drone: XLA gets element-wise arithmetic only.
 
 Between fused stages nothing has the shape of a small vector or matrix. An unfused stage gets ordinary arrays, and
-splits the step at its place.
+splits the step there.
 """
 
 from __future__ import annotations

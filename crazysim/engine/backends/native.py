@@ -35,7 +35,7 @@ from crazysim.version import __version__
 
 COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
                   "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
-"""Options of the compiler, before those of the variable CXXFLAGS. Products and sums may be contracted; no option
+"""Options of the compiler, before the options of the variable CXXFLAGS. Products and sums may be contracted; no option
 assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them without a sign."""
 
 ZIG_ARGUMENTS = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
@@ -101,7 +101,7 @@ class HostLaunch:
     def on_memory(self) -> Callable[[int, int, Any, int], int]:
         """Return the kernel as a function on memory, without XLA, which waits until it is done.
 
-        It takes the number of lanes, that of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
+        It takes the numbers of lanes and of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
         number of inputs. It returns 0 if there was no memory for it.
         """
         call = _LIBRARIES[self._name].crazysim_call
@@ -214,13 +214,13 @@ def toolchain(words: tuple[str, ...]) -> str:
 
 def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
     """Return a kernel's library: from the cache, or compiled."""
-    place = kernel_cache.folder()
-    for path in kernel_cache.find(place, key):
+    cache_folder = kernel_cache.folder()
+    for path in kernel_cache.find(cache_folder, key):
         library = _loaded(path)
         if library is not None:
             return library
     made, lost = _compile(words, source), None
-    for where in dict.fromkeys((place, kernel_cache.temporary())):  # code in a shared folder may not be executable
+    for where in dict.fromkeys((cache_folder, kernel_cache.temporary())):  # code in the first may not be executable
         try:
             library = _loaded(kernel_cache.store(where, key, made, ".so"))
         except OSError as error:

@@ -1,9 +1,9 @@
 """Reverse mode of many steps in one kernel: from cotangents of the leaves after the steps to cotangents before them.
 
-The kernel takes the steps once more, keeps the numbers that each begins with, and goes back from the last to the first.
-From more steps than ``interval`` on it keeps the beginnings of intervals, and takes the steps of each once more on the
-way back. A cotangent is a variable beside the number that it belongs to, for every drone: the caller adds up those of
-leaves that drones share.
+The kernel computes the steps again, stores the state before each, and goes back from the last step to the first. For
+more steps than ``interval`` it stores the state before each interval, and computes the steps of an interval again when
+it goes back through it. Every drone has a cotangent of every number; the caller sums the cotangents of leaves that
+drones share.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ class Reverse:
         return tuple(i for i in self.program.written if self.program.leaves[i].number.kind == "f")
 
     def slots(self) -> list[Slot]:
-        """Return the places of all cotangents."""
+        """Return the slots of all cotangents."""
         own = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
-        places = {(self.n_leaves + i, k) for i, k in own}
+        ct_slots = {(self.n_leaves + i, k) for i, k in own}
         for s in (*self.back.values(), *self.back_hoisted.values()):
             slots = self.program.per_drone(s, [*s.reads, *s.writes])
-            places.update(slot for slot in slots if slot[0] >= self.n_leaves)
-        return sorted(places)
+            ct_slots.update(slot for slot in slots if slot[0] >= self.n_leaves)
+        return sorted(ct_slots)
 
 
 def reverse_program(program: Program, perturbed: Collection[int]) -> Reverse:
@@ -94,7 +94,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> Reverse:
 
 
 def _used(program: Program, s: Segment) -> list[Slot]:
-    """Return the places of the inputs that a segment uses."""
+    """Return the slots of the inputs that a segment uses."""
     used, slots = s.block.uses(), program.per_drone(s, s.reads)
     return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]
 
@@ -108,7 +108,7 @@ def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Seq
     """Return the segment that replaces the cotangents after a segment by the cotangents before it.
 
     In a segment of worlds, each drone has a copy of what belongs to the world, and a cotangent for it; the sum of all
-    is that of the first drone afterwards.
+    belongs to the first drone afterwards.
     """
     n_drones, of_world = program.n_drones, s.scope == "world"
     reads = program.per_drone(s, s.reads)
@@ -149,12 +149,12 @@ def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Seq
         zero = constant(0, s.block.outputs[k].dtype)
         now.update(dict.fromkeys(copies(s.writes[k]), zero))
     for k, part in zip(wanted, parts, strict=False):
-        place, dtype = copies(s.reads[k])[0], s.block.inputs[k].dtype
-        old = now[place] if place in now else read(place, dtype)
-        now[place] = builder.add("add", (old, part), dtype)
+        ct_slot, dtype = copies(s.reads[k])[0], s.block.inputs[k].dtype
+        old = now[ct_slot] if ct_slot in now else read(ct_slot, dtype)
+        now[ct_slot] = builder.add("add", (old, part), dtype)
     for k, part in zip(constants, parts[len(wanted) :], strict=True):
-        place, dtype = (where, k), s.block.inputs[len(reads) + k].dtype
-        now[place] = builder.add("add", (read(place, dtype), part), dtype)
+        ct_slot, dtype = (where, k), s.block.inputs[len(reads) + k].dtype
+        now[ct_slot] = builder.add("add", (read(ct_slot, dtype), part), dtype)
     own, fixed = primal[: len(reads)], primal[len(reads) : n_inputs]
     block = Block((*own, *before.values(), *fixed), tuple(builder.operations), tuple(now.values()))
     return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *before), tuple(now))
@@ -168,11 +168,11 @@ def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int]
     pull = transpose_block(s.hoisted, [s.hoisted.inputs[k] for k in wanted])
     builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
     primal = [builder.input(x.dtype, x.size) for x in s.hoisted.inputs]
-    seeds, places = [], []
+    seeds, ct_slots = [], []
     for k, x in enumerate(s.hoisted.outputs):
         if x.dtype.kind == "f" and k in constants:
             seeds.append(builder.input(x.dtype))
-            places.append((where, k))
+            ct_slots.append((where, k))
         elif x.dtype.kind == "f":
             seeds.append(constant(0, x.dtype))
     old = [builder.input(s.hoisted.inputs[k].dtype) for k in wanted]
@@ -181,7 +181,7 @@ def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int]
     sums = [builder.add("add", (a, b), a.dtype) for a, b in zip(old, parts, strict=True)]
     targets = tuple((n + reads[k][0], reads[k][1]) for k in wanted)
     block = Block((*primal, *cts, *old), tuple(builder.operations), tuple(sums))
-    return Segment("drone", s.stages, "each", block, (*reads, *places, *targets), targets)
+    return Segment("drone", s.stages, "each", block, (*reads, *ct_slots, *targets), targets)
 
 
 def needed_leaves(reverse: Reverse) -> tuple[int, ...]:

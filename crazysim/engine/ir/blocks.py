@@ -151,7 +151,7 @@ class Builder:
         return self._new(name, args, types, params, blocks) if blocks else self._add(name, args, types, params)
 
     def barrier(self) -> None:
-        """Mark a place before which everything that is used after it should be computed once."""
+        """Add a barrier: values that are used after it should be computed once, before it."""
         if self.operations and self.operations[-1].name != "barrier":
             self._new("barrier", (), (), (), ())
 

@@ -50,7 +50,7 @@ def list_operation(program: Program, operation: Operation) -> str:
 
 
 def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
-    """Return a place as the field and the element, such as ``states.pos[2]``; of a world, with the drone."""
+    """Return a slot as the field and the element, such as ``states.pos[2]``; in a segment of worlds, with the drone."""
     (i, k), leaf = slot, program.leaves[slot[0]]
     if k < 0:  # all of it, a table
         return f"{leaf.name}[:]"

@@ -20,7 +20,7 @@ from crazysim.engine.ir.blocks import Block
 from crazysim.jaxcompat import is_key
 
 Slot = tuple[int, int]
-"""Place of a number: which leaf, and which element of the part of it that belongs to one drone (or one world)."""
+"""Index of a number: of its leaf, and of the element in the part of the leaf that belongs to one drone (or world)."""
 
 TABLE_INDEX = -1
 """Element of a slot that means the whole leaf, a table: only shared leaves are tables."""

@@ -18,7 +18,7 @@ def verify(program: Program) -> Program:
     """Return a program unchanged, or say what is wrong with it.
 
     Values are defined once, before they are used; operands and results have the types that the table says; inputs and
-    outputs fit the numbers they are; no place is read or written twice; nothing hoisted depends on a step.
+    outputs fit the numbers they are; no slot is read or written twice; nothing hoisted depends on a step.
 
     Raises:
         VerificationError: If it is not well formed.

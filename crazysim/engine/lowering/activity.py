@@ -41,9 +41,9 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
         return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
 
     def run(s: Segment) -> None:
-        places = program.per_drone(s, s.writes)
+        written_slots = program.per_drone(s, s.writes)
         reads = program.per_drone(s, s.reads)
-        found.update(places[k] for k in of(s.block, reads, constants.get(s, ())))
+        found.update(written_slots[k] for k in of(s.block, reads, constants.get(s, ())))
 
     for s in program.of("before"):
         run(s)

@@ -46,7 +46,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 
 class Entry(NamedTuple):
-    """Place of a number in a table: its index is the sum of a computed base and a constant."""
+    """Index of a number in a table: the sum of a computed base and a constant."""
 
     table: Value
     """The table."""

@@ -1,7 +1,8 @@
 """The smallest or largest number over other drones, in a form that has derivatives.
 
-Its derivative is that of the number of the first drone that has it, as ``crazysim.core.others`` defines it. That drone
-is found by its index, not by equality with the smallest number: numbers computed twice may be rounded differently.
+Its derivative is the derivative of the number of the first drone that has it, as ``crazysim.core.others`` defines it.
+The drone is found by its index, not by equality with the smallest number, since numbers computed twice may be rounded
+differently.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def _selected(builder: Builder, op: Operation, some: list[int], values: dict[Val
 
     inner, (is_self,), found = of_pair(0)
     one, zero = (constant(x, dtypes[0]) for x in (1, 0))
-    own = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the largest is that of the drone itself
+    own = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the drone itself has the largest
     names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in some), "argmax")
     block = prune(inner.finish([*found, own]))
     *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),

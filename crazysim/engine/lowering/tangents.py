@@ -1,7 +1,7 @@
 """Forward mode: the tangents of a program's numbers, computed beside the numbers.
 
-The result is a program like any other. Its tangents are leaves behind those of the program, and the derivative of
-each operation follows the operation, in the same loops and conditions.
+The result is a program like any other. Its tangents are further leaves, and the derivative of each operation follows
+the operation, in the same loops and conditions.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     """Return the program that computes the tangents of a program's numbers besides the numbers.
 
     Leaf ``len(program.leaves) + i`` is the tangent of leaf ``i``; each world has its own tangent of a leaf that all
-    drones share. The program reads the tangents of the perturbed leaves and writes those of the leaves that depend on
-    them. The leaves themselves are scratch: their values after the steps are not kept.
+    drones share. The program reads the tangents of the perturbed leaves and writes the tangents of leaves that depend
+    on them. The leaves themselves are scratch: their values after the steps are not kept.
 
     Args:
         program: The program.
@@ -80,8 +80,8 @@ def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: 
     if constants:
         some = [x for x, slot in zip(s.hoisted.inputs, s.hoisted_reads, strict=True) if slot in before]
         hoisted = add_block_tangents(s.hoisted, some)
-        places = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
-        kept = [hoisted.outputs[n_hoisted + places.index(k)] for k in constants]
+        indices = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
+        kept = [hoisted.outputs[n_hoisted + indices.index(k)] for k in constants]
         hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *kept))
     return dataclasses.replace(
         s,
@@ -104,9 +104,9 @@ def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
         The block from the inputs of ``block``, and behind them the tangents of ``wanted``, to the outputs of ``block``,
         and behind them a tangent of each that is a float.
     """
-    places = [block.inputs.index(x) for x in wanted]
+    indices = [block.inputs.index(x) for x in wanted]
     block = add_selections(block)
-    wanted = [block.inputs[k] for k in places]
+    wanted = [block.inputs[k] for k in indices]
     builder = Builder()
     values: Values = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     tangents: Values = {x: builder.input(x.dtype) for x in wanted}

@@ -40,9 +40,9 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
         The block from the inputs of ``block``, and behind them a cotangent for each output that is a float, to the
         cotangents of ``wanted``.
     """
-    places = [block.inputs.index(x) for x in wanted]
+    indices = [block.inputs.index(x) for x in wanted]
     block = _unrolled(add_selections(block))
-    wanted = [block.inputs[k] for k in places]
+    wanted = [block.inputs[k] for k in indices]
     on_path = active_values(block, wanted)
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}

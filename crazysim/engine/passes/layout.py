@@ -47,22 +47,22 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
     chosen = [i for i in sorted(select(program.written)) if not is_key(leaves[i])]
     # The only drone of a world is all that the world has.
     kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in chosen}
-    places: dict[int, tuple[int, int, int]] = {}
+    positions: dict[int, tuple[int, int, int]] = {}
     for kind in dict.fromkeys(kinds.values()):
         members = tuple([i for i in chosen if kinds[i] == kind])
         n_rows = sum(leaves[i].size for i in members)
         first = 0
         for i in members:
-            places[i] = (len(leaves), first, n_rows)
+            positions[i] = (len(leaves), first, n_rows)
             first += leaves[i].size
         n_lanes = leaves[members[0]].shape[0] * program.n_drones
         leaves.append(Leaf("rows", kind[0], (n_rows, n_lanes), kind[1], members))
 
     def move(slot: Slot) -> Slot:
         leaf, k = slot
-        if leaf not in places:
+        if leaf not in positions:
             return slot
-        new, first, n_rows = places[leaf]
+        new, first, n_rows = positions[leaf]
         drone, k = divmod(k, program.leaves[leaf].size)
         return new, drone * n_rows + first + k
 

@@ -1,4 +1,4 @@
-"""The first place at which two engines differ.
+"""The first stage after which two engines differ.
 
 ``first_difference(sim.step_pipeline, sim.data, engines=("plain", "fused"))`` finds the stage, the field and the world,
 and between engines that run programs the operation.
@@ -61,7 +61,7 @@ def first_difference(
 ) -> Difference | None:
     """Return the first difference between two engines in one step, or None.
 
-    Both run each stage from the same data, that of the first engine before it: a difference is of that stage alone.
+    Both run each stage from the data of the first engine before it, so a difference belongs to that stage alone.
     Between engines of programs the stage is then run with every value as a result, to find the operation.
 
     Args:

@@ -30,7 +30,7 @@ def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, E
 
     Args:
         segment: A segment of one drone.
-        number: Returns the number in a place before the step.
+        number: Returns the number in a slot before the step.
 
     Raises:
         UnsupportedError: If CasADi has no form for an operation; the error names the stage.
@@ -147,7 +147,7 @@ class _Interpreter:
     def _guarded_sqrt(self, x: Expression) -> Expression:
         """Return a root whose slope at zero is zero.
 
-        A function with a derivative of its own has it for places where that of its arithmetic is infinite, such as a
+        A function with a derivative of its own has it for arguments where its arithmetic has an infinite one, such as a
         norm at zero.
         """
         ca = self.casadi

@@ -53,7 +53,7 @@ def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
 def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Expand a primitive that is defined by others, which JAX has from 0.12 on.
 
-    Results without a derivative, such as the places that ``jnp.searchsorted`` finds, are computed as in any call, from
+    Results without a derivative, such as the indices that ``jnp.searchsorted`` finds, are computed as in any call, from
     tables where the operands are tables.
     """
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]

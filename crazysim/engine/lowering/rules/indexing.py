@@ -1,4 +1,4 @@
-"""Rules for indexing: a known index moves elements, a computed one selects among all places that it may mean."""
+"""Rules for indexing: a known index moves elements, a computed one selects among all elements that it may mean."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) ->
     for corner in itertools.product(*ranges):
         here = _all(ctx, (_at(ctx, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
                         if len(options) > 1))  # fmt: skip
-        place = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
+        window_index = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
         out = out.copy()
-        out[place] = update if here is None else _select(ctx, here, update, out[place])
+        out[window_index] = update if here is None else _select(ctx, here, update, out[window_index])
     return [out]
 
 
@@ -147,7 +147,7 @@ def _select_windows(
     row_of: np.ndarray,
     limits: Sequence[int],
 ) -> list[Element]:
-    """Return the elements of a gather, selected among all places that the indices may mean."""
+    """Return the elements of a gather, selected among all elements that the indices may mean."""
     _check_range(int(np.prod([limit + 1 for limit in limits])))
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
@@ -169,11 +169,11 @@ def _select_windows(
 def _gather_filled(eqn: JaxprEqn, x: Elements, indices: np.ndarray) -> Elements:
     """Gather at known indices; indices outside of the array are filled."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    (places,) = run_now(eqn, [numbers, indices], fill_value=-1)
+    (positions,) = run_now(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
     outside = constants(_fill_value(eqn.outvars[0].aval.dtype) if fill is None else fill, eqn.outvars[0].aval.dtype)[()]
     flat = x.reshape(-1)
-    return as_elements([outside if i < 0 else flat[i] for i in places.reshape(-1)], places.shape)
+    return as_elements([outside if i < 0 else flat[i] for i in positions.reshape(-1)], positions.shape)
 
 
 def _fill_value(dtype: DTypeLike) -> Any:
@@ -197,8 +197,8 @@ def _inside(ctx: Lowering, row: Elements, limits: list[int]) -> Elements:
 def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Write windows of ``updates`` into the operand, one row of ``indices`` after the other.
 
-    A window whose place is computed at run time is compared with every place it may have. A window that is partly
-    outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
+    A window whose position is computed at run time is compared with every position that it may have. A window that is
+    partly outside is dropped as a whole, or moved inside in mode ``clip``, as XLA does.
     """
     x, indices, updates = args
     dims, clip = eqn.params["dimension_numbers"], eqn.params["mode"] == GatherScatterMode.CLIP
@@ -214,12 +214,12 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
     for row in np.ndindex(indices.shape[:-1]):
         start, block = indices[row], blocks[(*row, ...)]
         options = [_options(i, limit, clip) for i, limit in zip(start, limits, strict=True)]
-        _check_range(int(np.prod([len(places) for places in options])))
+        _check_range(int(np.prod([len(positions) for positions in options])))
         corner = [0] * x.ndim
         for axis, batch_axis in zip(dims.operand_batching_dims, dims.scatter_indices_batching_dims, strict=True):
             corner[axis] = row[batch_axis]
-        for places in itertools.product(*options):
-            for axis, k in zip(starts_of, places, strict=True):
+        for positions in itertools.product(*options):
+            for axis, k in zip(starts_of, positions, strict=True):
                 corner[axis] = k
             here = _all(
                 ctx,
@@ -227,19 +227,19 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
                     _at(ctx, i, k, limit)
                     if clip
                     else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
-                    for i, k, limit in zip(start, places, limits, strict=True)
+                    for i, k, limit in zip(start, positions, limits, strict=True)
                     if not is_constant(i) and not (clip and limit == 0)
                 ),
             )
-            place = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
-            old = out[place]
+            window_index = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
+            old = out[window_index]
             new = _combined(ctx, eqn, old, block.reshape(old.shape))
-            out[place] = new if here is None else _select(ctx, here, new, old)
+            out[window_index] = new if here is None else _select(ctx, here, new, old)
     return [out]
 
 
 def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
-    """Return the places that a window may have along an axis; none if it is known to be outside."""
+    """Return the positions that a window may have along an axis; none if it is known to be outside."""
     if not is_constant(index):
         return range(limit + 1)
     if clip:

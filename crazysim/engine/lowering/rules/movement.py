@@ -59,8 +59,8 @@ def move_many(eqn: JaxprEqn, args: list[Elements], fixed: Sequence[Any] = ()) ->
     for x in args:
         numbers.append(np.arange(len(elements), len(elements) + x.size, dtype=np.int32).reshape(x.shape))
         elements.extend(x.reshape(-1))
-    places = _sources(eqn, [*numbers, *fixed])
-    return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in places]
+    positions = _sources(eqn, [*numbers, *fixed])
+    return [as_elements([elements[i] for i in p.reshape(-1)], p.shape) for p in positions]
 
 
 def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
@@ -85,10 +85,10 @@ def _padded(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, i
     for axis, (low, high, interior) in enumerate(config):
         n = x.shape[axis]
         length = max(low + n + max(n - 1, 0) * interior + high, 0)
-        places = low + np.arange(n) * (interior + 1)
-        inside = (places >= 0) & (places < length)
+        positions = low + np.arange(n) * (interior + 1)
+        inside = (positions >= 0) & (positions < length)
         padded = np.full((length, *np.delete(x.shape, axis)), value)
-        padded[places[inside]] = np.moveaxis(x, axis, 0)[inside]
+        padded[positions[inside]] = np.moveaxis(x, axis, 0)[inside]
         x = np.moveaxis(padded, 0, axis)
     return x
 

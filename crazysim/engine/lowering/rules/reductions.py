@@ -50,12 +50,12 @@ def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Eleme
     rest = arrays[0].shape[len(axes) :]
     rows = [x.reshape(math.prod(x.shape[: len(axes)]), *rest) for x in arrays]
     results = [np.empty(rest, object) for _ in arrays]
-    for place in np.ndindex(rest):
+    for rest_index in np.ndindex(rest):
         reduced = args[n:]
         for k in range(len(rows[0])):
-            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *place, ...)] for x in rows)])
+            reduced = ctx.lower(eqn.params["jaxpr"], [*reduced, *(x[(k, *rest_index, ...)] for x in rows)])
         for result, value in zip(results, reduced, strict=True):
-            result[place] = value[()]
+            result[rest_index] = value[()]
     return results
 
 
@@ -100,7 +100,7 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
     """
     (x,), k, axis, dtype = args, eqn.params["k"], eqn.params["axis"], eqn.invars[0].aval.dtype
     numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
-    places = constants(np.broadcast_to(numbers, x.shape), np.int32)
+    positions = constants(np.broadcast_to(numbers, x.shape), np.int32)
     key = x
     if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
         ctx.builder.barrier()  # the sign of a NaN that XLA computes again, for another exchange, may be another
@@ -109,7 +109,7 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
         turned = ctx.elementwise("xor", [key, constants(np.iinfo(whole).max, whole)], whole)
         negative = ctx.elementwise("lt", [key, constants(0, whole)], bool)
         key = ctx.elementwise("select_n", [negative, key, turned], whole)
-    columns = _sorted(ctx, eqn, [key, x, places], axis, 1, descending=True)
+    columns = _sorted(ctx, eqn, [key, x, positions], axis, 1, descending=True)
     return [np.take(y, range(k), axis) for y in columns[1:]]
 
 

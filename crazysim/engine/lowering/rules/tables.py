@@ -1,4 +1,4 @@
-"""Tables: arrays that all drones share, or constants, read at computed places from memory instead of selected."""
+"""Tables: arrays that all drones share, or constants, read from memory at computed indices instead of selected."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from crazysim.engine.ir.blocks import Element, Numbers, Value, constant, is_cons
 from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Entry, Lowering, as_elements
 
 MAX_SELECTED = 4
-"""Most places from which an entry of a shared array is selected: its numbers are in registers already."""
+"""Most elements from which an entry of a shared array is selected: its numbers are in registers already."""
 MAX_SELECTED_CONSTANTS = 8
 """The same for constants, which are parts of instructions."""
 
@@ -42,8 +42,8 @@ class Table:
                 continue
             largest = constant(min(limit, np.iinfo(i.dtype).max), i.dtype)
             clamped = self.ctx.scalar("clamp", constant(0, i.dtype), i, largest)
-            place = self.ctx.scalar("convert_element_type", clamped, dtype=np.int32)
-            step = self.ctx.scalar("mul", place, constant(stride, np.int32))
+            whole = self.ctx.scalar("convert_element_type", clamped, dtype=np.int32)
+            step = self.ctx.scalar("mul", whole, constant(stride, np.int32))
             base = self.ctx.scalar("add", base, step)
         return base
 
@@ -57,27 +57,27 @@ class Table:
         return as_elements(found, offsets.shape)
 
 
-def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_places: int) -> Table | None:
+def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> Table | None:
     """Return an array as a table in which an index along some axes moves all entries alike, or None.
 
     Args:
         ctx: The lowering.
         x: The array.
         axes: The axes along which it is indexed.
-        n_places: Number of places that an index may mean.
+        n_indices: Number of elements that an index may mean.
     """
     items = x.reshape(-1)
     if not len(items) or isinstance(items[0], tuple):
         return None
     if all(map(is_constant, items)):
-        return _of_constants(ctx, x, axes) if n_places > MAX_SELECTED_CONSTANTS else None
-    places = [ctx.entries.get(item) if isinstance(item, Value) else None for item in items]
-    first = places[0]
-    if first is None or not all(p is not None and p.table is first.table and p.base is first.base for p in places):
+        return _of_constants(ctx, x, axes) if n_indices > MAX_SELECTED_CONSTANTS else None
+    locations = [ctx.entries.get(item) if isinstance(item, Value) else None for item in items]
+    first = locations[0]
+    if first is None or not all(p is not None and p.table is first.table and p.base is first.base for p in locations):
         return None
-    if n_places <= MAX_SELECTED and first.table.size <= MAX_UNROLL:
+    if n_indices <= MAX_SELECTED and first.table.size <= MAX_UNROLL:
         return None
-    offsets = np.array([p.offset for p in places if p is not None]).reshape(x.shape)
+    offsets = np.array([p.offset for p in locations if p is not None]).reshape(x.shape)
     strides = _strides(offsets, axes)
     return None if strides is None else Table(ctx, first, offsets, strides)
 
