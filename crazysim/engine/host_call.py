@@ -43,7 +43,7 @@ class HostLeaves:
         """Hold leaves.
 
         Args:
-            items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``Results``.
+            items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``CallResults``.
             addresses: Address of each leaf that kernels read.
             views: Views that keep the memory of JAX arrays.
             sharding: Device that arrays of JAX are made on.
@@ -65,14 +65,14 @@ class HostLeaves:
     def array(self, i: int) -> NDArray:
         """Return a leaf as an array of NumPy, which must not be written into."""
         x = self.items[i]
-        return x.array(i) if isinstance(x, Results) else np.asarray(x)
+        return x.array(i) if isinstance(x, CallResults) else np.asarray(x)
 
-    def replaced(self, numbers: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
+    def replace(self, numbers: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
         """Return leaves of which some are replaced by arrays that nothing writes into any more."""
         arrays = [np.ascontiguousarray(x) for x in arrays]
-        return self.changed(numbers, arrays, [_address(x) for x in arrays])
+        return self.replace_items(numbers, arrays, [_address(x) for x in arrays])
 
-    def changed(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
+    def replace_items(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
         """Return leaves of which some are replaced."""
         new = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
         for i, x, address in zip(numbers, items, addresses, strict=True):
@@ -115,7 +115,7 @@ class _Layout:
         self.begins = [(x.piece, x.offset) for x in self.offsets]
 
 
-class Results:
+class CallResults:
     """Arrays that one call wrote."""
 
     __slots__ = ("_layout", "_memory", "_starts", "addresses")
@@ -214,17 +214,17 @@ class HostCall:
     def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:
         """Return the leaves some steps later."""
         self.used = True
-        results, addresses = Results(self._layout), leaves.addresses
+        results, addresses = CallResults(self._layout), leaves.addresses
         for kernel, n_lanes, inputs, outputs, packed in self._launches:
             pointers = packed.pack(*[addresses[i] for i in inputs], *results.addresses[outputs])
             if not kernel(n_lanes, n_steps, pointers, len(inputs)):
                 raise MemoryError("there is no memory for a step")
         new = [results.addresses[k] for k in self._positions]
-        after = leaves.changed(self._written, [results] * len(new), new)
+        after = leaves.replace_items(self._written, [results] * len(new), new)
         if not self._flags:
             return after
         flagged = functools.reduce(np.logical_or, (results.array(k).any(axis=1, keepdims=True) for k in self._flags))
-        return after.replaced([self._nonfinite], [flagged])
+        return after.replace([self._nonfinite], [flagged])
 
 
 def is_possible(kernels: Sequence[Kernels]) -> bool:

@@ -16,7 +16,7 @@ from crazysim import jaxcompat
 from crazysim.engine.backends import cuda, map_kernel, native
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.ir.blocks import Block, prune
-from crazysim.engine.lowering.jaxprs import Lowering, Rows, as_elements
+from crazysim.engine.lowering.jaxprs import Lowering, TableRows, as_elements
 
 Function = Callable[..., Sequence[Array]]
 """``fn(index, *tables)`` returns single numbers for an index, int32 (); it reads tables by ``table_row`` only."""
@@ -104,6 +104,6 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
     avals = [jax.ShapeDtypeStruct((max(len(x.shape) and x.shape[0], 2), *x.shape[1:]), x.dtype) for x in tables]
     lowering = Lowering()
     index = as_elements([lowering.builder.input(np.int32)], ())
-    rows: list[Any] = [Rows(lowering.builder, x) for x in avals]
+    rows: list[Any] = [TableRows(lowering.builder, x) for x in avals]
     traced = jax.make_jaxpr(lambda i, *tables: list(fn(i, *tables)))(jax.ShapeDtypeStruct((), np.int32), *avals)
     return prune(lowering.finish(lowering.lower(traced, [index, *rows])))

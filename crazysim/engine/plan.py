@@ -36,7 +36,7 @@ from crazysim.engine.lowering.relative import on_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
-from crazysim.engine.passes.layout import Rows, rows_of
+from crazysim.engine.passes.layout import PackedRows, rows_of
 from crazysim.errors import ConfigError
 from crazysim.pytree import leaf_indices, n_batch_axes, scopes
 
@@ -68,7 +68,7 @@ class Plan:
     """Leaves that are passed to the compiled step: leaves of the data, followed by the leaves that passes add."""
     packed: tuple[int, ...]
     """Shared leaves that are passed as one, the first leaf after the leaves of the data."""
-    rows: tuple[Rows, ...]
+    rows: tuple[PackedRows, ...]
     """Leaves of rows, behind that; empty where the data is stepped as it is."""
     written: tuple[int, ...]
     """Leaves that are returned."""

@@ -26,7 +26,7 @@ Query = tuple[Literal["drone", "world"], Callable[[SimData], Any]]
 tree of arrays with its drones in front."""
 
 
-class Results(PyTree):
+class QueryResults(PyTree):
     """Results as rows of numbers."""
 
     rows: dict[str, Array] = leaf("drone", 1)
@@ -58,7 +58,7 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         shapes.append(dict(zip(names, per_drone, strict=True)))
         trees.append(treedef)
         stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}", phase="after"))
-    prepared = data.replace(plugins={RECORD_NAME: Results(rows)})
+    prepared = data.replace(plugins={RECORD_NAME: QueryResults(rows)})
     given, treedef = jax.tree.flatten(prepared)
     program = optimise(lower_stages(stages, prepared))
     if program.unfused_stages:
@@ -80,6 +80,6 @@ def _writing(fn: Callable[[SimData], Any], names: list[str], scope: str) -> Call
         outs = jax.tree.leaves(fn(data.replace(plugins={})))
         shape = (data.core.n_drones, -1) if scope == "world" else (-1,)
         new = {name: x.reshape(shape) for name, x in zip(names, outs, strict=True)}
-        return data.replace(plugins={RECORD_NAME: Results(rows | new)})
+        return data.replace(plugins={RECORD_NAME: QueryResults(rows | new)})
 
     return write

@@ -73,17 +73,17 @@ def rollout(
     changed = sorted({*start.plan.written, start.plan.synced, *staged})
 
     def control_step(carry: list[Any]) -> list[Any]:
-        now = start.replaced(changed, carry)
+        now = start.replace(changed, carry)
         command = F.check_command(data, data.controls.mode, policy(params, now.data()))
-        after = step.advance(now.staged(data, command), n_substeps)
+        after = step.advance(now.stage_command(data, command), n_substeps)
         return [after.leaves[i] for i in changed]
 
     def until_record(carry: list[Any], _: Any) -> tuple[list[Any], Any]:
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
-        return carry, keep(start.replaced(changed, carry).data())
+        return carry, keep(start.replace(changed, carry).data())
 
     carry, kept = jax.lax.scan(until_record, [start.leaves[i] for i in changed], length=n_control_steps // every)
-    return start.replaced(changed, carry).data(), kept
+    return start.replace(changed, carry).data(), kept
 
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")

@@ -52,7 +52,7 @@ class FlatData:
             record = self._record = lazy(self.plan.numbers, functools.partial(_leaf, self.leaves, self.plan))
         return record
 
-    def replaced(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:
+    def replace(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:
         """Return the data with other values of some leaves.
 
         Raises:
@@ -63,10 +63,10 @@ class FlatData:
                 "expected leaves that are not in rows, got one that is. Name it in apart= of Step.flatten."
             )
         if isinstance(self.leaves, HostLeaves):
-            return FlatData(self.leaves.replaced(numbers, values), self.plan)
+            return FlatData(self.leaves.replace(numbers, values), self.plan)
         return FlatData(replace_leaves(self.leaves, numbers, values), self.plan)
 
-    def staged(self, like: SimData, command: Any, feedforward: Any = None) -> FlatData:
+    def stage_command(self, like: SimData, command: Any, feedforward: Any = None) -> FlatData:
         """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does.
 
         Args:
@@ -76,7 +76,7 @@ class FlatData:
         """
         numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
         on_host = isinstance(self.leaves, HostLeaves)
-        return self.replaced(numbers, [x if on_host else put_command(like, x) for x in values.values()])
+        return self.replace(numbers, [x if on_host else put_command(like, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step besides the number of steps."""
@@ -147,11 +147,11 @@ class Step:
         self._at_home: Any = None
         self._unsynced: Any = None
 
-    def without(self, names: Collection[str]) -> Step:
+    def without_stages(self, names: Collection[str]) -> Step:
         """Return the step without some stages."""
-        return self.of([stage for stage in self.stages if stage.__name__ not in names])
+        return self.with_stages([stage for stage in self.stages if stage.__name__ not in names])
 
-    def of(self, stages: Sequence[Stage]) -> Step:
+    def with_stages(self, stages: Sequence[Stage]) -> Step:
         """Return the step of other stages, with the same engine and devices."""
         names = [stage.__name__ for stage in stages]
         if twice := sorted({name for name in names if names.count(name) > 1}):

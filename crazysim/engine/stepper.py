@@ -63,7 +63,7 @@ class Stepper:
             self._data = data
 
     @property
-    def like(self) -> SimData:
+    def data_or_shapes(self) -> SimData:
         """The data as a record, or, where that would have to be put together, its shapes, types and devices."""
         flat = self._data
         if not isinstance(flat, FlatData):
@@ -76,7 +76,7 @@ class Stepper:
         return self._like[1]
 
     def stage(self, command: Any, feedforward: Any = None) -> None:
-        """Stage a command that was checked with ``like``; flattened data stays flattened.
+        """Stage a command that was checked with ``data_or_shapes``; flattened data stays flattened.
 
         Args:
             command: Command in the units of the command level, which nothing writes into any more.
@@ -85,7 +85,7 @@ class Stepper:
         """
         traced = isinstance(command, jax.core.Tracer) or isinstance(feedforward, jax.core.Tracer)
         if isinstance(self._data, FlatData) and not traced:
-            self._data = self._data.staged(self.like, command, feedforward)
+            self._data = self._data.stage_command(self.data_or_shapes, command, feedforward)
             return
         data = self.data
         feedforward = None if feedforward is None else put_command(data, feedforward)

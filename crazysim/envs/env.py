@@ -104,7 +104,7 @@ class Env(ABC):
         if self.base.resets.foreign:
             why = "a record in data.plugins is of another library, and is not divided among worlds"
         physics = self.base.physics
-        return physics.of(self.phases.stages(physics.stages, why))
+        return physics.with_stages(self.phases.stages(physics.stages, why))
 
     def reset(self, key: Array) -> EnvState:
         """Return all worlds at the start of an episode; the same key gives the same episodes.
@@ -177,7 +177,7 @@ class Env(ABC):
             flat: Result of ``flatten`` or ``advance``.
             action: Action of every drone, in the type of the state's, which is not checked. (n_worlds, n_drones, k)
         """
-        flat = flat.replaced([flat.plan.numbers.plugins[NAME].next_action], [action])
+        flat = flat.replace([flat.plan.numbers.plugins[NAME].next_action], [action])
         return self.step_fn.advance(flat, self.n_substeps)
 
     def _require_own(self, state: EnvState) -> None:
@@ -307,7 +307,7 @@ class DroneEnv(Env):
         sim.plugins.check()
         if NAME in sim.plugins:
             raise ConfigError(f"expected no plugin of the name {NAME!r}, which is that of the environment's record")
-        self.physics = sim.build_step_fn().without(sim.plugins.reset_stages)  # every episode begins by a reset
+        self.physics = sim.build_step_fn().without_stages(sim.plugins.reset_stages)  # every episode begins by a reset
         """The step of the physics."""
         self.resets = Resets(sim)
         """Resets of data at the start of an episode."""

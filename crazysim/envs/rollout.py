@@ -96,7 +96,7 @@ def rollout(
     carried = sorted({*start.plan.written, start.plan.synced})
 
     def step(carry: tuple[list[Any], Any], key: Array) -> tuple[Any, Any]:
-        before, memory = start.replaced(carried, carry[0]), carry[1]
+        before, memory = start.replace(carried, carry[0]), carry[1]
         seen = EnvState(before.data())
         action, memory, extras = policy(seen.obs, memory, key)
         after = env.advance(before, validate_action(action, seen, env.actions))
@@ -109,4 +109,4 @@ def rollout(
 
     carry = [start.leaves[i] for i in carried], memory
     (leaves, memory), kept = jax.lax.scan(step, carry, jax.random.split(key, n_steps))
-    return EnvState(start.replaced(carried, leaves).data()), memory, kept
+    return EnvState(start.replace(carried, leaves).data()), memory, kept

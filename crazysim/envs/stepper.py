@@ -72,7 +72,7 @@ class EnvStepper:
         carry, fixed = ([flat.leaves[i] for i in some] for some in (self._carried, self._fixed))
         with keep_programs(when=not jaxcompat.n_compilations(self.compiled)):
             carry, output, self._ends = self.compiled(carry, fixed, self._ends, actions)
-        self._flat = flat.replaced(self._carried, carry)
+        self._flat = flat.replace(self._carried, carry)
         return output, *self._ends
 
     def _compile(self, flat: FlatData) -> None:

@@ -413,7 +413,7 @@ class Sim:
         feedforward: ArrayLike | None = None,
     ) -> None:
         """Stage a full-state setpoint: (n_worlds, n_drones, 16), or ``pos`` and other parts, which broadcast."""
-        like = self._stepper.like
+        like = self._stepper.data_or_shapes
         self._stepper.stage(
             *F.check_setpoint(like, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
         )
@@ -439,7 +439,7 @@ class Sim:
         self._stage(Control.rotor_vel, controls, check_finite)
 
     def _stage(self, control: Control, command: ArrayLike, check_finite: bool) -> None:
-        self._stepper.stage(F.check_command(self._stepper.like, control, command, check_finite))
+        self._stepper.stage(F.check_command(self._stepper.data_or_shapes, control, command, check_finite))
 
     # Pipelines --------------------------------------------------------------------------------------------------------
 

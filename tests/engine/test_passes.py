@@ -41,7 +41,7 @@ def run(program, numbers, n_steps):
     }
     for phase, times in (("before", 1), ("each", n_steps), ("after", 1)):
         for _ in range(times):
-            for s in program.of(phase):
+            for s in program.phase_segments(phase):
                 out = interpret.run(s.block, [*(numbers[slot] for slot in s.reads), *hoisted[id(s)]], shape)
                 numbers.update(zip(s.writes, out, strict=True))
     return numbers

@@ -13,7 +13,7 @@ from crazysim import PyTree, Sim, leaf, stage
 from crazysim.core.stage import as_stages
 from crazysim.engine import Step
 from crazysim.engine.backends import cuda, interpret, kernel
-from crazysim.engine.ir.blocks import Builder, Numbers, Operation, Value
+from crazysim.engine.ir.blocks import Builder, Operation, TableEntries, Value
 from crazysim.engine.ir.listing import list_program
 from crazysim.engine.ir.verify import VerificationError, verify, verify_block
 from crazysim.engine.lowering.stages import lower_stages
@@ -243,7 +243,9 @@ def test_verify_finds_wrong_tables():
         op._replace(args=(place, place)),
         op._replace(args=(table, table)),
         Operation("add", (table, table), (Value(np.dtype(np.float32)),)),
-        Operation("table", (), (Value(np.dtype(np.float32), 3),), (("numbers", Numbers(np.zeros(2, np.float32))),)),
+        Operation(
+            "table", (), (Value(np.dtype(np.float32), 3),), (("numbers", TableEntries(np.zeros(2, np.float32))),)
+        ),
     ):
         with pytest.raises(VerificationError):
             verify_block(type(good)(good.inputs, (wrong,), wrong.results))

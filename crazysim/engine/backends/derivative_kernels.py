@@ -18,7 +18,7 @@ from crazysim.engine.backends import Run, kernel, lanes, reverse
 from crazysim.engine.backends.frame import Kernel
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel
-from crazysim.engine.backends.reverse import Reverse
+from crazysim.engine.backends.reverse import ReverseProgram
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.program import Program
 from crazysim.engine.lowering.tangents import add_tangents
@@ -138,7 +138,7 @@ def _forward(
 
 def _reverse(
     own: DerivativeKernels,
-    going_back: Reverse,
+    going_back: ReverseProgram,
     launch: Launch,
     values: Sequence[Any],
     cotangents: Leaves,

@@ -34,7 +34,7 @@ MAX_IN_VECTOR = 8
 """Most drones of a world that are lanes of one vector of the host."""
 
 
-class Lines(Protocol):
+class LineWriter(Protocol):
     """Source that is being written, line by line; ``source.Writer``."""
 
     names: dict[Value, str]
@@ -59,7 +59,7 @@ class Exchange(Protocol):
     depth: int
     """Blocks of source around the code of a lane."""
 
-    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         """Write what passes numbers to the other drones of a world, and return how they are read.
 
         Args:
@@ -70,19 +70,19 @@ class Exchange(Protocol):
         """
         ...
 
-    def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+    def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         """Define a number of a lane that changes, and return the expression for it."""
         ...
 
-    def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+    def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         """Define a number of a lane that does not change, and return the expression for it in all later code."""
         ...
 
-    def begin(self, writer: Lines, depth: int) -> None:
+    def open_loop(self, writer: LineWriter, depth: int) -> None:
         """Begin the code of a lane."""
         ...
 
-    def end(self, writer: Lines, depth: int) -> None:
+    def close_loop(self, writer: LineWriter, depth: int) -> None:
         """End the code of a lane."""
         ...
 
@@ -97,25 +97,25 @@ class OneLane:
 
     depth = 0
 
-    def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+    def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         writer.line(f"auto {name} = {value};", depth)
         return name
 
-    def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+    def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         writer.line(f"const auto {name} = {value};", depth)
         return name
 
-    def begin(self, writer: Lines, depth: int) -> None:
+    def open_loop(self, writer: LineWriter, depth: int) -> None:
         """Write nothing."""
 
-    def end(self, writer: Lines, depth: int) -> None:
+    def close_loop(self, writer: LineWriter, depth: int) -> None:
         """Write nothing."""
 
 
 class Registers(OneLane):
     """Lanes of one warp or vector, which read each other's registers."""
 
-    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         names = []
         for kind, value in values:
             names.append(writer.new())
@@ -137,7 +137,7 @@ class SharedMemory(OneLane):
         self.lanes = lanes
         self._records: dict[str, int] = {}
 
-    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         """Write a record of numbers for each thread, and return how the numbers of another thread are read."""
         order = sorted(range(len(values)), key=lambda k: -TYPE_BYTES[values[k][0]])
         text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
@@ -177,7 +177,7 @@ class Sweeps:
     def __init__(self) -> None:
         self.kept: list[str] = []
 
-    def publish(self, writer: Lines, values: Published, live: Live, depth: int) -> list[Read]:
+    def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         """Store numbers and everything that is live, begin the next part, and return how numbers are read."""
         arrays = []
         for kind, value in values:
@@ -185,26 +185,26 @@ class Sweeps:
             self.keep(writer, arrays[-1], kind, value, depth)
         for x, kind in live:
             writer.names[x] = self.keep(writer, writer.new("m"), kind, writer.names[x], depth)
-        self.end(writer, depth - 1)
-        self.begin(writer, depth - 1)
+        self.close_loop(writer, depth - 1)
+        self.open_loop(writer, depth - 1)
         writer.forget()
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
-    def variable(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+    def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         """Write a number of the lanes to memory, and return the expression that reads it."""
         self.kept.append(f"{kind}v {name}[VECTORS];")
         writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
         return f"w.{name}[v]"
 
-    def keep(self, writer: Lines, name: str, kind: str, value: str, depth: int) -> str:
+    def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
         """Write a number of the lanes to memory, and return the expression that reads it."""
         return self.variable(writer, name, kind, value, depth)
 
-    def begin(self, writer: Lines, depth: int) -> None:
+    def open_loop(self, writer: LineWriter, depth: int) -> None:
         """Begin a loop over the vectors of the world."""
         writer.line("SWEEP {", depth)
 
-    def end(self, writer: Lines, depth: int) -> None:
+    def close_loop(self, writer: LineWriter, depth: int) -> None:
         """End the loop."""
         writer.line("}", depth)
 

@@ -81,7 +81,7 @@ class Body:
             else:
                 names[slot] = f"SHARED(p{rank[slot[0]]}, {slot[1]})" if at_use else _load(program, slot)
         self._n_shared = len(writer.lines)
-        exchange.begin(writer, 1)
+        exchange.open_loop(writer, 1)
         own = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
         for i in dict.fromkeys(i for i, _ in own if i not in program.rows):
             size, drones = program.leaves[i].size, _drones(program, i)
@@ -100,22 +100,22 @@ class Body:
                 names[slot] = exchange.keep(writer, names[slot], kind, access, self._depth)
         self._write_phase("before")
         hoisted = [self._hoisted(segment) for segment in self.each]
-        exchange.end(writer, 1)
+        exchange.close_loop(writer, 1)
         return hoisted
 
     def write_loop(self, hoisted: list[list[str]]) -> None:
         """Write the steps."""
         self.writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
-        self.exchange.begin(self.writer, 2)
+        self.exchange.open_loop(self.writer, 2)
         for segment, constants in zip(self.each, hoisted, strict=True):
             write_segment(self.writer, self.program, segment, self.names, constants, 1 + self._depth)
-        self.exchange.end(self.writer, 2)
+        self.exchange.close_loop(self.writer, 2)
         self.writer.line("}", 1)
 
     def write_stores(self) -> None:
         """Write the check, the stages after the steps, and the stores."""
         program, writer, check = self.program, self.writer, self.program.check
-        self.exchange.begin(writer, 1)
+        self.exchange.open_loop(writer, 1)
         if check is not None:
             (flagged,) = writer.block(check.block, [self.names[slot] for slot in check.reads], self._depth)
             write_results(writer, "flagged", "b1", 1, [flagged], self._depth)
@@ -128,7 +128,7 @@ class Body:
                     writer.line(f"STORE_ROW({pointer}, {k}, {kind}_lanes({x}))", self._depth)
             else:
                 write_results(writer, pointer, kind, _drones(program, leaf), values, self._depth)
-        self.exchange.end(writer, 1)
+        self.exchange.close_loop(writer, 1)
 
     def kernel(
         self,
@@ -172,7 +172,7 @@ class Body:
         return [keep(writer, writer.new("h"), kind, x, self._depth) for kind, x in zip(kinds, outs, strict=True)]
 
     def _write_phase(self, phase: Phase) -> None:
-        for segment in self.program.of(phase):
+        for segment in self.program.phase_segments(phase):
             write_segment(self.writer, self.program, segment, self.names, [], self._depth)
 
 
@@ -214,13 +214,13 @@ def _loaded(program: Program) -> set[Slot]:
             drones[slot] = drones.get(slot, 0) + (1 if of_world else program.n_drones)
         known.update(slot for slot, n in drones.items() if n >= program.n_drones)
 
-    for segment in program.of("before"):
+    for segment in program.phase_segments("before"):
         run(segment)
-    for segment in program.of("each"):  # there may be no step
+    for segment in program.phase_segments("each"):  # there may be no step
         use([*program.per_drone(segment, [*segment.reads, *segment.writes]), *segment.hoisted_reads])
     if program.check is not None:
         use(program.check.reads)
-    for segment in program.of("after"):
+    for segment in program.phase_segments("after"):
         run(segment)
     use(_stored(program))
     return loaded

@@ -140,14 +140,14 @@ def prepare(program: Program, values: LeafValues) -> Constants:
     run(program, values, "before", {})
     return {
         k: values.execute(s.hoisted, [values.get(slot) for slot in s.hoisted_reads], values.shape)
-        for k, s in enumerate(program.of("each"))
+        for k, s in enumerate(program.phase_segments("each"))
         if isinstance(s, Segment) and s.hoisted.outputs
     }
 
 
 def run(program: Program, values: LeafValues, phase: Phase, constants: Constants) -> None:
     """Run the segments of a phase."""
-    for k, segment in enumerate(program.of(phase)):
+    for k, segment in enumerate(program.phase_segments(phase)):
         if isinstance(segment, UnfusedStage):
             _run_unfused(segment, values)
         elif segment.scope == "world":
@@ -216,7 +216,7 @@ def steps(
     """
     start = LeafValues(program, leaves, execute)
     constants = prepare(program, start)
-    each = program.of("each")
+    each = program.phase_segments("each")
     by_array = sorted({i for s in each if isinstance(s, UnfusedStage) for i in s.written})
     fused = [s for s in each if isinstance(s, Segment)]
     by_slot = sorted({slot for s in fused for slot in program.per_drone(s, s.writes) if slot[0] not in by_array})

@@ -26,7 +26,7 @@ from crazysim.engine.lowering.transpose import transpose_block
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Reverse:
+class ReverseProgram:
     """Transposed derivatives of the segments of a program."""
 
     program: Program
@@ -59,7 +59,7 @@ class Reverse:
         return sorted(ct_slots)
 
 
-def reverse_program(program: Program, perturbed: Collection[int]) -> Reverse:
+def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProgram:
     """Return the transposed derivatives of a program that one kernel can run.
 
     Args:
@@ -90,7 +90,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> Reverse:
         read = set(each[0].reads)
     carried = tuple(sorted(read & changing))
     used = {slot for s in (*(back[s] for s in each), *each[:-1]) for slot in _used(extended, s)}
-    return Reverse(extended, n, perturbed, back, back_hoisted, carried, frozenset(used.intersection(carried)))
+    return ReverseProgram(extended, n, perturbed, back, back_hoisted, carried, frozenset(used.intersection(carried)))
 
 
 def _used(program: Program, s: Segment) -> list[Slot]:
@@ -184,12 +184,12 @@ def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int]
     return Segment("drone", s.stages, "each", block, (*reads, *ct_slots, *targets), targets)
 
 
-def needed_leaves(reverse: Reverse) -> tuple[int, ...]:
+def needed_leaves(reverse: ReverseProgram) -> tuple[int, ...]:
     """Return the leaves that the kernel reads; behind them come the cotangents of ``seeds``."""
     return kernel.needed_leaves(reverse.program)
 
 
-def write(reverse: Reverse, target: str) -> Kernel:
+def write(reverse: ReverseProgram, target: str) -> Kernel:
     """Return the source of the kernel that goes back.
 
     Its inputs are the leaves that the program needs, then the cotangents of the leaves it writes; its outputs are a
@@ -236,7 +236,7 @@ def write(reverse: Reverse, target: str) -> Kernel:
             if slot in slots:
                 writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
 
-    last, each, first = program.of("after"), program.of("each"), program.of("before")
+    last, each, first = (program.phase_segments(phase) for phase in ("after", "each", "before"))
     writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
     writer.line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
     writer.line("const bool back = turn >= n_intervals - 1;", 2)
@@ -290,7 +290,7 @@ def write(reverse: Reverse, target: str) -> Kernel:
 
 def _write_back(
     body: Body,
-    reverse: Reverse,
+    reverse: ReverseProgram,
     segments: Sequence[Segment],
     constants: Sequence[Sequence[str]],
     names: dict[Slot, str],

@@ -31,7 +31,7 @@ class Value:
     """Number of entries of a table, which only ``lookup`` reads; 0 for a single number."""
 
 
-class Numbers:
+class TableEntries:
     """Entries of a table that are known before the program runs. Two with the same type and bits are equal."""
 
     def __init__(self, array: np.ndarray):
@@ -39,7 +39,7 @@ class Numbers:
         self._key = (array.dtype, array.tobytes())
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Numbers) and self._key == other._key
+        return isinstance(other, TableEntries) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)

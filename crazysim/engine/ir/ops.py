@@ -25,7 +25,7 @@ DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Row:
+class OperationForm:
     """One operation."""
 
     name: str
@@ -102,17 +102,18 @@ _LARGEST_FLOAT64 = float(np.finfo(np.float64).max)
 """CasADi has no operation that tests for finite numbers."""
 
 
-def _rows() -> list[Row]:
+def _rows() -> list[OperationForm]:
     """Return the rows, operations of a kind together."""
     any_number, integer = "fiu", "iu"
 
-    def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **more: Any) -> Row:
-        return Row(name=name, operands="T", numpy=numpy, cost=cost, casadi=casadi, **more)
+    def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **more: Any) -> OperationForm:
+        return OperationForm(name=name, operands="T", numpy=numpy, cost=cost, casadi=casadi, **more)
 
-    def binary(name: str, numpy: Any, kinds: str, cost: float = 1, **more: Any) -> Row:
-        return Row(name=name, operands="TT", numpy=numpy, kinds=kinds, cost=cost, **more)
+    def binary(name: str, numpy: Any, kinds: str, cost: float = 1, **more: Any) -> OperationForm:
+        return OperationForm(name=name, operands="TT", numpy=numpy, kinds=kinds, cost=cost, **more)
 
-    def comparison(name: str, numpy: Any, casadi: Any, kinds: str = any_number) -> Row:  # counted with the selection
+    def comparison(name: str, numpy: Any, casadi: Any, kinds: str = any_number) -> OperationForm:
+        # Its cost is counted with the selection.
         return binary(name, numpy, kinds, 0, results="b", exact=True, casadi=casadi, casadi_kinds="fiub")
 
     arithmetic = [
@@ -127,7 +128,7 @@ def _rows() -> list[Row]:
         binary("rem", forms.remainder, any_number, 8, exact=True, casadi="fmod", casadi_kinds="fiu"),
         binary("max", np.maximum, any_number, exact=True, casadi="fmax", casadi_kinds="fiu"),
         binary("min", np.minimum, any_number, exact=True, casadi="fmin", casadi_kinds="fiu"),
-        Row(name="clamp", operands="TTT", kinds=any_number, exact=True, casadi_kinds="fi",
+        OperationForm(name="clamp", operands="TTT", kinds=any_number, exact=True, casadi_kinds="fi",
             numpy=lambda low, x, high: np.minimum(np.maximum(x, low), high),
             casadi=lambda ca, low, x, high: ca.fmin(ca.fmax(x, low), high)),
         unary("neg", np.negative, 0, lambda _, x: -x, kinds=any_number, exact=True),
@@ -183,7 +184,7 @@ def _rows() -> list[Row]:
         comparison("le", np.less_equal, lambda _, a, b: a <= b),
         comparison("gt", np.greater, lambda _, a, b: a > b),
         comparison("ge", np.greater_equal, lambda _, a, b: a >= b),
-        Row(name="select_n", operands="bTT", kinds="fiub", exact=True, casadi_kinds="fiub",
+        OperationForm(name="select_n", operands="bTT", kinds="fiub", exact=True, casadi_kinds="fiub",
             numpy=lambda which, no, yes: np.where(which, yes, no),
             casadi=lambda ca, which, no, yes: ca.if_else(which, yes, no)),
     ]  # fmt: skip
@@ -196,20 +197,20 @@ def _rows() -> list[Row]:
         binary("shift_left", forms.shift(np.left_shift, np.zeros_like), integer, exact=True),
         binary("shift_right_logical", forms.shift(forms.shift_logical, np.zeros_like), integer, exact=True),
         binary("shift_right_arithmetic", forms.shift(forms.shift_arithmetic, forms.sign_bits), integer, exact=True),
-        Row(name="convert_element_type", operands="*", results="*", numpy=forms.convert, exact=True,
+        OperationForm(name="convert_element_type", operands="*", results="*", numpy=forms.convert, exact=True,
             source="to_{type}({0})"),
-        Row(name="bitcast_convert_type", operands="*", results="*", numpy=forms.bitcast, exact=True,
+        OperationForm(name="bitcast_convert_type", operands="*", results="*", numpy=forms.bitcast, exact=True,
             source="bits_{type}({0})"),
-        Row(name="again", operands="T", cost=0, numpy=lambda x, **_: x, xla=lambda x, **_: x,
+        OperationForm(name="again", operands="T", cost=0, numpy=lambda x, **_: x, xla=lambda x, **_: x,
             source="AGAIN({0})"),
     ]  # fmt: skip
     structured = [
-        Row(name="barrier", operands="", results="", cost=0, structured=True),
-        Row(name="table", operands="", results="*", cost=0, structured=True),
-        Row(name="lookup", operands="**", results="*", structured=True),
-        Row(name="any_lane", operands="b", results="b", kinds="b", structured=True),
-        Row(name="threefry2x32", operands="uuuu", results="uu", cost=60, structured=True),
-        *(Row(name=name, operands="...", results="...", cost=0, structured=True)
+        OperationForm(name="barrier", operands="", results="", cost=0, structured=True),
+        OperationForm(name="table", operands="", results="*", cost=0, structured=True),
+        OperationForm(name="lookup", operands="**", results="*", structured=True),
+        OperationForm(name="any_lane", operands="b", results="b", kinds="b", structured=True),
+        OperationForm(name="threefry2x32", operands="uuuu", results="uu", cost=60, structured=True),
+        *(OperationForm(name=name, operands="...", results="...", cost=0, structured=True)
           for name in ("when", "loop", "while", "custom_jvp", "over_others")),
     ]  # fmt: skip
     return [*arithmetic, *rounding, *functions, *comparisons, *bits, *structured]
@@ -221,7 +222,7 @@ def _lax() -> Any:
     return lax
 
 
-TABLE: Mapping[str, Row] = {row.name: row for row in _rows()}
+TABLE: Mapping[str, OperationForm] = {row.name: row for row in _rows()}
 """All operations by name.
 
 ``barrier`` separates stages: what is used behind it is computed once. ``when(mask, *old)`` has the outputs of its block

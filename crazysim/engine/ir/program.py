@@ -205,7 +205,7 @@ class Program:
         """Number of drones that read each other's numbers: all of a world if a segment needs that, otherwise 1."""
         return self.n_drones if any(s.couples for s in self.fused_segments) else 1
 
-    def of(self, phase: Phase) -> list[Any]:
+    def phase_segments(self, phase: Phase) -> list[Any]:
         """Return the segments that run in a phase."""
         return [segment for segment in self.segments if segment.phase == phase]
 
@@ -218,7 +218,7 @@ class Program:
     def changing(self) -> set[Slot]:
         """Return the numbers that a step may change."""
         changing: set[Slot] = set()
-        for segment in self.of("each"):
+        for segment in self.phase_segments("each"):
             if isinstance(segment, Segment):
                 changing.update(self.per_drone(segment, segment.writes))
             else:

@@ -45,17 +45,17 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
         reads = program.per_drone(s, s.reads)
         found.update(written_slots[k] for k in of(s.block, reads, constants.get(s, ())))
 
-    for s in program.of("before"):
+    for s in program.phase_segments("before"):
         run(s)
-    for s in program.of("each"):
+    for s in program.phase_segments("each"):
         constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
     while True:  # a number that one step changes may change more in the next
         before = len(found)
-        for s in program.of("each"):
+        for s in program.phase_segments("each"):
             run(s)
         if len(found) == before:
             break
-    for s in program.of("after"):
+    for s in program.phase_segments("after"):
         run(s)
     return found, constants
 

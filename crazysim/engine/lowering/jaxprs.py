@@ -144,7 +144,7 @@ class Lowering:
         return self.builder.finish(scalars(*outputs))
 
 
-class Rows:
+class TableRows:
     """A table in memory with any number of rows, of which a function reads whole ones (``table_row``)."""
 
     def __init__(self, builder: Builder, aval: Any):

@@ -69,7 +69,7 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
     return dataclasses.replace(_moved(program, move), leaves=tuple(leaves))
 
 
-class Rows(NamedTuple):
+class PackedRows(NamedTuple):
     """A leaf of rows, and the leaves whose numbers are its rows; arrays are as the program takes them."""
 
     program: Program
@@ -100,9 +100,9 @@ class Rows(NamedTuple):
         return x[:, :1] if like.scope == "world" else x
 
 
-def rows_of(program: Program) -> list[Rows]:
+def rows_of(program: Program) -> list[PackedRows]:
     """Return the leaves of rows of a program."""
-    return [Rows(program, i) for i, leaf in enumerate(program.leaves) if leaf.rows_of]
+    return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.rows_of]
 
 
 def _moved(program: Program, move: Callable[[Slot], Slot]) -> Program:

@@ -56,7 +56,7 @@ def _cost_of_split(step: Step, data: SimData, split: list[str]) -> str:
         jax.block_until_ready(step(data, jnp.int32(n)))
         return (time.perf_counter() - begin) / n
 
-    with_them, without = seconds(step), seconds(step.without(split))
+    with_them, without = seconds(step), seconds(step.without_stages(split))
     return (
         f"cost of the split, measured: a step takes {1e6 * with_them:.0f} us, and {1e6 * without:.0f} us without "
         f"{', '.join(split)}"

@@ -15,7 +15,7 @@ from crazysim.engine.lowering.jaxprs import (
     MAX_UNROLL,
     Elements,
     Lowering,
-    Rows,
+    TableRows,
     UnsupportedError,
     as_elements,
     constants,
@@ -29,7 +29,7 @@ from crazysim.jaxcompat import ClosedJaxpr, JaxprEqn
 @rule("dynamic_slice")
 def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     x, sizes = args[0], eqn.params["slice_sizes"]
-    if isinstance(x, Rows):
+    if isinstance(x, TableRows):
         return [x.row(ctx, args[1][()], sizes)]
     for axis, (start, size) in enumerate(zip(args[1:], sizes, strict=True)):
         x = _take(ctx, x, start[()], size, axis)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crazysim.engine.ir.blocks import Element, Numbers, Value, constant, is_constant
+from crazysim.engine.ir.blocks import Element, TableEntries, Value, constant, is_constant
 from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Entry, Lowering, as_elements
 
 MAX_SELECTED = 4
@@ -88,7 +88,7 @@ def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Table | No
     if not np.all(np.isfinite(numbers)):
         return None
     offsets = np.arange(x.size).reshape(x.shape)
-    (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", Numbers(numbers)),))
+    (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", TableEntries(numbers)),))
     table = Table(ctx, Entry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
     first = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
     bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
