@@ -52,7 +52,7 @@ from crazysim.errors import UnsupportedError
 try:
     from jaxlib.xla_client import batched_device_put
 except ImportError:
-    batched_device_put = None
+    batched_device_put = None  # type: ignore[assignment]
 
 __all__ = [
     "DIGAMMA_AT_ZERO",

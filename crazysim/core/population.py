@@ -1,4 +1,4 @@
-"""Populations: things of one kind beside the drones of a world, such as cars, loads or free bodies.
+"""Populations: all things of one kind in a world besides its drones, such as cars, loads or free bodies.
 
 A population is a plugin whose record has one row for each member. Its methods are written for one member; scopes,
 masks, seeds, sharding, engines and gradients treat members as they treat drones.
@@ -229,7 +229,7 @@ def scheme_of(integrator: Integrator, positions: Sequence[str]) -> Callable[...,
 
 
 def populations(data: SimData) -> dict[str, Members]:
-    """Return the records of the populations beside the drones, by name."""
+    """Return the records of all populations besides the drones, by name."""
     return {name: x for name, x in data.plugins.items() if isinstance(x, Members) and x.population == name}
 
 

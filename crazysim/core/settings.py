@@ -346,7 +346,7 @@ def control_freqs(
 
 
 def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[str, int]:
-    """Return the rates of whatever runs at a default rate: the largest divisors of ``freq`` up to the defaults, Hz.
+    """Return default rates in a simulation: the largest divisors of ``freq`` up to the defaults, Hz.
 
     Args:
         freq: Rate of physics steps, Hz.

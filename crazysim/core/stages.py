@@ -64,7 +64,7 @@ def build_step_pipeline(
 
 @_built_in("drone", when=_ticks("attitude"))
 def commit_attitude(data: SimData) -> SimData:
-    """Take over the staged attitude command; fitted dynamics contain the controller that follows it."""
+    """Apply the staged attitude command; fitted dynamics contain the controller that follows it."""
     ctrl = data.controls.attitude
     ctrl = ctrl.replace(cmd=ctrl.staged_cmd)
     return data.replace(controls=data.controls.replace(attitude=ctrl))
@@ -72,7 +72,7 @@ def commit_attitude(data: SimData) -> SimData:
 
 @_built_in("drone", when=_ticks("force_torque"))
 def force_torque_controller(data: SimData) -> SimData:
-    """Take over the staged wrench, and command the rotor speeds that give it."""
+    """Apply the staged wrench, and command the rotor speeds that produce it."""
     controls = controls_of(data)
     ctrl = controls.force_torque
     rotor_vel = force_torque2rotor_vel(ctrl.staged_cmd, params=ctrl.params)

@@ -34,13 +34,13 @@ MAX_SHARED_BYTES = 1 << 16
 class HostLeaves:
     """Leaves of a simulation at one moment: arrays of JAX, commands of the host, or results of a kernel.
 
-    An index gives a leaf as an array of JAX, which is made once.
+    An index gives a leaf as an JAX array, which is made once.
     """
 
     __slots__ = ("_made", "_sharding", "_views", "addresses", "items")
 
     def __init__(self, items: list[Any], addresses: list[int], views: Any, sharding: Any):
-        """Hold leaves.
+        """Store leaves.
 
         Args:
             items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``CallResults``.
@@ -154,7 +154,7 @@ class HostCall:
     """Steps of a plan, by one kernel of the host for each of its programs."""
 
     def __init__(self, kernels: Sequence[Kernels], owned: Sequence[Any], leaves: Sequence[Any], nonfinite: int):
-        """Take the kernels.
+        """Plan the memory and the calls of some kernels.
 
         Args:
             kernels: Kernels of the programs, all of which can be called so (``is_possible``).

@@ -35,7 +35,7 @@ class FlatData:
     __slots__ = ("_record", "leaves", "plan")
 
     def __init__(self, leaves: list[Any] | HostLeaves, plan: Plan):
-        """Hold the leaves of the data, with None for a leaf in rows, followed by the leaves that passes add."""
+        """Store the leaves of the data, with None for a leaf in rows, followed by the leaves that passes add."""
         self.leaves: Any = leaves
         self.plan = plan
         self._record: SimData | None = None
@@ -118,7 +118,7 @@ class Step:
         device: jax.Device | None = None,
         strict: bool = False,
     ):
-        """Take the stages as they are now.
+        """Create the step of the stages as they are now.
 
         Args:
             pipeline: The stages.

@@ -25,7 +25,7 @@ ANNOUNCED_AFTER = 5.0
 
 
 class Stepper:
-    """Data that advances: held flattened from step to step, and as a record where it is read.
+    """Data that advances: flattened from step to step, and as a record where it is read.
 
     ``step`` is the pure function that advances it.
     """
@@ -64,7 +64,7 @@ class Stepper:
 
     @property
     def data_or_shapes(self) -> SimData:
-        """The data as a record, or, where that would have to be put together, its shapes, types and devices."""
+        """The data as a record, or its shapes, types and devices if the data is flattened."""
         flat = self._data
         if not isinstance(flat, FlatData):
             return self.data
@@ -102,7 +102,7 @@ class Stepper:
         return flag is not self._unsynced
 
     def assign(self, data: SimData) -> None:
-        """Take data from outside: put it on the device, and clear ``core.mjx_synced``."""
+        """Replace the data by data from outside: put it on the device, and clear ``core.mjx_synced``."""
         if self._data is None or data.core.steps is not self.data.core.steps:
             self._most_steps = None
         if data.core.mjx_synced is not self._unsynced:
@@ -111,7 +111,7 @@ class Stepper:
         self.accept(self.put_on_device(data))
 
     def accept(self, data: SimData) -> None:
-        """Take data that is on the device, with ``core.mjx_synced`` false, as compiled calls return it."""
+        """Replace the data by data on the device with ``core.mjx_synced`` false, as compiled calls return it."""
         self.data, self._unsynced = data, data.core.mjx_synced
 
     def put_on_device(self, data: SimData) -> SimData:

@@ -79,7 +79,7 @@ class Exchange(Protocol):
         ...
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        """Begin the code of a lane."""
+        """Write the beginning of the code of each lane."""
         ...
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:
@@ -201,7 +201,7 @@ class Sweeps:
         return self.variable(writer, name, kind, value, depth)
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        """Begin a loop over the vectors of the world."""
+        """Write the beginning of a loop over the vectors of the world."""
         writer.line("SWEEP {", depth)
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:

@@ -34,7 +34,7 @@ class LeafValues:
     """Leaves of all drones, each as an array or as vectors over lanes, in the form that was last used."""
 
     def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run, library: Any = jnp):
-        """Hold leaves as arrays.
+        """Store leaves as arrays.
 
         Args:
             program: The program.

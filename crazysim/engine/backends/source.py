@@ -46,7 +46,7 @@ class Writer:
     """Lines of source of blocks."""
 
     def __init__(self, exchange: Exchange | None = None) -> None:
-        """Begin without lines.
+        """Create a writer without lines.
 
         Args:
             exchange: Exchange of numbers between lanes; None for registers.

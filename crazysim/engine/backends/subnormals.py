@@ -21,7 +21,7 @@ FLUSH_BITS = 0x8040
 
 @contextlib.contextmanager
 def flush_subnormals() -> Iterator[None]:
-    """Take subnormal numbers for zero in this thread; only on x86-64 Linux."""
+    """Treat subnormal numbers as zero in this thread; only on x86-64 Linux."""
     library = _library()
     if library is None:
         yield

@@ -110,7 +110,7 @@ class Builder:
     """Builds a block, operation by operation."""
 
     def __init__(self, outer: Builder | None = None, stage: str = ""):
-        """Begin an empty block, inside another one if that is given.
+        """Create the builder of an empty block, inside another block if one is given.
 
         Args:
             outer: Builder of the block around it.

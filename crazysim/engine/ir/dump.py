@@ -1,4 +1,4 @@
-"""Text written for people who look into the engine: ``CRAZYSIM_DUMP=folder``."""
+"""Jaxprs, programs and sources written to files, to inspect the engine: ``CRAZYSIM_DUMP=folder``."""
 
 from __future__ import annotations
 

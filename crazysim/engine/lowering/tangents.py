@@ -1,4 +1,4 @@
-"""Forward mode: the tangents of a program's numbers, computed beside the numbers.
+"""Forward mode: the tangents of a program's numbers, computed along with the numbers.
 
 The result is a program like any other. Its tangents are further leaves, and the derivative of each operation follows
 the operation, in the same loops and conditions.
@@ -94,7 +94,7 @@ def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: 
 
 
 def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
-    """Return the block that computes tangents beside a block's outputs.
+    """Return the block that computes tangents of a block's outputs as well.
 
     Args:
         block: The block.
@@ -229,7 +229,7 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
 
 
 def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Publish tangents beside the numbers that a drone publishes, and add up the tangents of sums."""
+    """Publish tangents with the numbers that a drone publishes, and add up the tangents of sums."""
     (body,) = op.blocks
     *others, is_self = body.inputs
     inner = Builder(builder)

@@ -150,7 +150,7 @@ Found = Sequence[Element | None]
 
 
 def _when(builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents) -> None:
-    """Take cotangents through the block where the mask is true, and to the old numbers elsewhere."""
+    """Pass cotangents through the block where the mask is true, and to the old numbers elsewhere."""
     mask, *old = op.args
     mask = values.get(mask, mask)
     (block,) = op.blocks

@@ -1,1 +1,1 @@
-"""Tools for people who look into the engine: comparison, explanation, and CasADi expressions."""
+"""Tools to inspect the engine: comparison, explanation, and CasADi expressions."""
