@@ -4,11 +4,12 @@ Each name has a test in ``tests/test_jaxcompat.py``, which continuous integratio
 newest JAX that are supported. What each use would be replaced by, if a release took it away:
 
 - **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
-  ``jax.make_jaxpr``, which takes as long as the first time. A fallback here.
+  ``jax.make_jaxpr``. A fallback here.
 - **batched_device_put** (``put_host_array``): ``jax.device_put``, ten times slower for a command. A fallback here, also
   used where jaxlib lacks the function.
-- **Donation, and views of arrays of the CPU while one is donated** (``jit_donating``, ``view_on_host``): functions are
-  compiled without donation, and the host copies the arrays that kernels read. A fallback here.
+- **Donation on the host**: JAX copies an array that is donated while NumPy has a view of it, on which steps without XLA
+  rely (``engine/host_call.py``). Without them the compiled step runs, and ``jit_donating`` donates nothing. A fallback
+  here.
 - **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
   of XLA's foreign function interface, a ``ctypes`` callback registered by ``jax.ffi.register_ffi_target`` for
   ``"CUDA"``. It would read the addresses of operands and results and the attributes (kernel, grid, block) from
@@ -90,7 +91,6 @@ __all__ = [
     "threefry2x32_p",
     "threefry_prng_impl",
     "versions",
-    "view_on_host",
     "vmap_rule_of",
 ]
 
@@ -373,14 +373,6 @@ def put_host_array(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
 @functools.cache
 def _aval(shape: tuple[int, ...], dtype: Any) -> Any:
     return jax.core.ShapedArray(shape, dtype)
-
-
-def view_on_host(x: jax.Array) -> np.ndarray:
-    """Return an array of the CPU as a NumPy array of the same memory, contiguous.
-
-    JAX does not write into this memory while the view exists, not even if the array is donated.
-    """
-    return np.array(x) if FALLBACKS else np.ascontiguousarray(x)
 
 
 def jit_donating(fn: Callable[..., Any]) -> Any:
