@@ -102,7 +102,7 @@ def _compiler() -> str:
     if program is None:
         return f"none; steps run on a slower engine: {native.MISSING_COMPILER}"
     done = subprocess.run([*shlex.split(program), "--version"], capture_output=True, text=True, timeout=20, check=False)
-    return f"{program}, {_first_line(done.stdout or done.stderr)}; {shlex.join(native.command()[1:])}"
+    return f"{program}, {_first_line(done.stdout or done.stderr)}; {shlex.join(native.compiler_command()[1:])}"
 
 
 def _nvrtc() -> str:

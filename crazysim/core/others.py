@@ -22,7 +22,7 @@ MEMBER_AXIS = "members"
 Reduction = Literal["sum", "min", "max"]
 
 
-def smallest(x: Array, axis: int) -> Array:
+def safe_min(x: Array, axis: int) -> Array:
     """Return the smallest number along an axis, or NaN if there is one; ``jnp.min`` with a safe derivative.
 
     The derivative of ``jnp.min`` goes to the numbers that equal the result. Where XLA computes them once more, with
@@ -31,12 +31,12 @@ def smallest(x: Array, axis: int) -> Array:
     return jnp.squeeze(jnp.take_along_axis(x, jnp.argmin(x, axis=axis, keepdims=True), axis), axis)
 
 
-def largest(x: Array, axis: int) -> Array:
-    """Return the largest number along an axis, as ``smallest`` does."""
+def safe_max(x: Array, axis: int) -> Array:
+    """Return the largest number along an axis, as ``safe_min`` does."""
     return jnp.squeeze(jnp.take_along_axis(x, jnp.argmax(x, axis=axis, keepdims=True), axis), axis)
 
 
-REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": smallest, "max": largest}
+REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": safe_min, "max": safe_max}
 
 MAX_PAIRS = 2**20
 """Pairs of a world that are computed at once. A larger swarm is computed in several turns, which bounds the memory."""

@@ -234,7 +234,7 @@ def test_wrong_settings_of_the_compiler_are_errors_that_name_them(place, monkeyp
 def test_a_kernel_that_would_take_longer_than_the_limit_is_refused_by_its_size(
     source, place, compilations, monkeypatch
 ):
-    native.toolchain(tuple(native.command()))
+    native.toolchain(tuple(native.compiler_command()))
     monkeypatch.setenv("CRAZYSIM_COMPILE_TIMEOUT", "0.001")
     monkeypatch.setattr(native, "_run", pytest.fail)
     with pytest.raises(KernelError, match=r"a kernel of [\d,]+ lines takes .* longer than 0.001 s; use loops"):
@@ -264,7 +264,7 @@ def test_a_compiler_is_a_command_with_options(source, place, monkeypatch):
     native.compiler.cache_clear()
     monkeypatch.setenv("CXX", "g++ -DOTHER")
     try:
-        assert native.command()[1] == "-DOTHER"
+        assert native.compiler_command()[1] == "-DOTHER"
         assert native.target(source)
     finally:
         native.compiler.cache_clear()
@@ -279,7 +279,7 @@ def test_where_there_is_no_other_compiler_that_of_ziglang_compiles(source, place
     monkeypatch.delenv("CXX", raising=False)
     native.compiler.cache_clear()
     try:
-        assert Path(native.command()[0]).name.startswith("zig")
+        assert Path(native.compiler_command()[0]).name.startswith("zig")
         name = native.target(source)
         monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
         assert again(source) == name
@@ -307,7 +307,7 @@ slow += "constexpr long x = f();"
 flags = ["-fconstexpr-ops-limit=1000000000000", "-fconstexpr-loop-limit=2000000000"]
 quick = 'extern "C" __attribute__((visibility("default"))) int crazysim_call = 1;'
 source = quick if sys.argv[1] == "quick" else slow
-compile = lambda key: native._library([*native.command(), *flags], key, source)
+compile = lambda key: native._library([*native.compiler_command(), *flags], key, source)
 if sys.argv[1] == "threads":
     with native.compiling_threads(2) as pool:
         list(pool.map(compile, "abcd"))

@@ -117,7 +117,7 @@ def _forward(
     results: Sequence[jax.ShapeDtypeStruct],
 ) -> list[Array]:
     n = len(own.program.leaves)
-    n_worlds, n_drones = lanes.batch(own.program, list(values))
+    n_worlds, n_drones = lanes.batch_counts(own.program, list(values))
 
     def of_worlds(i: int, x: Array) -> Array:
         """Return the tangent of a leaf, of one that all drones share for each world."""
@@ -146,7 +146,7 @@ def _reverse(
     size: int,
 ) -> Leaves:
     program = own.program
-    n_worlds, n_drones = lanes.batch(program, list(values))
+    n_worlds, n_drones = lanes.batch_counts(program, list(values))
 
     def seed(i: int) -> Array:
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)

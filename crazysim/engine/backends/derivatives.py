@@ -134,7 +134,7 @@ class Case(NamedTuple):
 def _written(*args: Any, case: Case, **params: Any) -> list[jax.ShapeDtypeStruct]:
     del params
     program = case.kernels.program
-    n_worlds, _ = lanes.batch(program, case.values(args))
+    n_worlds, _ = lanes.batch_counts(program, case.values(args))
     return [lanes.shape_of(program, i, n_worlds) for i in case.kernels.floats]
 
 

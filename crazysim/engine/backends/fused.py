@@ -257,7 +257,7 @@ def _split(program: Program, location: Location) -> CountedRun:
 def _call(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
     """Return what a kernel writes: leaves, and the worlds that are flagged."""
     program = kernels.program
-    n_worlds, n_drones = lanes.batch(program, leaves)
+    n_worlds, n_drones = lanes.batch_counts(program, leaves)
     inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]
     out = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
     written = [

@@ -200,7 +200,10 @@ def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], 
     n = op.param("n_members")
     own = np.arange(shape[0]) % n
     combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
-    found = [np.full(shape, ops.neutral(name, x.dtype)) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+    found = [
+        np.full(shape, ops.neutral_number(name, x.dtype))
+        for name, x in zip(op.param("reduce"), op.results, strict=True)
+    ]
     for j in range(n):
         other = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
         new = run([*other, own == j])
@@ -253,7 +256,7 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
     """
     if not program.fused:
         return lanes.steps(program, leaves, n_steps, call)
-    n_worlds, _ = lanes.batch(program, leaves)
+    n_worlds, _ = lanes.batch_counts(program, leaves)
     given = [i for i, x in enumerate(leaves) if x is not None]
     written = [lanes.shape_of(program, i, n_worlds) for i in program.written]
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)

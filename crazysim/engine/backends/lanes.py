@@ -43,7 +43,7 @@ class LeafValues:
             library: Library of the arrays: ``jax.numpy``, or ``numpy``, where random keys are 32-bit integers.
         """
         self.program, self.execute, self.library = program, execute, library
-        self.n_worlds, self.n_drones = batch(program, leaves)
+        self.n_worlds, self.n_drones = batch_counts(program, leaves)
         self.arrays: dict[int, Any] = dict(enumerate(leaves))
         self.vectors: dict[Slot, Any] = {}
 
@@ -104,12 +104,12 @@ class LeafValues:
             x = jax.random.key_data(x)
         if example.scope == "world":
             x = self.library.broadcast_to(x, (self.n_worlds, self.n_drones, *x.shape[2:]))
-        batch = self.shape if example.scope in ("drone", "world") else ()
-        x = x.reshape(*batch, size)
+        batch_axes = self.shape if example.scope in ("drone", "world") else ()
+        x = x.reshape(*batch_axes, size)
         self.vectors.update(((leaf, k), x[..., k]) for k in range(size))
 
 
-def batch(program: Program, leaves: list[Any]) -> tuple[int, int]:
+def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
     """Return the number of worlds and drones; under a mesh, on this device."""
     drone = next(
         i

@@ -131,7 +131,7 @@ def _zig() -> str | None:
     )
 
 
-def command(options: bool = True) -> list[str]:
+def compiler_command(options: bool = True) -> list[str]:
     """Return the compiler's command up to the names of files.
 
     Args:
@@ -158,7 +158,7 @@ def _words(variable: str) -> list[str]:
         raise ConfigError(f"expected words in {variable}, got {text!r}: {error}. Correct the quotation.") from None
 
 
-def limit() -> float:
+def time_limit() -> float:
     """Return the time that the compiler may take, s."""
     given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", COMPILE_TIMEOUT)
     try:
@@ -178,7 +178,7 @@ def target(kernel: Kernel) -> str:
     Raises:
         KernelError: If the compiler refuses it or takes too long, or the library cannot be loaded.
     """
-    words = command()
+    words = compiler_command()
     if dump.is_enabled():
         dump.write("kernel.cpp", f"// {shlex.join(words)} kernel.cpp\n{kernel.text}")
     key = kernel_cache.digest(*words, toolchain(tuple(words)), kernel.text)
@@ -207,7 +207,7 @@ def toolchain(words: tuple[str, ...]) -> str:
     # Asked for its steps, a compiler prints its version and the options that -march=native is replaced by.
     with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as work:
         # Clang prints the working directory, too.
-        steps = _run([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), limit(), cwd=os.sep)
+        steps = _run([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), time_limit(), cwd=os.sep)
     libc = " ".join(platform.libc_ver())
     return "\n".join([steps.stdout, steps.stderr, cpu_features(), libc, jaxcompat.versions(), __version__])
 
@@ -244,7 +244,7 @@ def _loaded(path: Path) -> ctypes.CDLL | None:
 
 def _compile(words: Sequence[str], source: str) -> bytes:
     """Compile a kernel, and return the library's contents."""
-    seconds, n_lines = limit(), source.count("\n")
+    seconds, n_lines = time_limit(), source.count("\n")
     if n_lines + (SELECTING_LINE_WEIGHT - 1) * len(SELECTING_LINE.findall(source)) > LINES_IN_ONE_SECOND * math.sqrt(
         seconds
     ):
@@ -274,8 +274,8 @@ def _check_settings(work: Path) -> None:
     (work / "empty.cpp").write_text("")
 
     def error(options: bool) -> str:
-        words = [*command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
-        done = _run(words, work, limit())
+        words = [*compiler_command(options), str(work / "empty.cpp"), "-o", str(work / "empty.so")]
+        done = _run(words, work, time_limit())
         return (done.stderr.strip()[:500] or f"exit status {done.returncode}") if done.returncode else ""
 
     message = error(options=True)

@@ -184,12 +184,12 @@ class Writer:
         (body,) = op.blocks
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
-        first = [ops.neutral(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
+        first = [ops.neutral_number(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
         name = self._carry(op, [literal(x) for x in first], [False] * len(first), depth)
         best: dict[int, str] = {}
         for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
             if combine in ops.INDEX_REDUCTIONS:
-                best[k], start = self.new(), literal(ops.neutral(combine[3:], x.dtype))
+                best[k], start = self.new(), literal(ops.neutral_number(combine[3:], x.dtype))
                 self.line(f"auto {best[k]} = {type_name(x.dtype)}_lanes({start});", depth)
         turn = self.new("j")
         self.line(f"UNROLL for (int {turn} = 0; {turn} < GROUP; ++{turn}) {{", depth)

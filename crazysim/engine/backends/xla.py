@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim import jaxcompat
-from crazysim.core.others import largest, smallest
+from crazysim.core.others import safe_max, safe_min
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 
@@ -185,8 +185,8 @@ COMBINE: dict[str, Callable[..., Array]] = {
 
 REDUCE: dict[str, Callable[..., Array]] = {
     "add": jnp.sum,
-    "min": smallest,
-    "max": largest,
+    "min": safe_min,
+    "max": safe_max,
     "or": jnp.any,
     "and": jnp.all,
 }

@@ -2,7 +2,7 @@
 
 A program has no operation that is not here. One row says which numbers an operation takes, how NumPy computes it (for
 constants and for the interpreter), what it is in XLA, in C++ and CUDA, and in CasADi, and what it costs. A target
-refuses a program with an operation that has no entry for it when the step is planned (``unsupported``).
+refuses a program with an operation that has no entry for it when the step is planned (``unsupported_error``).
 
 Integers and conversions follow XLA, which defines what C leaves open: a division by zero gives -1 (all bits set), its
 remainder the dividend; a shift by 32 bits or more gives 0, or the sign; a float becomes the nearest integer there is,
@@ -72,7 +72,7 @@ EXPENSIVE_COST = 2
 """Cost from which a number is worth a register, to be computed once instead of at every step."""
 
 
-def unsupported(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
+def unsupported_error(name: str, dtypes: Sequence[np.dtype], result: Any = bool) -> UnsupportedError | None:
     """Return the error of an operation that is not defined for operands and a result of these types, or None."""
     other = next((x.name for x in (*dtypes, np.dtype(result)) if x not in DTYPES), None)
     if other is not None:
@@ -250,7 +250,7 @@ INDEX_REDUCTIONS: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
 derivatives in kernels have them."""
 
 
-def neutral(name: str, dtype: np.dtype) -> np.generic:
+def neutral_number(name: str, dtype: np.dtype) -> np.generic:
     """Return the number that an operation of ``REDUCTIONS`` begins with; ``or`` and ``and`` stand for max and min."""
     if name in ("add", "or", "and", *INDEX_REDUCTIONS):
         return dtype.type(name == "and")

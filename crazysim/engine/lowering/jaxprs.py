@@ -120,7 +120,7 @@ class Lowering:
             op, negated = ops.BOOLEAN_FORM[op]
             args = [self.elementwise("not", [x], bool) if k == negated else x for k, x in enumerate(args)]
             return self.elementwise(op, args, bool)
-        error = ops.unsupported(op, dtypes, dtype)
+        error = ops.unsupported_error(op, dtypes, dtype)
         if error is not None:
             raise error
         return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)

@@ -128,7 +128,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
         tolerance: As in ``first_difference``.
     """
     seen, operations = expose_values(program)
-    n_worlds = lanes.batch(program, leaves)[0]
+    n_worlds = lanes.batch_counts(program, leaves)[0]
     more = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in seen.leaves[len(leaves) :]]
     location = Location("cpu" if jax.default_backend() == "cpu" else "gpu")
     written = [builder(seen, location)([*leaves, *more], 1)[0] for builder in (interpret.build, build)]
