@@ -92,7 +92,7 @@ class Exchange(Protocol):
         ...
 
 
-class OneLane:
+class OneLane(Exchange):
     """Code that is written once for a lane, whose variables hold in all of it."""
 
     depth = 0
@@ -166,7 +166,7 @@ class SharedMemory(OneLane):
         return lines
 
 
-class Sweeps:
+class Sweeps(Exchange):
     """Several vectors of the host for a world: each part of a step is computed for all before the next part begins.
 
     What a part passes on to the next is in memory.

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import DTypeLike
 
-from crazysim.engine.backends.exchange import Exchange, Registers
+from crazysim.engine.backends.exchange import Exchange, LineWriter, Registers
 from crazysim.engine.backends.uniform import is_shared, shared_carry, shared_results
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
@@ -42,7 +42,7 @@ def require(block: Block) -> None:
 INDENT = "  "
 
 
-class Writer:
+class Writer(LineWriter):
     """Lines of source of blocks."""
 
     def __init__(self, exchange: Exchange | None = None) -> None:
