@@ -1,4 +1,4 @@
-"""Closed loop against logs: tracking errors of simulated flights over those of the real ones.
+"""Closed loop against logs: tracking errors of simulated flights over the real ones.
 
     python benchmarks/closed_loop.py FOLDER --drone cf2x_L250 --quat-deviation 0.06
 

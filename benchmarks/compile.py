@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 import jax.numpy as jnp
-from measure import alone, engine_of, hovering, machine
+from measure import engine_of, hovering, machine, run_in_process
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"])
     args = parser.parse_args()
     for case in itertools.product(args.controls, args.integrators, args.worlds, args.engine):
-        print(json.dumps(alone(measure, *case, args.device)), flush=True)
+        print(json.dumps(run_in_process(measure, *case, args.device)), flush=True)
 
 
 def measure(control: str, integrator: str, n_worlds: int, engine: str, device: str) -> dict[str, Any]:

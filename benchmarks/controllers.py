@@ -44,9 +44,9 @@ STEPS = {
     "body_rate": ((0, 0.5), (0, 3.0), (1, -3.0), (2, 0.5), (2, 2.0)),
 }
 """Axes and sizes of the steps of the command at each level, rad or rad/s."""
-HIGH = 100.0
+START_HEIGHT = 100.0
 """Height of the flights that may fall, m."""
-TAKE_OFF, TRACKING, PUSHED, HEAVIER, INVERTED, TUMBLING = range(6)
+TAKE_OFF_WORLD, TRACKING_WORLD, PUSHED_WORLD, HEAVY_WORLD, INVERTED_WORLD, FIRST_TUMBLING_WORLD = range(6)
 """Worlds of the flights; the last is the first of many."""
 
 
@@ -140,7 +140,7 @@ def fly(
     device: str = "cpu",
 ) -> dict[str, dict[str, float]]:
     """Return the figures of a controller for each airframe; all fly at once, one drone each in every world."""
-    worlds, drones = TUMBLING + n, len(airframes)
+    worlds, drones = FIRST_TUMBLING_WORLD + n, len(airframes)
     controller = controller_of(name, speed)
     sim = Sim(worlds, drone=airframes, dynamics=dynamics, control="state", controller=controller, device=device)
     eight, s, params = figure_eight(2.0, 1.0, speed=speed, height=1.0), sim.data.states, sim.data.params
@@ -148,17 +148,20 @@ def fly(
 
     pos, vel, quat, ang_vel = (np.array(x) for x in (s.pos, s.vel, s.quat, s.ang_vel))
     rotor_vel = np.array(np.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
-    pos[:], rotor_vel[TAKE_OFF] = [0, 0, 1], 0
-    pos[TAKE_OFF, :, 2], pos[INVERTED:, :, 2] = 0, HIGH
-    pos[TRACKING], vel[TRACKING] = start.pos, start.vel
-    quat[INVERTED] = [np.sin(np.radians(89)), 0, 0, np.cos(np.radians(89))]
-    quat[TUMBLING:], ang_vel[TUMBLING:] = rng.normal(size=(n, drones, 4)), rng.normal(size=(n, drones, 3))
+    pos[:], rotor_vel[TAKE_OFF_WORLD] = [0, 0, 1], 0
+    pos[TAKE_OFF_WORLD, :, 2], pos[INVERTED_WORLD:, :, 2] = 0, START_HEIGHT
+    pos[TRACKING_WORLD], vel[TRACKING_WORLD] = start.pos, start.vel
+    quat[INVERTED_WORLD] = [np.sin(np.radians(89)), 0, 0, np.cos(np.radians(89))]
+    quat[FIRST_TUMBLING_WORLD:], ang_vel[FIRST_TUMBLING_WORLD:] = (
+        rng.normal(size=(n, drones, 4)),
+        rng.normal(size=(n, drones, 3)),
+    )
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
-    ang_vel[TUMBLING:] *= 5 / np.linalg.norm(ang_vel[TUMBLING:], axis=-1, keepdims=True)
+    ang_vel[FIRST_TUMBLING_WORLD:] *= 5 / np.linalg.norm(ang_vel[FIRST_TUMBLING_WORLD:], axis=-1, keepdims=True)
     mass = np.array(np.broadcast_to(params.mass, (worlds, drones, 1)))
     force = np.zeros((worlds, drones, 3))
-    force[PUSHED, :, 0] = 0.1 * 9.81 * mass[PUSHED, :, 0]
-    mass[HEAVIER] *= 1.2
+    force[PUSHED_WORLD, :, 0] = 0.1 * 9.81 * mass[PUSHED_WORLD, :, 0]
+    mass[HEAVY_WORLD] *= 1.2
 
     as_data = lambda x: jnp.asarray(x, s.pos.dtype)  # noqa: E731
     states = s.replace(pos=as_data(pos), vel=as_data(vel), quat=as_data(quat), ang_vel=as_data(ang_vel))
@@ -166,7 +169,7 @@ def fly(
         states=states.replace(rotor_vel=as_data(rotor_vel)), params=params.replace(mass=as_data(mass))
     )
     target = np.array(np.broadcast_to([0, 0, 1.0], pos.shape))
-    target[INVERTED:, :, 2] = HIGH
+    target[INVERTED_WORLD:, :, 2] = START_HEIGHT
     flown, wanted = positions(sim, eight, target, as_data(force))
     return {airframe.name: figures(flown[:, :, k], wanted, name) for k, airframe in enumerate(airframes)}
 
@@ -189,7 +192,7 @@ def responses(name: str, airframes: list[Airframe], level: str, device: str = "c
     steps = STEPS[level]
     sim = Sim(len(steps), drone=airframes, control=level, controller=controller_of(name), device=device)
     s, params = sim.data.states, sim.data.params
-    high = jnp.broadcast_to(jnp.array([0, 0, HIGH], s.pos.dtype), s.pos.shape)
+    high = jnp.broadcast_to(jnp.array([0, 0, START_HEIGHT], s.pos.dtype), s.pos.shape)
     sim.data = sim.data.replace(
         states=s.replace(pos=high, rotor_vel=jnp.broadcast_to(hover_rotors(params), s.rotor_vel.shape))
     )
@@ -210,22 +213,22 @@ def responses(name: str, airframes: list[Airframe], level: str, device: str = "c
 
 
 def positions(sim: Sim, eight: Any, target: np.ndarray, force: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of all drones after each step of 15 s, m, and those of the figure eight."""
+    """Return the positions of all drones after each step of 15 s, and of the figure eight, m."""
     step, feeds = sim.build_step_fn(), sim.data.controls.state.staged_feedforward is not None
     zeros, command = step.zeros(sim.data), np.zeros((*target.shape[:2], 16), np.float32)
     command[..., :3], command[..., 12] = target, 1
 
-    def one(data: Any, k: jax.Array) -> Any:
+    def fly_step(data: Any, k: jax.Array) -> Any:
         setpoint = eight.evaluate(k / sim.freq)
-        feedforward = jnp.zeros((*target.shape[:2], 8)).at[TRACKING].set(setpoint.feedforward())
-        everybody = jnp.asarray(command).at[TRACKING].set(setpoint.command())
+        feedforward = jnp.zeros((*target.shape[:2], 8)).at[TRACKING_WORLD].set(setpoint.feedforward())
+        everybody = jnp.asarray(command).at[TRACKING_WORLD].set(setpoint.command())
         data = F.state_control(data, everybody, feedforward=feedforward if feeds else None)
         data = data.replace(states=data.states.replace(force=jnp.where(k < 2 * sim.freq, 0.0, force)))
         data = step(data, 1, zeros)
         return data, (data.states.pos, eight.evaluate((k + 1) / sim.freq).pos)
 
     steps = jnp.arange(15 * sim.freq)
-    _, (flown, wanted) = jax.jit(lambda data: jax.lax.scan(one, data, steps))(sim.data)
+    _, (flown, wanted) = jax.jit(lambda data: jax.lax.scan(fly_step, data, steps))(sim.data)
     return np.asarray(flown), np.asarray(wanted)
 
 
@@ -233,17 +236,17 @@ def figures(pos: np.ndarray, eight: np.ndarray, name: str) -> dict[str, float]:
     """Return the figures of one airframe from its positions. (n_steps, n_worlds, 3)"""
     per_s, home = len(pos) // 15, np.array([0, 0, 1.0])
     off = np.linalg.norm(pos - home, axis=-1)
-    found = {"tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING] - eight)[: 9 * per_s] ** 2, axis=-1))))}
+    found = {"tracking": float(np.sqrt(np.mean(np.sum((pos[:, TRACKING_WORLD] - eight)[: 9 * per_s] ** 2, axis=-1))))}
     if name == "tracking_lqr":
         return found
     return {
-        "hover": float(off[5 * per_s, TAKE_OFF]),
+        "hover": float(off[5 * per_s, TAKE_OFF_WORLD]),
         **found,
-        "pushed": float(off[7 * per_s, PUSHED]),
-        "pushed_largest": float(off[:, PUSHED].max()),
-        "heavier": float(off[5 * per_s, HEAVIER]),
-        "home": float(np.mean(np.linalg.norm(pos[-1, TUMBLING:] - [0, 0, HIGH], axis=-1) < 0.1)),
-        "lost_178": float(HIGH - pos[:, INVERTED, 2].min()),
+        "pushed": float(off[7 * per_s, PUSHED_WORLD]),
+        "pushed_largest": float(off[:, PUSHED_WORLD].max()),
+        "heavier": float(off[5 * per_s, HEAVY_WORLD]),
+        "home": float(np.mean(np.linalg.norm(pos[-1, FIRST_TUMBLING_WORLD:] - [0, 0, START_HEIGHT], axis=-1) < 0.1)),
+        "lost_178": float(START_HEIGHT - pos[:, INVERTED_WORLD, 2].min()),
     }
 
 

@@ -21,7 +21,7 @@ from measure import digits, engine_of, medians, report, seconds
 
 from crazysim import RangeFinder, Sim, __version__
 
-HALF = 10.0
+HALF_WIDTH = 10.0
 """Half the side of the square in which the poles stand, m."""
 
 
@@ -37,7 +37,7 @@ def main() -> None:
     for n_poles, movable in [(n, movable) for n in args.poles for movable in ((False, True) if n else (False,))]:
         sim = scene(args.worlds, n_poles, movable, args.device)
         if args.range_finder:
-            of_range_finder(sim, n_poles, movable, args)
+            range_finder_steps(sim, n_poles, movable, args)
             continue
         look = partial(sim.depth, "fpv_cam", args.size[0], args.size[1])
         begin = time.perf_counter()
@@ -53,10 +53,14 @@ def main() -> None:
         )  # fmt: skip
 
 
-def of_range_finder(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
+def range_finder_steps(sim: Sim, n_poles: int, movable: bool, args: argparse.Namespace) -> None:
     """Print the time of a step with a range finder."""
     n, n_steps = sim.n_worlds, 20
-    pos = np.random.default_rng(1).uniform([-HALF, -HALF, 1], [HALF, HALF, 1], (n, 1, 3)).astype(np.float32)
+    pos = (
+        np.random.default_rng(1)
+        .uniform([-HALF_WIDTH, -HALF_WIDTH, 1], [HALF_WIDTH, HALF_WIDTH, 1], (n, 1, 3))
+        .astype(np.float32)
+    )
     sim.add(RangeFinder())
 
     def steps() -> Array:
@@ -91,7 +95,7 @@ def scene(n_worlds: int, n_poles: int, movable: bool, device: str) -> Sim:
     sim = Sim(n_worlds, control="attitude", device=device)
     if n_poles:
         pos = np.zeros((n_poles, 3))
-        pos[:, :2] = np.random.default_rng(0).uniform(-HALF, HALF, (n_poles, 2))
+        pos[:, :2] = np.random.default_rng(0).uniform(-HALF_WIDTH, HALF_WIDTH, (n_poles, 2))
         sim.scene.add("pole", count=n_poles, pos=pos, mocap=movable)
     pos = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), sim.data.states.pos.shape)
     sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))

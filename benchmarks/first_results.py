@@ -64,9 +64,9 @@ def main() -> None:
     args = parser.parse_args()
     for case in args.cases:
         with tempfile.TemporaryDirectory() as folder:
-            cold = [measured(case, "off") for _ in range(args.repeat)]
-            measured(case, folder)
-            cached = [measured(case, folder) for _ in range(args.repeat)]
+            cold = [measure_cases(case, "off") for _ in range(args.repeat)]
+            measure_cases(case, folder)
+            cached = [measure_cases(case, folder) for _ in range(args.repeat)]
         for name, runs in (("off", cold), ("on", cached)):
             wall, cpu = map(statistics.median, zip(*runs, strict=True))
             line = {"benchmark": "first_results", "case": case, "cache": name}
@@ -74,7 +74,7 @@ def main() -> None:
             print(json.dumps(line | times | machine("cpu")), flush=True)
 
 
-def measured(case: str, cache: str) -> tuple[float, float]:
+def measure_cases(case: str, cache: str) -> tuple[float, float]:
     """Return the wall time and the CPU time of a process, s."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {VARIABLE: cache}
     program = f"import crazysim\n{CASES[case]}"

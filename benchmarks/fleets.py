@@ -1,8 +1,8 @@
 """Steps per second of mixed fleets: drones beside cars, and drones of two airframes in one world.
 
 One JSON line for each case. ``cars``: worlds of drones and cars, beside the same worlds without cars; the figure is
-the rate of the drones over that of the drones alone. ``airframes``: every other drone is of a second airframe, beside
-drones of one airframe whose parameters are one per drone. The two of a case are measured in turns.
+the ratio of their rates. ``airframes``: every other drone has a second airframe, beside drones of one airframe with
+parameters of their own. The two simulations of a case are measured in turns.
 
     python benchmarks/fleets.py [--device gpu] [--worlds 4096] [--drones 4] [--cars 2]
 """
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="physics steps per call")
     parser.add_argument("--repeats", type=int, default=9)
     args = parser.parse_args()
-    cases = {"cars": (drones(args), beside_cars(args)), "airframes": (drones(args, own=True), two_airframes(args))}
+    cases = {"cars": (drones(args), drones_and_cars(args)), "airframes": (drones(args, own=True), two_airframes(args))}
     for case, (reference, fleet) in cases.items():
         flights = {name: Flight(sim, "state", args.steps, args.device)
                    for name, sim in (("reference", reference), ("fleet", fleet))}  # fmt: skip
@@ -52,12 +52,14 @@ def drones(args: argparse.Namespace, own: bool = False) -> Sim:
     if own:
         shape = sim.data.states.pos.shape[:2]
 
-        def spread(record: Any) -> Any:
+        def repeat_per_drone(record: Any) -> Any:
             return jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), record)
 
         levels = {level: getattr(sim.data.controls, level) for level in LEVELS}
-        changes = {level: x.replace(params=spread(x.params)) for level, x in levels.items() if x is not None}
-        sim.data = sim.data.replace(params=spread(sim.data.params), controls=sim.data.controls.replace(**changes))
+        changes = {level: x.replace(params=repeat_per_drone(x.params)) for level, x in levels.items() if x is not None}
+        sim.data = sim.data.replace(
+            params=repeat_per_drone(sim.data.params), controls=sim.data.controls.replace(**changes)
+        )
     return sim
 
 
@@ -67,7 +69,7 @@ def two_airframes(args: argparse.Namespace) -> Sim:
     return Sim(args.worlds, args.drones, drone=kinds, control="state", device=args.device)
 
 
-def beside_cars(args: argparse.Namespace) -> Sim:
+def drones_and_cars(args: argparse.Namespace) -> Sim:
     """Return drones and cars, which drive circles."""
     sim = drones(args)
     cars = sim.add(Cars(args.cars, in_scene=False))

@@ -2,7 +2,7 @@
 
     python benchmarks/flight_stack.py [--device gpu] [--worlds 1024] [--cases state follow rod ...] [--operations]
 
-Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time over that of the reference: constant
+Drones hover, in calls of 100 steps; all cases alternate. ``ratio`` is the time over the reference's: constant
 state commands for trajectories and controllers, the bare drone with rotor commands for loads.
 
 - state: the default cascade, a constant command; follow: a figure eight for all; starts: with a start per world

@@ -2,9 +2,9 @@
 
     python benchmarks/gradient.py [--device gpu] [--worlds 1024 16384 131072] [--controls attitude] [--steps 100]
 
-The gradient is that of the squared distances from the start after ``--steps`` steps, with respect to the commands.
-``jvp_s`` is the time of the distances and their derivative in one direction, in forward mode, and ``forward_s`` that of
-the distances alone. Calls alternate; on a GPU those of a batch are queued.
+The gradient is taken of the squared distances from the start after ``--steps`` steps, with respect to the commands.
+``jvp_s`` is the time of the distances and their derivative in one direction, in forward mode, and ``forward_s`` the
+time of the distances alone. Calls alternate; on a GPU the calls of a batch are queued.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Lower bound of the time of each case on this machine, and the measured time relative to it.
 
-The lower bound is the larger of two times: that of the operations at the rate of multiply-adds measured here through
-the same engine, and that of the data, with each number that a call reads or writes moved once at the bandwidth of a
+The lower bound is the larger of two times: for the operations at the rate of multiply-adds measured here through
+the same engine, and for the data, with each number that a call reads or writes moved once at the bandwidth of a
 copy measured here. Both rates are the best of all repeats; the measured time is a median. Data that fits into a cache
 may move faster than the copy, which does not fit.
 
@@ -29,10 +29,10 @@ from crazysim.engine.backends import fused
 from crazysim.engine.ir.blocks import Block, Operation, Value
 from crazysim.engine.ir.ops import TABLE
 
-BIG = {"cpu": 2**26, "gpu": 2**28}
+COPY_SIZES = {"cpu": 2**26, "gpu": 2**28}
 """Number of float32 in the copy that measures the bandwidth, larger than any cache."""
 
-MANY = {"cpu": 2**14, "gpu": 2**20}
+WORLDS = {"cpu": 2**14, "gpu": 2**20}
 """Number of drones, and default number of worlds, that fill every core."""
 
 CHAINS, LENGTH = 8, 32
@@ -43,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engine", nargs="+", default=["auto"], choices=ENGINES)
-    parser.add_argument("--worlds", type=int, nargs="+", help=f"by default {MANY}")
+    parser.add_argument("--worlds", type=int, nargs="+", help=f"by default {WORLDS}")
     parser.add_argument("--controls", nargs="+", default=["rotor_vel", "attitude", "state"])
     parser.add_argument("--integrators", nargs="+", default=["euler", "rk4"])
     parser.add_argument("--steps", type=int, nargs="+", default=[100], help="physics steps per call")
@@ -51,12 +51,12 @@ def main() -> None:
     args = parser.parse_args()
     platform = "cpu" if args.device == "cpu" else "gpu"
     machine = Machine(
-        bytes_per_s=copy_bandwidth(args.device, BIG[platform], args.repeats),
-        multiply_adds_per_s=arithmetic_rate(args.device, MANY[platform], args.repeats),
+        bytes_per_s=copy_bandwidth(args.device, COPY_SIZES[platform], args.repeats),
+        multiply_adds_per_s=arithmetic_rate(args.device, WORLDS[platform], args.repeats),
     )
     figures = {name: digits(value) for name, value in machine._asdict().items()}
     report(args.device, benchmark="limits/machine", engine=fastest(args.device), **figures, crazysim=__version__)
-    worlds = args.worlds or [MANY[platform]]
+    worlds = args.worlds or [WORLDS[platform]]
     for case in itertools.product(args.controls, args.integrators, worlds, args.steps, args.engine):
         measure(args, machine, *case)
 
@@ -105,7 +105,7 @@ def measure(
 def work(sim: Sim) -> tuple[float, float, int]:
     """Return the multiply-adds of one drone per step, those per call, and the bytes that a call reads and writes.
 
-    The program is that of ``lanes`` with one world, whichever engine runs.
+    The program is taken from ``lanes`` with one world, whichever engine runs.
 
     Raises:
         SystemExit: If a stage is not part of the program, so that its operations cannot be counted.

@@ -40,7 +40,7 @@ def main() -> None:
         start, command = sim.data, np.asarray(getattr(sim.data.controls, control).staged_cmd)
         setter = getattr(sim, f"{control}_control")
 
-        def begin(sim: Sim = sim, start=start) -> None:
+        def reset(sim: Sim = sim, start=start) -> None:
             sim.data = start
 
         def iterate(sim: Sim = sim, command=command, setter=setter) -> None:
@@ -48,7 +48,7 @@ def main() -> None:
             sim.step(STEPS)
             np.asarray(sim.data.states.pos)
 
-        times = measured(begin, iterate, args.repeats)
+        times = measure_times(reset, iterate, args.repeats)
         if not still_flies(sim):
             raise RuntimeError("the drones crashed; a crashed drone costs less to simulate")
         realtime = STEPS / sim.freq * n_worlds / times["iteration_s"]
@@ -58,18 +58,18 @@ def main() -> None:
             args.device,
             benchmark="loop/jax",
             n_worlds=n_worlds,
-            **measured(*sum_with_one(args.device, n_worlds), args.repeats),
+            **measure_times(*sum_with_one(args.device, n_worlds), args.repeats),
         )
-    report("cpu", benchmark="loop/mj_step", n_worlds=1, **measured(*free_box(), args.repeats))
+    report("cpu", benchmark="loop/mj_step", n_worlds=1, **measure_times(*free_box(), args.repeats))
 
 
-def measured(begin: Callable[[], None], iterate: Callable[[], None], repeats: int) -> dict[str, float]:
+def measure_times(reset: Callable[[], None], iterate: Callable[[], None], repeats: int) -> dict[str, float]:
     """Return the median and the shortest time of an iteration, s, of some repeats that each start anew."""
-    begin()
+    reset()
     iterate()
     times = []
     for _ in range(repeats):
-        begin()
+        reset()
         for _ in range(ITERATIONS):
             now = time.perf_counter()
             iterate()

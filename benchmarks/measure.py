@@ -160,7 +160,7 @@ def report_flights(
         )
 
 
-def alone(function: Any, *args: Any) -> Any:
+def run_in_process(function: Any, *args: Any) -> Any:
     """Return the result of a function in a new process, where nothing is compiled yet."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *args).result()

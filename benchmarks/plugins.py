@@ -44,7 +44,7 @@ SPACING = 3.0
 Build = Callable[[], Sequence[Plugin]]
 
 
-def _on(estimator: Estimator) -> list[Plugin]:
+def _with_estimator(estimator: Estimator) -> list[Plugin]:
     return [*estimator.sensors, estimator]
 
 
@@ -83,23 +83,25 @@ def _all_aids() -> list[Plugin]:
 
 def _everything() -> list[Plugin]:
     aids = [*SENSORS["imu"](), *SENSORS["motion_capture"]()]
-    others = [plugin for name in (*SENSORS, *EFFECTS) if name not in UNLIKE for plugin in CASES[name]()]
+    others = [plugin for name in (*SENSORS, *EFFECTS) if name not in EXCLUDED for plugin in CASES[name]()]
     return [*others, *aids, Kalman(aids)]  # type: ignore[arg-type]
 
 
 OUTDOORS = ("imu", "gps", "barometer", "magnetometer")
 """Cases of the sensors of ``outdoors``."""
-UNLIKE = ("imu", "motion_capture", "battery", "rotor_aerodynamics", "randomize")
+EXCLUDED = ("imu", "motion_capture", "battery", "rotor_aerodynamics", "randomize")
 """Cases that ``everything`` has otherwise (sensors of the filter, the battery of its voltage), or lacks."""
 CASES: dict[str, Build] = {
     "none": lambda: [],
     **SENSORS,
     "imu_vibration": lambda: [sensors.IMU.bmi088(imbalance=1e-8)],
     "motion_capture_late": lambda: [sensors.MotionCapture(1e-3, 1e-3, delay=0.01, jitter=0.01, dropout=0.05)],
-    "complementary": lambda: _on(Complementary([sensors.IMU.crazyflie(), sensors.Barometer()], control=False)),
-    "kalman": lambda: _on(Kalman.default()),
-    "eskf": lambda: _on(ESKF.default()),
-    "outdoors": lambda: _on(ESKF([s for name in OUTDOORS for s in SENSORS[name]()])),  # type: ignore[misc]
+    "complementary": lambda: _with_estimator(
+        Complementary([sensors.IMU.crazyflie(), sensors.Barometer()], control=False)
+    ),
+    "kalman": lambda: _with_estimator(Kalman.default()),
+    "eskf": lambda: _with_estimator(ESKF.default()),
+    "outdoors": lambda: _with_estimator(ESKF([s for name in OUTDOORS for s in SENSORS[name]()])),  # type: ignore[misc]
     "all_aids": _all_aids,
     **EFFECTS,
     "everything": _everything,

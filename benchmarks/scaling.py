@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from measure import Flight, alone, digits, engine_of, machine, medians
+from measure import Flight, digits, engine_of, machine, medians, run_in_process
 
 from crazysim import Sim, __version__
 from crazysim.engine import ENGINES
@@ -43,12 +43,12 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="image to write; needs matplotlib")
     parser.add_argument("--lines", type=Path, help="file of JSON lines to plot instead of measuring")
     args = parser.parse_args()
-    lines = [json.loads(line) for line in args.lines.read_text().splitlines()] if args.lines else measured(args)
+    lines = [json.loads(line) for line in args.lines.read_text().splitlines()] if args.lines else measure_cases(args)
     if args.plot:
         plot(lines, args.plot)
 
 
-def measured(args: argparse.Namespace) -> list[dict[str, Any]]:
+def measure_cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Print and return one line for each case."""
     sizes = [("worlds", n, 1) for n in powers_of_4(args.most_worlds)]
     sizes += [("drones", max(args.total // n, 1), n) for n in powers_of_4(args.most_drones)]
@@ -59,7 +59,7 @@ def measured(args: argparse.Namespace) -> list[dict[str, Any]]:
                 case = {"control": control, "integrator": args.integrator, "n_worlds": n_worlds, "n_drones": n_drones}
                 line = {"benchmark": "scaling", "series": series, "engine": engine, **case, "n_steps": args.steps}
                 try:
-                    line |= alone(measure, {**case, "engine": engine}, args.steps, args.device, args.repeats)
+                    line |= run_in_process(measure, {**case, "engine": engine}, args.steps, args.device, args.repeats)
                 except (
                     BrokenProcessPool,
                     jax.errors.JaxRuntimeError,

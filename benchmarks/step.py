@@ -86,22 +86,22 @@ def build(
         params = sim.data.params
         sim.data = sim.data.replace(params=params.replace(drag_matrix=jnp.zeros_like(params.drag_matrix)))
     if args.randomised:
-        randomised(sim)
+        randomise_parameters(sim)
     return sim
 
 
-def randomised(sim: Sim, spread: float = 1e-4) -> None:
+def randomise_parameters(sim: Sim, spread: float = 1e-4) -> None:
     """Give every drone its own value of every parameter, varied so little that all of them still hover."""
     batch, key = (sim.n_worlds, sim.n_drones), jax.random.key(0)
 
-    def own(scope: str, x: jax.Array) -> jax.Array:
+    def randomise_leaf(scope: str, x: jax.Array) -> jax.Array:
         if scope != "shared" or not jnp.issubdtype(x.dtype, jnp.floating):
             return x
         return x * jax.random.uniform(key, (*batch, *x.shape), x.dtype, 1 - spread, 1 + spread)
 
     data = sim.data
-    params = jax.tree.map(own, scopes(data.params), data.params)
-    controls = jax.tree.map(own, scopes(data.controls), data.controls)
+    params = jax.tree.map(randomise_leaf, scopes(data.params), data.params)
+    controls = jax.tree.map(randomise_leaf, scopes(data.controls), data.controls)
     sim.data = data.replace(params=params, controls=controls)
 
 

@@ -91,7 +91,7 @@ def train(task: str, seed: int, folder: Path, device: str) -> None:
         success=round(point["success"], 4),
         crashed=round(point["crashed"], 4),
         error=digits(point["error"]) if point["error"] == point["error"] else None,
-        kept_iteration=point["round"],
+        kept_iteration=point["iteration"],
         env_steps=last["env_steps"],
         seconds=digits(last["seconds"]),
         compile_seconds=digits(last["compile_seconds"]),

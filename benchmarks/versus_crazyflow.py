@@ -36,8 +36,8 @@ from typing import Any
 import jax
 from measure import digits, medians
 
-HERE = Path(__file__).parent
-PEER = HERE.parent / ".cache" / "crazyflow"
+FOLDER = Path(__file__).parent
+PEER_FOLDER = FOLDER.parent / ".cache" / "crazyflow"
 CASES = ("first_step", "step", "loop", "call", "gradient", "swarm", "contacts", "depth", "swarm_build", "gym", "memory")
 LEVELS = ("rotor_vel", "force_torque", "body_rate", "attitude", "state")
 
@@ -191,7 +191,7 @@ class Worker:
 
     def __init__(self, python: str, name: str):
         """Start the process."""
-        command = [python, HERE / "contestant.py", name]
+        command = [python, FOLDER / "contestant.py", name]
         # Two processes share one GPU, so each preallocates less than half of its memory instead of three quarters.
         env = {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.45"} | os.environ
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
@@ -219,7 +219,7 @@ class Worker:
 
 def peer_environment(device: str) -> Path:
     """Return the interpreter of an environment with Crazyflow 0.4.0 and our JAX, made at first use."""
-    folder = PEER if device == "cpu" else PEER.with_name(f"{PEER.name}-{device}")
+    folder = PEER_FOLDER if device == "cpu" else PEER_FOLDER.with_name(f"{PEER_FOLDER.name}-{device}")
     python = folder / "bin" / "python"
     if not python.exists():
         print(f"making an environment for Crazyflow 0.4.0 in {folder} ...", file=sys.stderr)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-import crazysim.surroundings  # noqa: F401 - before JAX and MuJoCo
+import crazysim.startup  # noqa: F401 - before JAX and MuJoCo
 
 # isort: split
 from crazysim.cache import enable_cache
@@ -16,7 +16,6 @@ from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
-from crazysim.lazy import lazy
 from crazysim.plugins.effects import (
     Battery,
     Downwash,
@@ -31,7 +30,7 @@ from crazysim.plugins.effects import (
 )
 from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
-from crazysim.version import __version__
+from crazysim.startup import __version__, lazy
 
 if TYPE_CHECKING:
     from crazysim.core import functional as functional

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _named_extra(error: Exception, command: str) -> str:
-    """Return the message of an error; that of a missing package says which extra of crazysim brings it."""
+    """Return the message of an error, for a missing package with the extra of crazysim that brings it."""
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package not in EXTRAS:
         return str(error)

@@ -24,13 +24,13 @@ import jax
 
 from crazysim import jaxcompat
 from crazysim.errors import ConfigError
-from crazysim.trust import REMEDY, distrust, make_private
+from crazysim.storage import FOLDER_REMEDY, distrust, make_private
 
 VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
-LIMIT = 1_000_000_000
+MAX_CACHE_BYTES = 1_000_000_000
 """Size of all files, bytes, above which the oldest are removed when the cache is first used: some 5,000 programs."""
-SHARE_LEFT = 0.8
+SHARE_AFTER_TRIM = 0.8
 """Share of the limit that is left by a removal, so that not every process has to remove files."""
 MIN_FREE = 50_000_000
 """Free space below which a disk counts as full, bytes: the programs of some simulations."""
@@ -96,18 +96,18 @@ def cpu_features() -> str:
 
 
 def folder() -> Path | None:
-    """Return the folder of this process: that of JAX's configuration, else the default one; None if there is none.
+    """Return the folder of this process: of JAX's configuration, else the default one; None if there is none.
 
     A default folder that cannot be used is a line on stderr, once; the process then keeps nothing.
     """
     configured = jaxcompat.cache_folder()
     if configured is not None:
         return Path(configured)
-    return _usable(*map(os.environ.get, (VARIABLE, "XDG_CACHE_HOME", "HOME")))
+    return _prepare_default(*map(os.environ.get, (VARIABLE, "XDG_CACHE_HOME", "HOME")))
 
 
 @functools.cache
-def _usable(*environment: str | None) -> Path | None:
+def _prepare_default(*environment: str | None) -> Path | None:
     """Return the default folder, prepared, if it can be used in this environment."""
     del environment  # the folder follows from it
     try:
@@ -140,7 +140,9 @@ def _prepare(root: Path, path: Path) -> None:
             f"expected a folder for compiled programs, got {str(path)!r}: {error}. Use another."
         ) from error
     if reason := distrust(path):
-        raise ConfigError(f"expected a folder that only this user can write, got {str(path)!r}: {reason}. {REMEDY}")
+        raise ConfigError(
+            f"expected a folder that only this user can write, got {str(path)!r}: {reason}. {FOLDER_REMEDY}"
+        )
     if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
         raise ConfigError(f"expected a folder that can be written, got {str(path)!r}. Use another.")
     if free < MIN_FREE:
@@ -160,11 +162,10 @@ def enable_cache(
     """Keep all programs that this process compiles from now on, your own included, and return the folder.
 
     What crazysim compiles itself is kept without it. What is in the folder is executed, so it is made for this user
-    alone. Where it holds more than ``LIMIT`` bytes, the programs that have not been used for the longest time are
-    removed.
+    alone. Where it holds more than ``MAX_CACHE_BYTES``, those not used for the longest time are removed.
 
     Args:
-        cache_path: Folder; None for that of the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
+        cache_path: Folder; None for the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
             the user's folder of caches, where each kind of CPU has a folder of its own. Where the variable is ``off``,
             None keeps nothing and returns None.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
@@ -230,7 +231,7 @@ def enable_for_command() -> None:
     enable_cache()
     if is_new:
         print(
-            f"compiled programs are kept in {path}, {LIMIT / 1e9:g} GB at most; {VARIABLE}=off keeps none",
+            f"compiled programs are kept in {path}, {MAX_CACHE_BYTES / 1e9:g} GB at most; {VARIABLE}=off keeps none",
             file=sys.stderr,
         )
 
@@ -256,7 +257,7 @@ def announce(work: str, seconds: str) -> None:
 
 
 @contextlib.contextmanager
-def announced(work: str, seconds: str, patience: float = PATIENCE) -> Iterator[None]:
+def announce_if_slow(work: str, seconds: str, patience: float = PATIENCE) -> Iterator[None]:
     """Keep the programs of long work, and announce it where it has not ended after some time.
 
     Args:
@@ -274,7 +275,7 @@ def announced(work: str, seconds: str, patience: float = PATIENCE) -> Iterator[N
         timer.cancel()
 
 
-def trim(folder: Path, limit: int = LIMIT) -> None:
+def trim(folder: Path, limit: int = MAX_CACHE_BYTES) -> None:
     """Remove the least recently used programs of a folder if they take more than a number of bytes.
 
     Args:
@@ -295,5 +296,5 @@ def trim(folder: Path, limit: int = LIMIT) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         size -= n
-        if size <= SHARE_LEFT * limit:
+        if size <= SHARE_AFTER_TRIM * limit:
             return

@@ -7,19 +7,19 @@ import warnings
 
 import jax
 
-LONGEST = 60
+MAX_REPR_LENGTH = 60
 """Most characters of a value in a message."""
-BETWEEN = ("crazysim", "jax", "contextlib", "functools", "importlib")
+SKIPPED_PACKAGES = ("crazysim", "jax", "contextlib", "functools", "importlib")
 """Packages whose lines may stand between a warning and the line of the user's that caused it."""
 
 
-def shown(value: object) -> str:
-    """Return a value for a message, at most ``LONGEST`` characters of it."""
+def short_repr(value: object) -> str:
+    """Return a value for a message, at most ``MAX_REPR_LENGTH`` characters of it."""
     try:
-        text = repr(value) if not isinstance(value, (list, dict)) or len(value) < LONGEST else _kind(value)
+        text = repr(value) if not isinstance(value, (list, dict)) or len(value) < MAX_REPR_LENGTH else _kind(value)
     except RecursionError:
         text = _kind(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return text if len(text) <= MAX_REPR_LENGTH else f"{text[: MAX_REPR_LENGTH - 3]}..."
 
 
 def _kind(value: object) -> str:
@@ -27,9 +27,9 @@ def _kind(value: object) -> str:
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the line of the user's that led here, the nearest one outside of ``BETWEEN``."""
+    """Warn at the line of the user's that led here, the nearest one outside of ``SKIPPED_PACKAGES``."""
     frame = sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in BETWEEN:
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in SKIPPED_PACKAGES:
         frame = frame.f_back
     names = frame.f_globals
     registry = names.setdefault("__warningregistry__", {})

@@ -1,16 +1,18 @@
-"""Files that are written as a whole or not at all, and files and archives that are read within bounds."""
+"""Files: written completely or not at all, read within bounds, and in folders of this user alone."""
 
 from __future__ import annotations
 
 import io
 import math
 import os
+import stat
 import tomllib
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from types import TracebackType
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,10 @@ MAX_ARRAYS = 10_000
 """Most arrays of an ``.npz`` file."""
 MAX_UNPACKED, MAX_RATIO = 2**30, 100
 """Most bytes that are unpacked from an ``.npz`` file: so many, or so many times its size if that is more."""
+FOLDER_REMEDY = "Remove it, since what it holds may not be yours, or use another."
+"""End of the message for a folder that is refused."""
+SYSTEM_USERS = (0, 65534)
+"""Users that may own the folders above: root, and the one that stands for root in containers that do not map it."""
 
 
 def is_file(path: str | Path) -> bool:
@@ -274,3 +280,53 @@ def _array(content: bytes, place: str) -> NDArray:
         )
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder that only this user can enter, with the folders above it as usual; it may exist.
+
+    Raises:
+        OSError: If it cannot be made.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
+def distrust(path: Path) -> str:
+    """Return the reason why another user could have written a file or folder, for a message; empty if none could.
+
+    Args:
+        path: The file or folder. One that cannot be read is not trusted.
+    """
+    if not hasattr(os, "geteuid"):
+        return ""
+    try:
+        status = path.stat()
+    except OSError as error:
+        return f"it cannot be read ({error.strerror})"
+    if status.st_uid != os.geteuid():
+        return f"it belongs to the user {status.st_uid}"
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return "other users can write to it"
+    for parent in path.resolve().parents:
+        status = parent.stat()
+        if status.st_uid not in (os.geteuid(), *SYSTEM_USERS):
+            return f"the user {status.st_uid} can replace it, who owns {parent}"
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            return f"other users can replace it, as they can write to {parent}"
+    return ""
+
+
+class Closing:
+    """Base of files and connections, which a ``with`` block closes."""
+
+    def close(self) -> None:
+        """Close the file or connection."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.storage import is_file, read_toml
 
-LARGEST = 1e30
+MAX_NUMBER = 1e30
 """Largest size of a number, and inverse of the smallest positive one; float32 represents both, and their inverses."""
 ENTRY = ("value", "unit", "source")
 """Keys of a number that is written with its unit and source."""
@@ -33,20 +33,20 @@ class Range(NamedTuple):
     """Description, as in "expected mass to be ..."."""
     low: Any
     """Smallest value; for an array, one for all or one for each entry."""
-    high: Any = LARGEST
+    high: Any = MAX_NUMBER
     """Largest value."""
 
 
-ANY = Range(f"finite, of a size up to {LARGEST:g}", -LARGEST)
-POSITIVE = Range("positive", 1 / LARGEST)
+ANY_NUMBER = Range(f"finite, of a size up to {MAX_NUMBER:g}", -MAX_NUMBER)
+POSITIVE = Range("positive", 1 / MAX_NUMBER)
 NOT_NEGATIVE = Range("at least zero", 0.0)
-NEGATIVE = Range("negative", -LARGEST, -1 / LARGEST)
-UNLIMITED = Range("at least zero, or inf", 0.0, np.inf)
+NEGATIVE = Range("negative", -MAX_NUMBER, -1 / MAX_NUMBER)
+NOT_NEGATIVE_OR_INF = Range("at least zero, or inf", 0.0, np.inf)
 MASS = Range("from 1e-6 to 1e6 kg", 1e-6, 1e6)
 INERTIA = Range("from 1e-15 to 1e9 kg m^2", 1e-15, 1e9)
 LENGTH = Range("from 1e-6 to 1e3 m", 1e-6, 1e3)
-MAYBE_LENGTH = Range("from 0 to 1e3 m", 0.0, 1e3)
-PLACE = Range("from -1e3 to 1e3 m", -1e3, 1e3)
+LENGTH_OR_ZERO = Range("from 0 to 1e3 m", 0.0, 1e3)
+COORDINATE = Range("from -1e3 to 1e3 m", -1e3, 1e3)
 
 
 class Key(NamedTuple):
@@ -54,24 +54,24 @@ class Key(NamedTuple):
 
     shapes: Shapes
     """Allowed shapes."""
-    range: Range = ANY
+    range: Range = ANY_NUMBER
     """Range of all entries."""
 
 
-def bounds(low: float = -np.inf, high: float = np.inf, positive: bool = False) -> Range:
+def range_between(low: float = -np.inf, high: float = np.inf, positive: bool = False) -> Range:
     """Return the range of finite numbers between two bounds, or of positive ones."""
-    most = "" if high > LARGEST else f" to {high:.6g}"
+    most = "" if high > MAX_NUMBER else f" to {high:.6g}"
     if positive:
-        return Range(f"positive{most and f', at most {high:.6g}'}", 1 / LARGEST, min(high, LARGEST))
-    if low < -LARGEST:
-        return ANY if not most else Range(f"finite and at most {high:.6g}", -LARGEST, high)
-    return Range(f"from {low:.6g}{most}" if most else f"finite and at least {low:.6g}", low, min(high, LARGEST))
+        return Range(f"positive{most and f', at most {high:.6g}'}", 1 / MAX_NUMBER, min(high, MAX_NUMBER))
+    if low < -MAX_NUMBER:
+        return ANY_NUMBER if not most else Range(f"finite and at most {high:.6g}", -MAX_NUMBER, high)
+    return Range(f"from {low:.6g}{most}" if most else f"finite and at least {low:.6g}", low, min(high, MAX_NUMBER))
 
 
-def numbers(
+def read_numbers(
     name: str,
     value: Any,
-    allowed: Range = ANY,
+    allowed: Range = ANY_NUMBER,
     shapes: Shapes | None = None,
     *,
     whole: bool = False,
@@ -101,13 +101,13 @@ def numbers(
     # A float32 is compared with the bound in float32, which may be larger: pi / 2 is.
     compared = np.asarray(value) if getattr(value, "dtype", None) == np.float32 else array
     if not np.all((compared >= allowed.low) & (compared <= allowed.high)):
-        raise ConfigError(f"{owner}expected {name} to be {allowed.text}, got {shown(array.tolist())}{remedy}")
+        raise ConfigError(f"{owner}expected {name} to be {allowed.text}, got {short_repr(array.tolist())}{remedy}")
     return array
 
 
-def number(name: str, value: Any, allowed: Range = ANY, remedy: str = "") -> float:
-    """Return one number, checked as by ``numbers``."""
-    return float(numbers(name, value, allowed, ((),), remedy=remedy))
+def read_number(name: str, value: Any, allowed: Range = ANY_NUMBER, remedy: str = "") -> float:
+    """Return one number, checked as ``read_numbers`` does."""
+    return float(read_numbers(name, value, allowed, ((),), remedy=remedy))
 
 
 def _as_array(
@@ -124,7 +124,7 @@ def _as_array(
         array = np.array(None)
     if array.dtype.kind not in ("iu" if whole else "iuf"):
         kind = f"a {'whole ' if whole else ''}number{'' if shapes == ((),) else ' or array'}"
-        raise ConfigError(f"{owner}expected {name} as {kind}, got {shown(value)}{remedy}")
+        raise ConfigError(f"{owner}expected {name} as {kind}, got {short_repr(value)}{remedy}")
     array = array.astype(np.int64 if whole else np.float64)
     array.setflags(write=False)
     return array
@@ -164,7 +164,7 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
         ConfigError: If it has another shape, or an entry is out of the range.
     """
     shapes = tuple(tuple(n if length == "n" else length for length in shape) for shape in key.shapes)
-    numbers(path, value, key.range, shapes, owner=owner)
+    read_numbers(path, value, key.range, shapes, owner=owner)
 
 
 @dataclass(frozen=True)
@@ -204,14 +204,14 @@ class Layout:
             if path in self.tables:
                 if not isinstance(item, Mapping):
                     raise ConfigError(
-                        f"{owner}: expected a table [{path}], got {shown(item)}. {self.guide} lists its keys."
+                        f"{owner}: expected a table [{path}], got {short_repr(item)}. {self.guide} lists its keys."
                     )
                 yield from self.numbers(owner, item, f"{path}.")
             elif path in self.keys:
                 if isinstance(item, Mapping) and ("value" not in item or set(item) - set(ENTRY)):
                     raise ConfigError(
                         f"{owner}: expected {path} as a number, an array or {{ value, unit, source }}, got "
-                        f"{shown(dict(item))}. {self.guide} shows both forms."
+                        f"{short_repr(dict(item))}. {self.guide} shows both forms."
                     )
                 yield path, as_numbers(owner, path, item)
             elif isinstance(item, Mapping) and "value" not in item:
@@ -260,14 +260,14 @@ def read_source(
         return "custom", "", dict(source)
     if not isinstance(source, (str, Path)):
         raise ConfigError(
-            f"expected a {kind} as a name, the path of a TOML file, a dict or {loaded}, got {shown(source)}"
+            f"expected a {kind} as a name, the path of a TOML file, a dict or {loaded}, got {short_repr(source)}"
         )
     if str(source) in names:
         return str(source), "", _built_in(folder / f"{source}.toml", guide)
     if not is_file(source):
         raise UnknownNameError(
             f"expected a {kind} as one of {', '.join(names)}, the path of a .toml file, or a dict, got "
-            f"{shown(str(source))}, and no file of that path exists"
+            f"{short_repr(str(source))}, and no file of that path exists"
         )
     return Path(source).stem, f" in {source}", read_toml(source, guide)
 
@@ -277,11 +277,11 @@ def _built_in(path: Path, guide: str) -> Mapping[str, Any]:
     return read_toml(path, guide)
 
 
-def extended(bases: tuple[str, ...], source: Any) -> tuple[str, ...]:
+def extend_bases(bases: tuple[str, ...], source: Any) -> tuple[str, ...]:
     """Return the sources that extend each other, with one more.
 
     Args:
-        bases: Names, paths or kinds of the sources so far, each of which has the next one as its base.
+        bases: Names, paths or kinds of the sources so far, each with the next one as its base.
         source: Name, path or dict of the next one.
 
     Raises:

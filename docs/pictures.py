@@ -14,9 +14,9 @@ from pathlib import Path
 import jax
 import matplotlib as mpl
 import numpy as np
+from examples import mixed_fleet
 from PIL import Image
 
-import crazysim.demos.mixed as demo
 from crazysim import IMU, Follow, MotionCapture, Sim
 from crazysim.envs import flying
 from crazysim.media import View
@@ -62,7 +62,7 @@ def flight() -> None:
 
 def mixed() -> None:
     """Two Crazyflies, a Bumblebee with a load, and two cars, one with a trailer, on hills."""
-    sim = demo.build(1, "cpu")
+    sim = mixed_fleet.build(1)
     sim.step(round(7.5 * sim.freq))
     camera = {"lookat": [0, 0, 0.75], "distance": 3.4, "azimuth": 210, "elevation": -22}
     Image.fromarray(View([0], 960, 480, cam_config=camera).render(sim)).save(FOLDER / "mixed.jpg", quality=80)

@@ -27,13 +27,13 @@ def run(benchmarks, monkeypatch, capsys):
     """Return a function that runs a script in this process, its cases too, and returns the lines that it printed."""
     import measure
 
-    monkeypatch.setattr(measure, "alone", lambda function, *args: function(*args))
+    monkeypatch.setattr(measure, "run_in_process", lambda function, *args: function(*args))
 
     def run(script, *arguments):
         monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
         module = importlib.import_module(script.removesuffix(".py"))
-        if hasattr(module, "alone"):
-            monkeypatch.setattr(module, "alone", measure.alone)
+        if hasattr(module, "run_in_process"):
+            monkeypatch.setattr(module, "run_in_process", measure.run_in_process)
         module.main()
         return lines_of(capsys.readouterr().out)
 
@@ -116,7 +116,7 @@ def test_randomised_leaves_no_parameter_shared(benchmarks):
     from crazysim.pytree import scopes
 
     sim = Sim(n_worlds=2, n_drones=3, engine="lanes")
-    step.randomised(sim)
+    step.randomise_parameters(sim)
     assert set(jax.tree.leaves(scopes(sim.data.params))) == {"drone"}
     assert "shared" not in jax.tree.leaves(scopes(sim.data.controls))
     assert len(set(sim.data.params.mass.ravel().tolist())) == 6
@@ -134,8 +134,8 @@ def test_scaling_measures_both_series_and_draws_them(run, tmp_path):
 def test_limits_prints_a_floor_and_how_far_from_it(monkeypatch, benchmarks, capsys):
     import limits
 
-    monkeypatch.setattr(limits, "BIG", {"cpu": 2**16})
-    monkeypatch.setattr(limits, "MANY", {"cpu": 64})
+    monkeypatch.setattr(limits, "COPY_SIZES", {"cpu": 2**16})
+    monkeypatch.setattr(limits, "WORLDS", {"cpu": 64})
     monkeypatch.setattr(
         sys, "argv", ["limits.py", "--repeats", "1", "--controls", "rotor_vel", "--integrators", "euler"]
     )

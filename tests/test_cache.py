@@ -13,7 +13,15 @@ import pytest
 from jax._src import compilation_cache
 
 from crazysim import cache
-from crazysim.cache import announce, announced, default_cache, enable_cache, enable_for_command, keep_programs, trim
+from crazysim.cache import (
+    announce,
+    announce_if_slow,
+    default_cache,
+    enable_cache,
+    enable_for_command,
+    keep_programs,
+    trim,
+)
 from crazysim.engine.backends import kernel_cache
 from crazysim.errors import ConfigError
 
@@ -191,7 +199,7 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
         monkeypatch.delenv("XDG_CACHE_HOME")
         monkeypatch.delenv("HOME")
         monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for a user without an entry in passwd
-    cache._usable.cache_clear()
+    cache._prepare_default.cache_clear()
     for _ in range(2):
         with keep_programs():
             jax.jit(_inner)(jnp.ones(3))
@@ -202,7 +210,7 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
     assert cache.VARIABLE in told
     with pytest.raises(ConfigError, match="expected"):
         enable_cache()
-    cache._usable.cache_clear()
+    cache._prepare_default.cache_clear()
 
 
 def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_path, capsys):
@@ -292,12 +300,12 @@ def test_long_work_is_announced_once_for_each_kind(settings, capsys):
 
 def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):
     monkeypatch.setattr(cache, "PATIENCE", 3600.0)
-    with announced("compiling what is cached", "5 s"):
+    with announce_if_slow("compiling what is cached", "5 s"):
         pass
     assert capsys.readouterr().err == ""
     shown = threading.Event()
     monkeypatch.setattr(cache, "PATIENCE", 0.0)
     monkeypatch.setattr(cache, "announce", lambda *args: (announce(*args), shown.set()))
-    with announced("compiling what lasts", "5 s"):
+    with announce_if_slow("compiling what lasts", "5 s"):
         assert shown.wait(60), "the notice comes while the work is done"
     assert capsys.readouterr().err.startswith("compiling what lasts: 5 s on two cores")

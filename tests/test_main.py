@@ -13,7 +13,7 @@ from pictures import frames_of
 
 from crazysim import Sim
 from crazysim.__main__ import EXTRAS, main
-from crazysim.demos import DEMOS, flight
+from crazysim.commands import demo_flight
 from crazysim.media import Flight, Recorder
 from crazysim.scene.software import film_size
 
@@ -61,15 +61,11 @@ def test_the_help_of_a_command_states_defaults_once(command, capsys):
         assert "random seed; by default 0" in out
 
 
-def test_a_demo_has_a_name(capsys, monkeypatch):
-    ran = []
-    monkeypatch.setattr(flight, "run", lambda **settings: ran.append(settings))
-    assert main(["demo"]) == main(["demo", "flight", "--worlds", "8", "--no-film"]) == 0
-    assert ran == [{}, {"n_worlds": 8, "film": False}]
-    with pytest.raises(SystemExit):
-        main(["demo", "dance"])
-    message = capsys.readouterr().err
-    assert all(name in message for name in DEMOS)
+def test_the_demo_has_the_defaults_of_its_function(monkeypatch):
+    settings = []
+    monkeypatch.setattr(demo_flight, "fly", lambda **given: settings.append(given))
+    assert main(["demo"]) == main(["demo", "--worlds", "8", "--no-film"]) == 0
+    assert settings == [{}, {"n_worlds": 8, "film": False}]
 
 
 def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
@@ -91,46 +87,11 @@ def test_the_demo_flies_counts_plots_and_films(tmp_path, capsys, opengl):
     assert np.mean(np.abs(frames[-1].astype(float) - frames[0])) > 1, "nothing moves in the film"
 
 
-def test_pick_and_place_succeeds_in_every_world(tmp_path, capsys):
-    """From random places of the loads: all are set down within millimetres, and carried within 3 cm RMS."""
-    assert main(["demo", "pick", "--worlds", "3", "--no-film", "--out", str(tmp_path)]) == 0
-    out = capsys.readouterr().out
-    for word in ("engine: fused", "picked up         3 of 3", "placed            3 of 3", "steps per second"):
-        assert word in out
-    assert float(out.split("distance")[1].split("cm")[0]) < 0.5
-    assert float(out.split("tracking error")[1].split("cm")[0]) < 3
-    flown = Flight.load(tmp_path / "flight.npz")
-    assert flown.pos.shape == (625, 1, 1, 3)
-    away = np.linalg.norm(flown.body_pos[:, 0] - [1.2, 1.2, 0.04], axis=-1)
-    load = np.argmin(away[-1])
-    assert away[-1, load] < 5e-3
-    from_middle = np.linalg.norm(flown.body_pos[0, 0, load] - [-1.2, -1.2, 0.04])
-    assert 0.01 < from_middle < 0.18, "it starts at a random place on the other pad"
-
-
-def test_a_mixed_fleet_keeps_to_its_paths_and_apart(tmp_path, capsys):
-    """Drones of two kinds and cars of two kinds, over hills: a second of two worlds."""
-    arguments = ["--worlds", "2", "--seconds", "1", "--no-film", "--out", str(tmp_path)]
-    assert main(["demo", "mixed", *arguments]) == 0
-    out = capsys.readouterr().out
-    for word in ("engine: fused", "Crazyflie_1, Bumblebee_0", "0 begun, in 0 of 2 worlds", "steps per second"):
-        assert word in out
-    closest = out.split("closest")[1].splitlines()[0].split()
-    assert float(closest[0]) > 20
-    assert 20 < float(closest[4]) < 80, "one drone escorts a car"
-    errors = [line for line in out.splitlines() if line.startswith("tracking error")]
-    for name, line in zip(("Crazyflie_0", "Crazyflie_1", "Bumblebee_0's load", "_0", "_1"), errors, strict=True):
-        assert name in line
-        assert float(line.split("cm RMS")[0].split()[-1]) < 15
-    assert main(["demo", "mixed", "--drones", "2"]) == 2
-    assert "--drones 3" in capsys.readouterr().err
-
-
 def test_without_opengl_the_demo_says_so_and_does_the_rest(tmp_path, capsys, monkeypatch):
     def no_picture(*args, **kwargs):
-        raise flight.RenderError("no OpenGL context could be made")
+        raise demo_flight.RenderError("no OpenGL context could be made")
 
-    monkeypatch.setattr(flight.Sim, "render", no_picture)
+    monkeypatch.setattr(demo_flight.Sim, "render", no_picture)
     assert main(["demo", "--worlds", "8", "--seconds", "1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert len([line for line in out.splitlines() if line.startswith("no film")]) == 1
@@ -151,12 +112,12 @@ def test_wrong_arguments_are_one_line(arguments, word, capsys):
 
 def test_the_poles_are_where_drones_can_hit_them():
     """Contacts are found in some worlds and not in all: the check would be worthless otherwise."""
-    sim = flight.build(64, 4, "cpu")
-    fly = flight.build_fly_frame(sim)
+    sim = demo_flight.build(64, 4, "cpu")
+    fly = demo_flight.build_fly_frame(sim)
     touched = np.zeros(64, bool)
     for _ in range(75):
         sim.data, _ = fly(sim.data)
-        touched |= flight.touches(sim).any((1, 2))
+        touched |= demo_flight.find_touches(sim).any((1, 2))
     assert 0 < touched.sum() < 64
 
 
@@ -184,7 +145,7 @@ sys.exit(main(sys.argv[2:]))
         ("render {0}", "train"),
         ("replay {0}/flight.npz", "web"),
         ("live --browser --seconds 0.1 --port 0", "web"),
-        ("demo load --worlds 1 --seconds 0.1 --out {0}", "demo"),
+        ("demo --worlds 1 --drones 1 --seconds 0.1 --out {0}", "demo"),
     ],
 )
 def test_a_command_names_the_extra_that_it_lacks(arguments, extra, tmp_path):
@@ -198,7 +159,7 @@ def test_a_command_names_the_extra_that_it_lacks(arguments, extra, tmp_path):
     text = done.stdout + done.stderr
     assert f"pip install 'crazysim[{extra}]'" in text
     assert "Traceback" not in text
-    assert done.returncode == (0 if extra == "demo" else 2), "a demonstration flies without its film"
+    assert done.returncode == (0 if extra == "demo" else 2), "the demo flies without plot and film"
     assert "1 worlds" not in text
     assert "1 drones" not in text
 

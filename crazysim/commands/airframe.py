@@ -27,7 +27,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         epilog="example: crazysim airframe new mine.toml --mass 1.2 --arm 0.12 --propeller 0.127 --thrust-to-weight 4",
         formatter_class=DefaultsFormatter,
     )
-    parser.set_defaults(run=new)
+    parser.set_defaults(run=estimate)
     add = parser.add_argument
     add("file", type=Path, help=".toml file to write")
     add("--mass", type=float, required=True, metavar="KG", help="mass with the battery")
@@ -51,7 +51,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--cells", type=int, metavar="N", help="battery cells in series; by default estimated")
     add("--capacity", type=float, metavar="AH", help="of the battery, A h; by default estimated")
     add("--resistance", type=float, metavar="OHM", help="of the whole battery; by default estimated")
-    add("--name", help="name of the airframe; by default that of the file")
+    add("--name", help="name of the airframe; by default the file's")
 
     text = "print what an airframe can do and what it lacks, and draw it"
     parser = actions.add_parser("check", help=text, formatter_class=DefaultsFormatter)
@@ -60,7 +60,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--picture", type=Path, metavar="FILE", help="picture of the body to write, .png")
 
 
-def new(options: argparse.Namespace) -> None:
+def estimate(options: argparse.Namespace) -> None:
     """Estimate an airframe, and write its file."""
     import tomllib
 

@@ -23,20 +23,20 @@ from crazysim.dynamics.models import require_freq
 from crazysim.errors import ConfigError, not_installed
 from crazysim.storage import replacing
 
-STATE = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
+STATE_CONTROLLERS = ("auto", "geometric", "indi", "lqr", "pid", "mellinger")
 """Controllers that follow state commands, besides Crazyflow's cascade."""
 QUARTER_TURN = np.pi / 2
 """Angle of the turn whose largest rate and duration are stated, rad."""
-WEAK = 1.5
+MIN_THRUST_TO_WEIGHT = 1.5
 """Thrust over weight below which a warning is given, 1."""
-SLUGGISH = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
+MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
 """Angular acceleration in hover below which a warning is given, rad/s^2: the least of the airframes of the tests."""
-UNSTABLE = 2.5
+MAX_PRECESSION_RATIO = 2.5
 """Precession over the bandwidth of the attitude loop above which ``auto`` may be unstable: of 1,960 random airframes
 with an odd number of rotors all up to 2.45 fly, and the one with 4.3 does not."""
-PRECESSION = 0.25
+MAX_PRECESSION_SHARE = 0.25
 """Part of the authority that the net momentum of the rotors takes at 1 rad/s, above which a warning is given, 1."""
-SLOW = 0.2
+MAX_TIME_CONSTANT = 0.2
 """Time constant of rotors above which a warning is given, s: the longest of the airframes of the tests."""
 FREQ = 500
 """Default rate of the physics, Hz."""
@@ -143,14 +143,19 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
     if Dynamics.first_principles not in dynamics:
         if dynamics:
             yield "  auto", "state, above the response of the fitted model"
-            yield f"  {Crazyflow.name}", _levels({"state": _lack(lambda: StateParams.create(airframe)), "attitude": ""})
+            yield (
+                f"  {Crazyflow.name}",
+                _levels({"state": _missing_parameters(lambda: StateParams.create(airframe)), "attitude": ""}),
+            )
         return
-    for name in STATE:
+    for name in STATE_CONTROLLERS:
         found: Any = find_controller(name)
-        lack = _lack(functools.partial(found.params, airframe))
+        lack = _missing_parameters(functools.partial(found.params, airframe))
         yield f"  {name}", _levels({", ".join(level.value for level in found.levels): lack})
     stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
-    lacks = {levels: _lack(functools.partial(params.create, airframe)) for levels, params in stages.items()}
+    lacks = {
+        levels: _missing_parameters(functools.partial(params.create, airframe)) for levels, params in stages.items()
+    }
     yield f"  {Crazyflow.name}", _levels(lacks)
 
 
@@ -161,7 +166,7 @@ def _levels(lacks: Mapping[str, str]) -> str:
     return "; ".join([followed or "none", *reasons])
 
 
-def _lack(create: Callable[[], Any]) -> str:
+def _missing_parameters(create: Callable[[], Any]) -> str:
     """Return the reason for which parameters cannot be made; empty if they can."""
     try:
         create()
@@ -174,37 +179,37 @@ def _lack(create: Callable[[], Any]) -> str:
 def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
     """Yield what is allowed and probably not meant."""
     positions, ratio = airframe.value("rotors.position"), _ratio(airframe)
-    if ratio < WEAK:
-        yield f"thrust over weight is {ratio:.2f}; below {WEAK:g} little is left for manoeuvres"
+    if ratio < MIN_THRUST_TO_WEIGHT:
+        yield f"thrust over weight is {ratio:.2f}; below {MIN_THRUST_TO_WEIGHT:g} little is left for manoeuvres"
     if np.linalg.norm(np.mean(positions[:, :2], axis=0)) > 0.05 * airframe.arm:
         yield "the middle of the rotors is beside the centre of mass: rotors differ in hover"
     if np.sum(airframe.value("rotors.yaw_torque_sign")):
         yield "more rotors turn one way than the other: their drag turns the drone in hover"
     if Dynamics.first_principles in dynamics:
-        yield from _slow(airframe)
+        yield from _agility_warnings(airframe)
     if not dynamics:
         yield "no dynamics: expected the curves of the rotors, or a table [fitted.NAME]"
 
 
-def _slow(airframe: Airframe) -> Iterator[str]:
+def _agility_warnings(airframe: Airframe) -> Iterator[str]:
     """Yield what makes flights slow, or steps of the default rate diverge."""
-    for (axis, least), acc in zip(SLUGGISH.items(), authority(airframe), strict=True):
+    for (axis, least), acc in zip(MIN_AUTHORITY.items(), authority(airframe), strict=True):
         if acc < least:
             seconds = 2 * np.sqrt(QUARTER_TURN / acc)
             yield f"{axis} has {acc:.2g} rad/s^2 in hover: a turn by 90 degrees takes {seconds:.2g} s at least"
-    if precession(airframe) > PRECESSION * np.min(authority(airframe)[:2]):
+    if precession(airframe) > MAX_PRECESSION_SHARE * np.min(authority(airframe)[:2]):
         yield (
             f"rotors turn one way more than the other: at 1 rad/s of roll or pitch their momentum takes "
             f"{precession(airframe):.2g} of {np.min(authority(airframe)[:2]):.2g} rad/s^2 about the other axis"
         )
     bandwidth = float(np.sqrt(Auto().params(airframe).stiffness[0]))
-    if precession(airframe) > UNSTABLE * bandwidth:
+    if precession(airframe) > MAX_PRECESSION_RATIO * bandwidth:
         yield (
             f"rotors turn one way more than the other: their momentum turns roll into pitch at "
             f"{precession(airframe):.2g} rad/s, against a bandwidth of controller 'auto' of {bandwidth:.2g} rad/s: it "
             f"may not hold the drone"
         )
-    if rotor_rate(airframe) * SLOW < 1:
+    if rotor_rate(airframe) * MAX_TIME_CONSTANT < 1:
         yield f"rotors lag by {1 / rotor_rate(airframe):.2g} s: a drone that is thrown takes long to recover"
     try:
         require_freq(airframe, Dynamics.first_principles, FREQ)

@@ -51,7 +51,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--out", type=Path, required=True, metavar="FILE", help=".toml file to write")
     add("--test", nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
-    add("--mass", type=float, metavar="KG", help="mass; by default that of the airframe")
+    add("--mass", type=float, metavar="KG", help="mass; by default the airframe's")
     add("--dynamics", choices=["first_principles", *FITTED], default="first_principles", help="model to fit")
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
     add("--iterations", type=int, default=1000, metavar="N", help="iterations of that training")
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
     if options.motion and len(options.motion) != len(paths):
         raise ValueError(
             f"expected motion capture of each of {len(paths)} logs, got {len(options.motion)} files. "
-            "Name them in the order of the logs, then of those of --test."
+            "Name them in the order of the logs, then of the logs of --test."
         )
     every = [
         read_log(path, columns, motion, between)
@@ -136,7 +136,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _part(text: str) -> tuple[str, tuple[float, float]]:
-    """Return path, start and end of ``LOG@START:END``, either of which may be left out."""
+    """Return path, start and end of ``LOG@START:END``; start and end may be left out."""
     found = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
     if found is None or Path(text).exists():
         return text, (0.0, math.inf)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import crazysim
-from crazysim import surroundings
+from crazysim import startup
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "gymnasium")
 """Packages that crazysim needs."""
@@ -115,7 +115,7 @@ def _nvrtc() -> str:
 def _cache() -> str:
     from crazysim import jaxcompat
     from crazysim.cache import default_cache
-    from crazysim.trust import distrust
+    from crazysim.storage import distrust
 
     configured = jaxcompat.cache_folder()
     folder = default_cache() if configured is None else Path(configured)
@@ -135,7 +135,7 @@ def _size(folder: Path) -> str:
 def _rendering() -> str:
     """Return the backend of OpenGL, and whether it draws; tried in a process of its own, which it can end."""
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
-    environment = os.environ | surroundings.refused
+    environment = os.environ | startup.refused
     backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"
     try:
         done = subprocess.run(
@@ -149,6 +149,6 @@ def _rendering() -> str:
 
 
 def _variables() -> str:
-    environment = os.environ | surroundings.refused
+    environment = os.environ | startup.refused
     given = [f"{name}={environment[name]}" for name in VARIABLES if name in environment]
     return ", ".join(given) or "none"

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given
+from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given_options
 from crazysim.errors import ConfigError
 
 
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
             "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
         )
     n_worlds, control_freq = options.worlds, options.control_freq
-    settings = given(options, "drone", "controller", "device")
+    settings = given_options(options, "drone", "controller", "device")
     sim = Sim(n_worlds, options.drones, control="state", freq=options.freq, state_freq=control_freq, **settings)
     with contextlib.ExitStack() as stack:
         live = stack.enter_context(Live(sim, control_freq, speed, options.fps))

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given
+from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given_options
 from crazysim.errors import ConfigError
 from crazysim.lab.show_files import Show, load_show
 from crazysim.storage import check_writable, write_file
@@ -28,7 +28,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     live = "fly in real time while --window or --browser shows it; no report of distances"
     add("--live", action="store_true", help=live)
     add("--report", type=Path, metavar="FILE", help="figures to write, .json")
-    add("--seconds", type=float, help="duration of the flight, s; by default that of the show")
+    add("--seconds", type=float, help="duration of the flight, s; by default the show's")
     add("--fps", type=float, default=25.0, help="frames per second of the film")
     add_simulation(parser)
 
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> None:
         if path is not None:
             check_writable(path, suffixes)
     show = load_show(options.file)
-    settings = given(options, "drone", "controller", "device")
+    settings = given_options(options, "drone", "controller", "device")
     if options.live:
         _run_live(show, options, settings)
         return

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from crazysim.commands.options import DefaultsFormatter, given
+from crazysim.commands.options import DefaultsFormatter, given_options
 from crazysim.storage import PICTURES, check_writable
 
 
@@ -20,10 +20,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     add = parser.add_argument
     task = "name of a task, such as hover, or place of your own, FILE.py:CLASS; list prints all names"
     add("task", help=task)
-    add("--algorithm", help="ppo or apg; by default that of the task's recipe")
+    add("--algorithm", help="ppo or apg; by default the recipe's")
     add("--seed", type=int, help="random seed; by default 0")
-    add("--worlds", type=int, help="number of parallel worlds; by default that of the task's recipe")
-    iterations = "number of rollouts, each with its updates; by default that of the task's recipe"
+    add("--worlds", type=int, help="number of parallel worlds; by default the recipe's")
+    iterations = "number of rollouts, each with its updates; by default the recipe's"
     add("--iterations", type=int, help=iterations)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume = "continue from the checkpoint in that folder, with its settings where none are given"
@@ -62,7 +62,7 @@ def _add_place(add: Any) -> None:
     """Add the options of a command that makes the environment of a run again."""
     place = "place of a task of your own, if it is not where it was in training"
     add("--task", metavar="FILE.py:CLASS", help=place)
-    add("--device", help="device: cpu, gpu; by default that of the training")
+    add("--device", help="device: cpu, gpu; by default the training's")
 
 
 def _pairs(texts: Sequence[str]) -> dict[str, Any]:
@@ -97,8 +97,8 @@ def train(options: argparse.Namespace) -> None:
         algorithm=options.algorithm,
         seed=options.seed,
         n_worlds=options.worlds,
-        options=_pairs(options.set) | given(options, "device"),
-        config=_pairs(options.config) | given(options, "iterations"),
+        options=_pairs(options.set) | given_options(options, "device"),
+        config=_pairs(options.config) | given_options(options, "iterations"),
     )
 
 
@@ -106,7 +106,7 @@ def evaluate(options: argparse.Namespace) -> None:
     """Print the figures of a policy."""
     import jax
 
-    from crazysim.train.evaluation import TERM, evaluate, outcome
+    from crazysim.train.evaluation import TERM_PREFIX, evaluate, outcome
     from crazysim.train.show import plot_episode
     from crazysim.train.training import load_policy
 
@@ -116,7 +116,7 @@ def evaluate(options: argparse.Namespace) -> None:
     env = config.with_device(options.device).make_env(options.worlds)
     key = None if options.seed is None else jax.random.key(options.seed)
     metrics = evaluate(env, policy, key)
-    terms = ", ".join(f"{k.removeprefix(TERM)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM))
+    terms = ", ".join(f"{k.removeprefix(TERM_PREFIX)} {x:.4g}" for k, x in metrics.items() if k.startswith(TERM_PREFIX))
     print(
         f"{config.title}, {options.worlds:,} starts: success {metrics['success']:.1%}, "
         f"{outcome(metrics, env.task.unit)}, mean return {metrics['reward']:.4g} ({terms})"

@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
         if section.missing:
             print(f"left out {section.name}: {section.missing}")
     pictures = _draw(chosen, rows, options.out.parent)
-    write_file(options.out, page(chosen, rows, _made(chosen), pictures))
+    write_file(options.out, page(chosen, rows, _provenance(chosen), pictures))
     for row in rows:
         if row.failed:
             print(f"failed: {row.what}: {row.problem or f'{row.text}, {bound_text(row.bound)} passes'}")
@@ -69,7 +69,7 @@ def _draw(chosen: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[
     return pictures
 
 
-def _made(chosen: Sequence[Section]) -> str:
+def _provenance(chosen: Sequence[Section]) -> str:
     """Return a sentence that says with what the page was made."""
     command = ["git", "-C", str(Path(crazysim.__file__).parent), "describe", "--always", "--dirty"]
     try:

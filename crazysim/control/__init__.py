@@ -13,7 +13,7 @@ from crazysim.control.state import StateParams, state2attitude
 from crazysim.control.switch import Switch
 from crazysim.dynamics.parameter_tables import load_controller_fn_params as load_fn_params
 from crazysim.dynamics.parameter_tables import load_controller_params as load_params
-from crazysim.lazy import lazy
+from crazysim.startup import lazy
 
 if TYPE_CHECKING:
     from crazysim.control.auto import Auto

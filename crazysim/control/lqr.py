@@ -26,7 +26,7 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.pytree import as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
-from crazysim.tables import numbers
+from crazysim.tables import read_numbers
 
 
 class LQRParams(RigidBodyParams):
@@ -104,7 +104,7 @@ def as_weights(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     Raises:
         ConfigError: If they are neither n numbers nor a symmetric matrix, not finite, or negative in any direction.
     """
-    array = numbers(f"weights {name}", weights, shapes=((n,), (n, n)), remedy=f"Give a diagonal of {n} numbers.")
+    array = read_numbers(f"weights {name}", weights, shapes=((n,), (n, n)), remedy=f"Give a diagonal of {n} numbers.")
     array = np.diag(array) if array.ndim == 1 else array
     is_symmetric = np.allclose(array, array.T)
     least, rounding = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()

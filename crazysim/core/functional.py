@@ -17,7 +17,7 @@ from crazysim.control import COMMAND_FIELDS, Control, Setpoint
 from crazysim.core.data import SimData, command_shape
 from crazysim.core.settings import check_flag
 from crazysim.core.stage import tick
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 
 FEEDFORWARD_FIELDS = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"
 """Entries of a feedforward with their units, for messages."""
@@ -113,9 +113,9 @@ def _part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.nda
         array, fits = np.zeros(0), False
     numbers = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
     if not (fits and numbers and (name == "yaw" or array.shape[-1:] == (3,))):
-        raise ConfigError(f"expected {name} as numbers that broadcast to shape {shape}, got {shown(value)}")
+        raise ConfigError(f"expected {name} as numbers that broadcast to shape {shape}, got {short_repr(value)}")
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
-        raise ConfigError(f"expected finite numbers as {name}, got {shown(value)}. Check its computation.")
+        raise ConfigError(f"expected finite numbers as {name}, got {short_repr(value)}. Check its computation.")
     return array
 
 

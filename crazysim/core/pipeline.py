@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 
 Pipeline = dict[str, Callable[..., Any]]
 
@@ -23,12 +23,12 @@ def check_pipeline(name: str, pipeline: object) -> Pipeline:
     """
     if not isinstance(pipeline, dict) or not pipeline:
         raise ConfigError(
-            f"expected {name} as a dict with a function for each name of a stage, got {shown(pipeline)}. Use "
+            f"expected {name} as a dict with a function for each name of a stage, got {short_repr(pipeline)}. Use "
             f"insert_fn_before or remove_fn of crazysim.core.pipeline to edit the present one."
         )
     for stage, fn in pipeline.items():
         if not isinstance(stage, str) or not callable(fn):
-            raise ConfigError(f"expected names and functions in {name}, got {shown(stage)}: {shown(fn)}")
+            raise ConfigError(f"expected names and functions in {name}, got {short_repr(stage)}: {short_repr(fn)}")
     return pipeline
 
 

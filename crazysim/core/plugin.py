@@ -19,9 +19,9 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import Setting, check_settings, setting, settings_of
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.pytree import PyTree, device_array
-from crazysim.tables import Shapes, bounds, numbers
+from crazysim.tables import Shapes, range_between, read_numbers
 
 P = TypeVar("P", bound="Plugin")
 R = TypeVar("R", bound=PyTree)
@@ -94,7 +94,7 @@ def parameter(
     ``derivative`` must read the number from the record, never from the field. Its range is checked as in
     ``setting``, and its shape by ``Plugin.filled`` or ``shapes``.
     """
-    declared = Setting(bounds(low, high, positive), True, per_axis, dtype, shapes)
+    declared = Setting(range_between(low, high, positive), True, per_axis, dtype, shapes)
     return dataclasses.field(default=default, metadata={"setting": declared})
 
 
@@ -148,7 +148,7 @@ def check_parameter(
     Raises:
         ConfigError: If the shape, the type or a value is invalid.
     """
-    allowed = bounds(low, high, positive)
+    allowed = range_between(low, high, positive)
     batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
     if core == (1,) and array.shape == batch:
         array = array[..., None]
@@ -160,7 +160,7 @@ def check_parameter(
             f"{(*batch, *core)} = (n_worlds, n_drones, {core[0]}) for each, got shape {array.shape} and type "
             f"{array.dtype}"
         )
-    array = numbers(name, array, allowed, whole=array.dtype.kind != "f")
+    array = read_numbers(name, array, allowed, whole=array.dtype.kind != "f")
     dtype = sim.data.states.pos.dtype if dtype is None else dtype
     return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
 
@@ -385,7 +385,9 @@ def plugin_list(name: str, plugins: Sequence[Plugin]) -> Sequence[Plugin]:
     """
     if not isinstance(plugins, (list, tuple)) or not all(isinstance(plugin, Plugin) for plugin in plugins):
         example = "IMU()" if name == "sensors" else "Wind()"
-        raise ConfigError(f"expected {name} as a list of plugins, got {shown(plugins)}. Use {name}=[{example}], say.")
+        raise ConfigError(
+            f"expected {name} as a list of plugins, got {short_repr(plugins)}. Use {name}=[{example}], say."
+        )
     return plugins
 
 

@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from crazysim.control import Control, Controller
 from crazysim.control.protocol import controller_chain
 from crazysim.control.switch import Switch
-from crazysim.errors import ConfigError, UnknownNameError, shown
-from crazysim.tables import ANY, Range, Shapes, bounds, numbers
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
+from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbers
 
 E = TypeVar("E", bound=Enum)
 
@@ -50,9 +50,9 @@ def positive_integer(name: str, value: object, at_most: int | None = None) -> in
         at_most: Largest value; None for any.
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ConfigError(f"{name} is {shown(value)}; it must be a positive whole number")
+        raise ConfigError(f"{name} is {short_repr(value)}; it must be a positive whole number")
     if at_most is not None and value > at_most:
-        raise ConfigError(f"{name} is {shown(value)}; it must be at most {at_most}")
+        raise ConfigError(f"{name} is {short_repr(value)}; it must be at most {at_most}")
     return int(value)
 
 
@@ -64,7 +64,7 @@ def check_flag(name: str, value: object) -> bool:
         value: The setting.
     """
     if not isinstance(value, (bool, np.bool_)):
-        raise ConfigError(f"expected {name} as True or False, got {shown(value)}")
+        raise ConfigError(f"expected {name} as True or False, got {short_repr(value)}")
     return bool(value)
 
 
@@ -83,7 +83,7 @@ TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
 class Setting(NamedTuple):
     """Values that a field of a record of settings may have."""
 
-    range: Range = ANY
+    range: Range = ANY_NUMBER
     """Range of its numbers."""
     is_parameter: bool = False
     """True for a field of a plugin that only fills numbers of its record."""
@@ -117,7 +117,9 @@ def setting(
         shapes: Shapes of an array, ``"any"`` for any length; None for all.
     """
     default = {"default": default} if default_factory is dataclasses.MISSING else {"default_factory": default_factory}
-    return dataclasses.field(**default, metadata={"setting": Setting(bounds(low, high, positive), shapes=shapes)})
+    return dataclasses.field(
+        **default, metadata={"setting": Setting(range_between(low, high, positive), shapes=shapes)}
+    )
 
 
 def color(n: bool = False) -> Any:
@@ -163,16 +165,16 @@ def check_settings(settings: Any) -> None:
             check_flag(name, value)
         elif kinds == {NumbersByName}:
             if not isinstance(value, Mapping):
-                raise ConfigError(f"expected {name} as a dict of numbers by name, got {shown(value)}. {remedy}")
+                raise ConfigError(f"expected {name} as a dict of numbers by name, got {short_repr(value)}. {remedy}")
             for key, item in value.items():
-                numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
+                read_numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
         elif kinds & NUMERIC_TYPES and not isinstance(value, classes):
             shapes = declared.shapes if np.ndarray in kinds or declared.is_parameter else ((),)
             whole = kinds & NUMERIC_TYPES == {int} or declared.dtype is not None
-            numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
+            read_numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
         elif not isinstance(value, classes):
             names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in kinds))
-            raise ConfigError(f"expected {name} as {names}, got {shown(value)}. {remedy}")
+            raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
 
 
 @functools.cache
@@ -217,7 +219,7 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
 
 def check_softness(freq: int, softness: ArrayLike) -> None:
     """Check the time constant with which an overlap is pushed out, s, at ``freq`` steps per second, Hz."""
-    numbers(
+    read_numbers(
         "softness", softness, Range(f"from two steps, {2 / freq:.4g} s, to {MAX_SOFTNESS:g}", 2 / freq, MAX_SOFTNESS)
     )
 
@@ -257,7 +259,7 @@ def find_device(device: str | jax.Device) -> jax.Device:
     platform, colon, index = device.partition(":") if isinstance(device, str) else ("", "", "")
     if not platform or (colon and not index.isdecimal()):
         raise ConfigError(
-            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {shown(device)}; use "
+            f"expected a platform such as 'cpu', 'gpu' or 'gpu:1', or a jax.Device, got {short_repr(device)}; use "
             f"device='cpu'"
         )
     try:
@@ -279,7 +281,7 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
         n: Number of things that may have a colour each, for (n, 4); None for one colour.
     """
     shapes = ((4,),) if n is None else ((4,), (n, 4))
-    return numbers("rgba", rgba, bounds(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
+    return read_numbers("rgba", rgba, range_between(0.0, 1.0), shapes, remedy="Use (1, 0, 0, 1) for red.")
 
 
 def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Array | None:

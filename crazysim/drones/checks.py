@@ -6,7 +6,7 @@ import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE, Airframe
 from crazysim.drones.keys import GUIDE, LAYOUT
-from crazysim.errors import AirframeWarning, ConfigError, shown, warn
+from crazysim.errors import AirframeWarning, ConfigError, short_repr, warn
 from crazysim.tables import INERTIA, check_numbers
 
 MAX_ROTORS = 64
@@ -59,7 +59,7 @@ def _inertia(airframe: Airframe) -> str | None:
     if not np.allclose(inertia, inertia.T, atol=0) or not np.all((moments >= INERTIA.low) & (moments <= INERTIA.high)):
         return (
             f"expected an inertia of three positive moments {INERTIA.text}, or a symmetric positive definite 3 x 3 "
-            f"matrix, got {shown(inertia.tolist())}"
+            f"matrix, got {short_repr(inertia.tolist())}"
         )
     excess = moments[2] / (moments[0] + moments[1]) - 1
     found = (
@@ -87,7 +87,9 @@ def _rotors(airframe: Airframe) -> str | None:
             f"{MAX_THRUST_TO_WEIGHT} times its weight, got {n} rotors of {low} to {high} N"
         )
     if set(signs.tolist()) != {-1.0, 1.0}:
-        return f"expected yaw_torque_sign as 1 or -1 for each rotor, and not all equal, got {shown(signs.tolist())}"
+        return (
+            f"expected yaw_torque_sign as 1 or -1 for each rotor, and not all equal, got {short_repr(signs.tolist())}"
+        )
     if not airframe.arm > 0:
         return "expected rotors beside the centre of mass, got all of them at x = y = 0"
     axes = "x and y" if n < 4 else "x, y and z"  # three rotors cannot hold the heading as well
@@ -95,13 +97,14 @@ def _rotors(airframe: Airframe) -> str | None:
     if np.linalg.matrix_rank(mixing, tol=MIN_LEVERAGE) < len(mixing):
         return (
             f"expected rotors whose thrusts lift the drone and turn it about {axes}, each alone, got positions (x, y) "
-            f"{shown(value('rotors.position')[:, :2].tolist())} m with yaw_torque_sign {shown(signs.tolist())}"
+            f"{short_repr(value('rotors.position')[:, :2].tolist())} m with "
+            f"yaw_torque_sign {short_repr(signs.tolist())}"
         )
     hover = np.linalg.pinv(mixing)[:, 0] * mass * GRAVITY_MAGNITUDE
     if not np.all((hover >= low) & (hover <= high)):
         return (
             f"expected rotors that keep the drone level in hover with {low} to {high} N each, got "
-            f"{shown(hover.round(4).tolist())} N, which their positions around the centre of mass need"
+            f"{short_repr(hover.round(4).tolist())} N, which their positions around the centre of mass need"
         )
     moments = np.linalg.eigvalsh(airframe.inertia)
     if airframe.arm * n * high / moments[0] > MAX_ANG_ACC:
@@ -128,7 +131,7 @@ def _curves(airframe: Airframe) -> str | None:
         if np.any(curves[:, 2] <= 0) or not np.all((low >= 0) & (low < high) & (high <= MAX_ROTOR_VEL)):
             return (
                 f"expected thrust_curve with a positive quadratic term, that rises from thrust_min to thrust_max "
-                f"between 0 and {MAX_ROTOR_VEL:g} rpm, got {shown(curves.tolist())}"
+                f"between 0 and {MAX_ROTOR_VEL:g} rpm, got {short_repr(curves.tolist())}"
             )
         if "rotors.torque_curve" in numbers:
             k0, k1, k2 = np.atleast_2d(numbers["rotors.torque_curve"]).T
@@ -138,7 +141,7 @@ def _curves(airframe: Airframe) -> str | None:
             if not np.all(k1 + 2 * k2 * hover > 0):
                 return (
                     f"expected torque_curve that rises at the speed of hover, got "
-                    f"{shown(np.atleast_2d(numbers['rotors.torque_curve']).tolist())}"
+                    f"{short_repr(np.atleast_2d(numbers['rotors.torque_curve']).tolist())}"
                 )
             if not np.all((torques >= 0) & (torques <= most)):
                 return (
@@ -150,7 +153,7 @@ def _curves(airframe: Airframe) -> str | None:
         if np.any(lag[:, 0::2] + lag[:, 1::2] == 0):
             return (
                 f"expected lag with a positive linear or quadratic term on spin-up and on spin-down, without which a "
-                f"rotor never reaches its speed, got {shown(lag.tolist())}"
+                f"rotor never reaches its speed, got {short_repr(lag.tolist())}"
             )
     return None
 
@@ -164,7 +167,7 @@ def _forces(airframe: Airframe) -> str | None:
             path in numbers
             and np.max(np.linalg.eigvalsh((airframe.matrix(path) + airframe.matrix(path).T) / 2)) > 1e-12
         ):
-            return f"expected {path} that brakes, so negative or zero, got {shown(numbers[path].tolist())}"
+            return f"expected {path} that brakes, so negative or zero, got {short_repr(numbers[path].tolist())}"
     for model in airframe.tables.get("fitted", {}):
         known = [numbers.get(f"fitted.{model}.{key}") for key in ("acc_coef", "cmd_f_coef")]
         if known[0] is not None and known[1] is not None and known[0] + known[1] * most <= weight:

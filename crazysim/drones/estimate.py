@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.drones.checks import MAX_ROTORS
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import is_file
-from crazysim.tables import POSITIVE, number
+from crazysim.tables import POSITIVE, read_number
 
 AIR_DENSITY = 1.225
 """Density of air at sea level in the standard atmosphere, kg/m^3."""
@@ -151,7 +151,7 @@ def estimate_airframe(
         ("resistance", resistance),
     ):
         if value is not None:
-            number(key, value, POSITIVE)
+            read_number(key, value, POSITIVE)
     file = _File(name)
     places, signs = _rotors(file, arm, n_rotors, layout, positions, spins, propeller)
     file.add("rigid_body", "mass", mass, "kg", "given")
@@ -221,7 +221,7 @@ def _string(text: str) -> str:
     """Return a TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     if not escaped.isprintable():
-        raise ConfigError(f"expected a name of printable characters, got {shown(text)}")
+        raise ConfigError(f"expected a name of printable characters, got {short_repr(text)}")
     return f'"{escaped}"'
 
 
@@ -246,7 +246,7 @@ def _rotors(
         raise ConfigError("expected either arm, with n_rotors and layout, or positions. Use arm=0.11 for a quadrotor.")
     if positions is None:
         if layout not in ("x", "+"):
-            raise ConfigError(f"expected layout as 'x' or '+', got {shown(layout)}. Use positions for any other.")
+            raise ConfigError(f"expected layout as 'x' or '+', got {short_repr(layout)}. Use positions for any other.")
         if not 4 <= n_rotors <= MAX_ROTORS or n_rotors % 2:
             raise ConfigError(
                 f"expected an even number of rotors from 4 to {MAX_ROTORS}, which alternate, got {n_rotors}. Use "
@@ -278,7 +278,9 @@ def _rotors(
         spins = [1, -1] * (len(places) // 2)
     turning = np.asarray(spins)
     if turning.shape != (len(places),) or not np.all(np.isin(turning, (1, -1))) or abs(np.sum(turning)) == len(places):
-        raise ConfigError(f"expected spins of 1 and -1 for {len(places)} rotors, and not all equal, got {shown(spins)}")
+        raise ConfigError(
+            f"expected spins of 1 and -1 for {len(places)} rotors, and not all equal, got {short_repr(spins)}"
+        )
     return places, -turning
 
 
@@ -370,14 +372,16 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
     found: dict[str, NDArray] = {}
     for key, values in columns.items():
         if str(key).strip().lower() not in COLUMNS:
-            raise ConfigError(f"expected columns of a motor table among {known}, got {shown(key)}")
+            raise ConfigError(f"expected columns of a motor table among {known}, got {short_repr(key)}")
         quantity, factor = COLUMNS[str(key).strip().lower()]
         try:
             array = np.asarray(values, float) * factor
         except ValueError as error:
             raise ConfigError(f"expected numbers in column {key!r} of the motor table, got {error}") from error
         if array.ndim != 1 or not len(array) or not np.all(np.isfinite(array)) or np.any(array < 0):
-            raise ConfigError(f"expected finite numbers of at least 0 in column {key!r}, got {shown(array.tolist())}")
+            raise ConfigError(
+                f"expected finite numbers of at least 0 in column {key!r}, got {short_repr(array.tolist())}"
+            )
         same = found.setdefault(quantity, array)
         if same.shape == array.shape and np.any(np.abs(same - array) > TABLE_ERROR * np.max(same)):
             k = int(np.argmax(np.abs(same - array)))
@@ -386,7 +390,7 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
                 f"{array[k]:.4g} in row {k + 1}, in SI units. Remove the column that is wrong."
             )
     if "thrust" not in found or not np.max(found["thrust"]) > 0:
-        raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {shown(list(columns))}")
+        raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {short_repr(list(columns))}")
     if len({len(array) for array in found.values()}) != 1:
         raise ConfigError("expected columns of equal lengths in the motor table")
     if "rpm" in found:

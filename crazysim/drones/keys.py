@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from crazysim.tables import (
+    COORDINATE,
     LENGTH,
     MASS,
     NEGATIVE,
     NOT_NEGATIVE,
-    PLACE,
     POSITIVE,
     Key,
     Layout,
@@ -23,7 +23,7 @@ _MATRIX: Shapes = ((3,), (3, 3))
 _SIGN = Range("1 or -1 for each rotor", -1.0, 1.0)
 _GAIN, _GAINS = Key(_NUMBER, NOT_NEGATIVE), Key(_VECTOR, NOT_NEGATIVE)
 _POSITIVE = Key(_NUMBER, POSITIVE)
-_FAR = 3 * (PLACE.low,)
+_FAR = 3 * (COORDINATE.low,)
 _SIZE, _SIZES = Key(_NUMBER, LENGTH), Key(_VECTOR, LENGTH)
 _RESPONSE = {
     "acc_coef": Key(_NUMBER),
@@ -37,7 +37,7 @@ _PID = dict.fromkeys(("kp", "ki", "kd"), _GAINS)
 TABLES: dict[str, dict[str, Key]] = {
     "rigid_body": {"mass": Key(_NUMBER, MASS), "inertia": Key(_MATRIX)},
     "rotors": {
-        "position": Key((("n", 3),), PLACE),
+        "position": Key((("n", 3),), COORDINATE),
         "yaw_torque_sign": Key((("n",),), _SIGN),
         "thrust_min": Key(_NUMBER, NOT_NEGATIVE),
         "thrust_max": _POSITIVE,
@@ -88,20 +88,20 @@ TABLES: dict[str, dict[str, Key]] = {
     "shape": {
         "plate": _SIZES,
         "battery": _SIZES,
-        "battery_height": Key(_NUMBER, PLACE),
+        "battery_height": Key(_NUMBER, COORDINATE),
         "arm_radius": _SIZE,
         "motor_radius": _SIZE,
         "motor_height": _SIZE,
         "propeller_radius": _SIZE,
-        "propeller_height": Key(_NUMBER, PLACE),
+        "propeller_height": Key(_NUMBER, COORDINATE),
         "led_radius": _SIZE,
-        "led_heights": Key(((2,),), PLACE),
+        "led_heights": Key(((2,),), COORDINATE),
         "collision_sphere": Key(((4,),), Range("three coordinates and a positive radius, m", (*_FAR, LENGTH.low), 1e3)),
         "collision_box": Key(
             ((6,),), Range("three coordinates and three positive half sizes, m", (*_FAR, *3 * (LENGTH.low,)), 1e3)
         ),
-        "fpv_camera": Key(_VECTOR, PLACE),
-        "track_camera": Key(_VECTOR, PLACE),
+        "fpv_camera": Key(_VECTOR, COORDINATE),
+        "track_camera": Key(_VECTOR, COORDINATE),
     },
 }
 """All tables by dotted path, with the keys of each."""

@@ -13,7 +13,7 @@ from crazysim.drones.airframe import TUNED, Airframe, AirframeSource, airframe_n
 from crazysim.drones.checks import check_airframe
 from crazysim.drones.keys import LAYOUT
 from crazysim.storage import is_file
-from crazysim.tables import extended, read_source
+from crazysim.tables import extend_bases, read_source
 
 FOLDER = Path(__file__).parent
 BODY = (
@@ -53,7 +53,7 @@ def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
     """Return the airframe of a source, which is the base of others."""
     if isinstance(source, Airframe):
         return source
-    bases = extended(bases, source)
+    bases = extend_bases(bases, source)
     stem, origin, tables = read_source(source, "drone", "an Airframe", FOLDER, airframe_names(), LAYOUT.guide)
     name = str(tables.get("name", stem))
     numbers, why = dict(LAYOUT.numbers(f"airframe {name!r}{origin}", tables)), ""

@@ -25,7 +25,7 @@ from crazysim.engine.host_call import HostLeaves
 from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.lowering.relative import view_leaves
 from crazysim.engine.plan import ENGINES, Plan, Planner, SeparateLeaves
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import check_axes, lazy
 
 
@@ -333,7 +333,9 @@ def _check_steps(n_steps: Any) -> None:
     is_array = isinstance(n_steps, (jax.Array, np.ndarray, np.generic))
     is_integer = jnp.issubdtype(n_steps.dtype, jnp.integer) if is_array else isinstance(n_steps, int)
     if not is_integer or isinstance(n_steps, bool) or np.shape(n_steps):
-        raise ConfigError(f"expected a number of steps as one integer, got {shown(n_steps)}. Use 5, or jnp.int32(5).")
+        raise ConfigError(
+            f"expected a number of steps as one integer, got {short_repr(n_steps)}. Use 5, or jnp.int32(5)."
+        )
     if isinstance(n_steps, jax.core.Tracer):
         return
     if int(n_steps) < 0:

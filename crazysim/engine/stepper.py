@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from crazysim.cache import announced
+from crazysim.cache import announce_if_slow
 from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import put_command, stage_command
 from crazysim.core.pipeline import Pipeline
@@ -132,7 +132,7 @@ class Stepper:
         """Advance the data; any number of steps uses the same compilation."""
         self.count(n_steps)
         compiles, self._compiled = self._compiled is not self.step, self.step
-        with announced("compiling the step", "5 to 40 s", ANNOUNCED_AFTER) if compiles else nullcontext():
+        with announce_if_slow("compiling the step", "5 to 40 s", ANNOUNCED_AFTER) if compiles else nullcontext():
             flat = self._data if isinstance(self._data, FlatData) else self.step.flatten(self.data)
             if flat.plan.host_call is None:
                 after = self.step.advance(flat, self._as_array(n_steps))

@@ -30,7 +30,7 @@ from crazysim.envs.wrappers import (
     RewardTerms,
     Wrapper,
 )
-from crazysim.lazy import lazy
+from crazysim.startup import lazy
 
 if TYPE_CHECKING:
     from crazysim.envs.brax import BraxEnv

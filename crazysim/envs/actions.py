@@ -18,13 +18,13 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import scopes
 from crazysim.rotation import safe_clip
 
-TILT = np.pi / 4
+MAX_TILT = np.pi / 4
 """Largest roll and pitch of an action, rad."""
-YAW = np.pi / 2
+MAX_YAW = np.pi / 2
 """Largest yaw of an action, rad."""
-RATES = (10.0, 10.0, 4.0)
+MAX_BODY_RATES = (10.0, 10.0, 4.0)
 """Largest body rates of an action, rad/s."""
-REACH = (2.0, 2.0, 1.0)
+MAX_OFFSET = (2.0, 2.0, 1.0)
 """Largest distance of a position setpoint from 1 m above the origin, m."""
 
 
@@ -47,10 +47,12 @@ class Actions:
     """
 
     def __init__(self, centre: np.ndarray, scale: np.ndarray, control: Control):
-        """Take the map, in the units of the command level. (k,) each, or (n_drones, k) where drones differ
+        """Create a map.
 
-        Raises:
-            ConfigError: If the two do not have the same shape.
+        Args:
+            centre: Command at a zero action, in the units of the command level. (k,), or (n_drones, k) if drones differ
+            scale: Change of the command per unit of action. Same shape
+            control: Command level.
         """
         self.centre, self.scale, self.control = np.asarray(centre, float), np.asarray(scale, float), control
         if self.centre.shape != self.scale.shape or self.centre.ndim not in (1, 2):
@@ -80,24 +82,24 @@ class Actions:
         return f"{self.control.value} ({what}): {self.centre - self.scale} to {self.centre + self.scale}"
 
 
-def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = TILT) -> Actions:
+def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = MAX_TILT) -> Actions:
     """Return the usual map of a command level; see ``Actions``.
 
     Args:
         airframe: Airframe of all drones, or of each, for the limits of the rotors.
-        params: Parameters, for the hover command; where drones of one airframe have their own, those of the first are
+        params: Parameters, for the hover command. If drones of one airframe have different ones, the first drone's are
             used.
         control: Command level.
         tilt: Largest roll and pitch of the attitude level, rad.
     """
     airframes = as_airframes(airframe)
     if all(other is airframes[0] for other in airframes):
-        return _of_drone(airframes[0], params, control, tilt, 0)
-    each = [_of_drone(one, params, control, tilt, k) for k, one in enumerate(airframes)]
+        return _drone_actions(airframes[0], params, control, tilt, 0)
+    each = [_drone_actions(one, params, control, tilt, k) for k, one in enumerate(airframes)]
     return Actions(np.stack([one.centre for one in each]), np.stack([one.scale for one in each]), control)
 
 
-def _of_drone(airframe: Airframe, params: SimParams, control: Control, tilt: float, drone: int) -> Actions:
+def _drone_actions(airframe: Airframe, params: SimParams, control: Control, tilt: float, drone: int) -> Actions:
     """Return the map of one drone of the first world."""
     params = jax.tree.map(lambda scope, x: fetch_rows(x, (0, drone)) if scope == "drone" else x, scopes(params), params)
     n_rotors = airframe.n_rotors
@@ -105,11 +107,11 @@ def _of_drone(airframe: Airframe, params: SimParams, control: Control, tilt: flo
     hover = float(hover_thrust(params)[0])
     span = n_rotors * each - hover
     if control == Control.attitude:
-        return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, YAW, span]), control)
+        return Actions(np.array([0, 0, 0, hover]), np.array([tilt, tilt, MAX_YAW, span]), control)
     if control == Control.body_rate:
-        return Actions(np.array([0, 0, 0, hover]), np.array([*RATES, span]), control)
+        return Actions(np.array([0, 0, 0, hover]), np.array([*MAX_BODY_RATES, span]), control)
     if control == Control.state:
-        return Actions(np.array([0, 0, 1.0]), np.array(REACH), control)
+        return Actions(np.array([0, 0, 1.0]), np.array(MAX_OFFSET), control)
     if control == Control.force_torque:
         most = each / 2 * torque_arms(airframe) * np.abs(airframe.mixing_matrix).sum(axis=-1)
         return Actions(np.array([hover, 0, 0, 0]), np.array([span, *most / 4]), control)

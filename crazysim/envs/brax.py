@@ -32,7 +32,7 @@ class State(PyTree):
 
 
 class BraxEnv:
-    """Brax's interface to a functional environment: ``reset(rng) -> State``, ``step(state, action) -> State``.
+    """Brax's interface to a functional environment without automatic resets.
 
     Brax batches an environment of one world with ``vmap``. Here the worlds are batched already, so this class
     corresponds to an environment after Brax's ``training.wrap``: keys, observations and actions have an axis of worlds,
@@ -42,11 +42,6 @@ class BraxEnv:
     """
 
     def __init__(self, env: Env):
-        """Take the functional environment, without automatic resets.
-
-        Raises:
-            ConfigError: If it resets automatically.
-        """
         self.env = AutoReset(env)
         self.sim = env.sim
         shapes = jax.eval_shape(env.reset, jax.random.key(0))
@@ -60,7 +55,7 @@ class BraxEnv:
 
     @property
     def action_size(self) -> int:
-        """Size of the action of a world, which is that of all its drones."""
+        """Size of the action of a world: of all its drones together."""
         return self._action_shape[1] * self._action_shape[2]
 
     @property
@@ -88,16 +83,13 @@ class BraxEnv:
         Args:
             rng: A key, or one per world as Brax passes them, typed or not. The first one seeds all worlds, each of
                 which draws its own numbers.
-
-        Raises:
-            ValueError: If it is neither.
         """
-        state = self.env.reset(self._key(rng))
+        state = self.env.reset(self._seed_key(rng))
         zeros = jnp.zeros(self.sim.n_worlds, state.reward.dtype)
-        metrics = {"error": self._mean(state.info["error"])}
+        metrics = {"error": self._mean_over_drones(state.info["error"])}
         episode = {"sum_reward": zeros, "length": zeros} | dict.fromkeys(metrics, zeros)
         info = {"steps": zeros, "truncation": zeros, "episode_done": zeros, "episode_metrics": episode}
-        return State(state, self._flat(state.obs), zeros, zeros, metrics, info)
+        return State(state, self._flatten_obs(state.obs), zeros, zeros, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
         """Return all worlds one step later.
@@ -105,9 +97,6 @@ class BraxEnv:
         Args:
             state: State of all worlds.
             action: Action in [-1, 1], drone after drone. (n_worlds, action_size)
-
-        Raises:
-            ValueError: If the action has another shape.
         """
         needed = (self.sim.n_worlds, self.action_size)
         if jnp.shape(action) != needed:
@@ -117,8 +106,8 @@ class BraxEnv:
             )
         inner = self.env.step(state.pipeline_state, jnp.reshape(action, self._action_shape))
         dtype = state.reward.dtype
-        done, reward = inner.done.astype(dtype), self._mean(inner.reward)
-        metrics = {"error": self._mean(inner.info["error"])}
+        done, reward = inner.done.astype(dtype), self._mean_over_drones(inner.reward)
+        metrics = {"error": self._mean_over_drones(inner.info["error"])}
         continues = 1 - state.done
         results = {"sum_reward": reward, "length": jnp.ones_like(reward)} | metrics
         before = state.info["episode_metrics"]
@@ -130,14 +119,14 @@ class BraxEnv:
         }
         return state.replace(
             pipeline_state=inner,
-            obs=self._flat(inner.obs),
+            obs=self._flatten_obs(inner.obs),
             reward=reward,
             done=done,
             metrics=state.metrics | metrics,
             info=state.info | info,
         )
 
-    def _key(self, rng: Array) -> Array:
+    def _seed_key(self, rng: Array) -> Array:
         """Return the key that seeds all worlds."""
         n_worlds, typed = self.sim.n_worlds, jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         shape = rng.shape if typed else rng.shape[:-1]
@@ -151,8 +140,8 @@ class BraxEnv:
         return rng[0] if shape else rng
 
     @staticmethod
-    def _mean(x: Array) -> Array:
+    def _mean_over_drones(x: Array) -> Array:
         return jnp.mean(x, axis=1)
 
-    def _flat(self, obs: Obs) -> Array:
+    def _flatten_obs(self, obs: Obs) -> Array:
         return flatten(obs).reshape(self.sim.n_worlds, -1)

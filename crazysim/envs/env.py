@@ -21,10 +21,10 @@ from crazysim.eager import is_traced
 from crazysim.engine.step import FlatData, Step
 from crazysim.engine.tools.explain import explain
 from crazysim.envs.actions import Actions, actions_of
+from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
-from crazysim.envs.phases import Phases, all_worlds, select_states
+from crazysim.envs.phases import Phases, select_states, vectorize_over_worlds
 from crazysim.envs.reset_policy import ResetPolicy
-from crazysim.envs.resets import Resets
 from crazysim.envs.state import NAME, OUTPUTS, EnvState, state_of_data, validate_action
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
@@ -37,7 +37,7 @@ class Env(ABC):
     """An environment of all worlds, wrapped or not. Its functions are pure, for jit, scan, vmap and grad.
 
     A step has four phases: ``act`` stages the command of an action, the physics advances the simulation, ``observe``
-    evaluates the task, and ``begin`` starts new episodes where one is over, if ``AutoReset`` is around it.
+    evaluates the task, and, inside ``AutoReset``, ``reset_episode`` starts a new episode where one is over.
     """
 
     @property
@@ -90,9 +90,9 @@ class Env(ABC):
             self.wrappers,
             base.sim.n_drones,
             last_step,
-            base.resets,
+            base.episode_reset,
             self.reset_policy,
-            base.measured,
+            base.measure_states,
         )
 
     @functools.cached_property
@@ -101,7 +101,7 @@ class Env(ABC):
         batched = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
         batched += [f"task {self.task.name!r}"] if self.task.batched else []
         why = f"{', '.join(batched)} is declared to need all worlds at once" if batched else None
-        if self.base.resets.foreign:
+        if self.base.episode_reset.has_foreign_record:
             why = "a record in data.plugins is of another library, and is not divided among worlds"
         physics = self.base.physics
         return physics.with_stages(self.phases.stages(physics.stages, why))
@@ -122,9 +122,9 @@ class Env(ABC):
             data = self.base.initial_data(key)
             for wrapper in self.wrappers:
                 data = wrapper.prepare(data)
-            state = self._complete(self.begin(state_of_data(data)))
-        if not is_traced([state.whole.states.pos]):
-            state = EnvState(put_on_device(state.whole, self.sim.device)) if self.sim.mesh is None else state
+            state = self._add_step_results(self._reset_episodes(state_of_data(data)))
+        if not is_traced([state.full_data.states.pos]):
+            state = EnvState(put_on_device(state.full_data, self.sim.device)) if self.sim.mesh is None else state
             require_finite_start(self.task, state)
         return state
 
@@ -134,15 +134,12 @@ class Env(ABC):
         Args:
             state: The state of all worlds.
             mask: True where a new episode begins; None for all. (n_worlds,)
-
-        Raises:
-            ConfigError: If the mask has another shape or type.
         """
-        steps = state.whole.core.steps
+        steps = state.full_data.core.steps
         with default_device_of(steps):
             mask = as_mask(mask, steps.shape[:1])
-            new = self.begin(state)
-            new = new if self.reset_policy is None else self.reset_policy.end(new)
+            new = self._reset_episodes(state)
+            new = new if self.reset_policy is None else self.reset_policy.after_step(new)
             return select_states(mask, new, state)
 
     def step(self, state: EnvState, action: Array) -> EnvState:
@@ -153,22 +150,19 @@ class Env(ABC):
         Args:
             state: The state of all worlds.
             action: Action of every drone, clipped to [-1, 1]. (n_worlds, n_drones, k)
-
-        Raises:
-            ValueError: If the action has another shape.
         """
-        self._require_own(state)
-        with default_device_of(state.whole.core.steps):
+        self._check_reset_mode(state)
+        with default_device_of(state.full_data.core.steps):
             action = validate_action(action, state, self.actions)
-            after = self.step_fn(state.replace(next_action=action).whole, self.n_substeps, ())
+            after = self.step_fn(state.replace(next_action=action).full_data, self.n_substeps, ())
             return EnvState(after).replace(next_action=state.record.next_action)
 
     def flatten(self, state: EnvState) -> FlatData:
         """Return the state as flat data for ``advance``, which is faster in a loop than ``step``."""
-        self._require_own(state)
-        record = leaf_indices(state.whole).plugins[NAME]
+        self._check_reset_mode(state)
+        record = leaf_indices(state.full_data).plugins[NAME]
         outputs = jax.tree.leaves([getattr(record, name) for name in OUTPUTS])
-        return self.step_fn.flatten(state.whole, (), self.n_substeps, frozenset(outputs))
+        return self.step_fn.flatten(state.full_data, (), self.n_substeps, frozenset(outputs))
 
     def advance(self, flat: FlatData, action: Array) -> FlatData:
         """Return flat data one environment step later; ``EnvState(flat.data())`` is its state.
@@ -180,12 +174,8 @@ class Env(ABC):
         flat = flat.replace([flat.plan.numbers.plugins[NAME].next_action], [action])
         return self.step_fn.advance(flat, self.n_substeps)
 
-    def _require_own(self, state: EnvState) -> None:
-        """Check that a state has the structure that steps of this environment return.
-
-        Raises:
-            ConfigError: If it is of an environment with another mode of automatic resets.
-        """
+    def _check_reset_mode(self, state: EnvState) -> None:
+        """Check that a state has the structure that steps of this environment return."""
         expected = self.reset_policy is not None and self.reset_policy.keeps_final_obs
         if expected != ("final_obs" in state.record.drone_info):
             raise ConfigError(
@@ -193,36 +183,36 @@ class Env(ABC):
                 f"of another mode of automatic resets. Use its own reset."
             )
 
-    def begin(self, state: EnvState) -> EnvState:
+    def _reset_episodes(self, state: EnvState) -> EnvState:
         """Return the state with new episodes in all worlds."""
-        state = self.phases.begin(state, self.base.resets.default_of(state.data), all_worlds)
-        core = state.whole.core.replace(mjx_synced=jnp.asarray(False))
-        whole = state.whole.replace(core=core)
-        return EnvState(whole if self.sim.mesh is None else shard(whole, self.sim.mesh))
+        state = self.phases.reset_episode(state, self.base.episode_reset.default_for(state.data), vectorize_over_worlds)
+        core = state.full_data.core.replace(mjx_synced=jnp.asarray(False))
+        full_data = state.full_data.replace(core=core)
+        return EnvState(full_data if self.sim.mesh is None else shard(full_data, self.sim.mesh))
 
-    def _complete(self, state: EnvState) -> EnvState:
+    def _add_step_results(self, state: EnvState) -> EnvState:
         """Return the state at the start of the first episode with everything that a step adds, as zeros."""
-        state = state if self.reset_policy is None else self.reset_policy.end(state)
-        state = state.replace(next_action=jnp.zeros_like(state.action), over=jnp.zeros_like(state.terminated))
+        state = state if self.reset_policy is None else self.reset_policy.after_step(state)
+        state = state.replace(next_action=jnp.zeros_like(state.action), must_reset=jnp.zeros_like(state.terminated))
         leaves, treedef = jax.tree.flatten(state)
         key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]))
-        if key not in self._after:
-            self._after[key] = jax.eval_shape(self.phases.outline, state)
-        after = self._after[key]
+        if key not in self._stepped_shapes:
+            self._stepped_shapes[key] = jax.eval_shape(self.phases.outline, state)
+        after = self._stepped_shapes[key]
         missing = {k: x for k, x in after.info.items() if k not in state.info}
         state = state.replace(info=state.info | jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), missing))
         check_record(state, after)
         return state
 
     @functools.cached_property
-    def _after(self) -> dict[Any, EnvState]:
+    def _stepped_shapes(self) -> dict[Any, EnvState]:
         """Shapes and types of the state after a step, by those at the start of an episode."""
         return {}
 
     def explain(self) -> str:
         """Return how a step is executed, as ``Sim.explain`` does for a step of the physics."""
         state = jax.eval_shape(self.reset, jax.random.key(0))
-        return explain(self.step_fn, state.whole, zeros=())
+        return explain(self.step_fn, state.full_data, zeros=())
 
     def target(self, state: EnvState) -> Array | None:
         """Return the place where each drone should be, or several marks, for images, m; None if the task has none.
@@ -230,7 +220,7 @@ class Env(ABC):
         Returns:
             (n_worlds, n_drones, 3) or (n_worlds, n_drones, n_marks, 3)
         """
-        return self._of_task(self.task.target, state)
+        return self._evaluate_task(self.task.target, state)
 
     def subjects(self, state: EnvState) -> Array | None:
         """Return points that films hold in view besides drones and marks, m; None if the task has none.
@@ -238,7 +228,7 @@ class Env(ABC):
         Returns:
             (n_worlds, n_points, 3)
         """
-        return self._of_task(self.task.subjects, state)
+        return self._evaluate_task(self.task.subjects, state)
 
     def succeeded(self, state: EnvState) -> Array | None:
         """Return true where a drone has succeeded; None if success is an error that stays small.
@@ -246,17 +236,17 @@ class Env(ABC):
         Returns:
             (n_worlds, n_drones)
         """
-        return self._of_task(self.task.succeeded, state)
+        return self._evaluate_task(self.task.succeeded, state)
 
-    def _of_task(self, fn: Callable[[SimData], Any], state: EnvState) -> Any:
-        return all_worlds(fn, self.task.batched)(state.data)
+    def _evaluate_task(self, fn: Callable[[SimData], Any], state: EnvState) -> Any:
+        return vectorize_over_worlds(fn, self.task.batched)(state.data)
 
 
 class DroneEnv(Env):
     """Many worlds of one task. Episodes that are over continue; ``AutoReset`` begins new ones."""
 
     def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None, measured: bool = False):
-        """Take a simulation in which the task is installed.
+        """Create an environment of a simulation in which the task is installed.
 
         Args:
             sim: The simulation, after ``task.install(sim)``; episodes begin from ``sim.default_data``.
@@ -265,11 +255,6 @@ class DroneEnv(Env):
             actions: Meaning of an action; None for ``actions_of``.
             measured: True for observations of the states as the sensors of the simulation measure them. Rewards and
                 ends of episodes are of the true states.
-
-        Raises:
-            ConfigError: If the task is not installed, lacks a method, or observes or rewards in a wrong shape; if a
-                rate does not divide, or the controller runs less often than actions come; if no plugin measures states
-                although ``measured`` is true.
         """
         freq = positive_integer("freq", freq)
         require_installed(sim, task)
@@ -286,9 +271,9 @@ class DroneEnv(Env):
         self._sim, self._task, self.freq = sim, task, freq
         self._actions = actions_of(sim.airframes, sim.default_data.params, sim.control) if actions is None else actions
         check_task(task, sim.default_data, self._actions.size)
-        self.measured: Callable[[SimData], SimData] | None = None
-        """``measured(data)``: the data with measured states, of one world, or of all worlds for a task that is batched;
-        None if the task observes the true ones."""
+        self.measure_states: Callable[[SimData], SimData] | None = None
+        """``measure_states(data)``: the data with measured states, of one world, or of all if the task is batched;
+        None if the task observes the true states."""
         if measured:
             if not any(type(plugin).measured_states is not Plugin.measured_states for plugin in sim.plugins.values()):
                 raise ConfigError(
@@ -296,7 +281,7 @@ class DroneEnv(Env):
                     "sim.add(MotionCapture()) before the environment is made, or make(..., sensors=[MotionCapture()])."
                 )
             of_world = sim.plugins.measured_states
-            self.measured = vmap_worlds(of_world) if task.batched else of_world
+            self.measure_states = vmap_worlds(of_world) if task.batched else of_world
         self._n_substeps = sim.freq // freq
         self._max_steps = round(task.seconds * freq)
         if self._max_steps < 1:
@@ -306,55 +291,43 @@ class DroneEnv(Env):
             )
         sim.plugins.check()
         if NAME in sim.plugins:
-            raise ConfigError(f"expected no plugin of the name {NAME!r}, which is that of the environment's record")
+            raise ConfigError(f"expected no plugin of the name {NAME!r}, which the environment's record has")
         self.physics = sim.build_step_fn().without_stages(sim.plugins.reset_stages)  # every episode begins by a reset
         """The step of the physics."""
-        self.resets = Resets(sim)
+        self.episode_reset = EpisodeReset(sim)
         """Resets of data at the start of an episode."""
-        self._plugins, self._beginning = tuple(sim.plugins.values()), _beginning(sim)
+        self._plugins, self._default_arrays = tuple(sim.plugins.values()), _default_arrays(sim)
 
     @property
     def base(self) -> DroneEnv:
-        """The environment itself."""
         return self
 
     @property
     def wrappers(self) -> tuple[Hooks, ...]:
-        """No wrappers, ``()``."""
         return ()
 
     @property
     def sim(self) -> Sim:
-        """The simulation it was made from; it is used for drawing, and does not advance."""
         return self._sim
 
     @property
     def task(self) -> Task:
-        """The task."""
         return self._task
 
     @property
     def actions(self) -> Actions:
-        """Meaning of an action."""
         return self._actions
 
     @property
     def n_substeps(self) -> int:
-        """Physics steps in one environment step."""
         return self._n_substeps
 
     @property
     def max_steps(self) -> int:
-        """Environment steps in one episode."""
         return self._max_steps
 
     def initial_data(self, key: Array) -> SimData:
-        """Return the data of all worlds before their first episode. The key is that of ``reset``. ()
-
-        Raises:
-            ConfigError: If the simulation has other plugins or default data than those with which the environment was
-                made.
-        """
+        """Return the data of all worlds before their first episode, with the random key of ``reset``."""
         now = tuple(self._sim.plugins.values())
         if [*map(id, now)] != [*map(id, self._plugins)]:
             known = ", ".join(plugin.name for plugin in self._plugins)
@@ -363,19 +336,21 @@ class DroneEnv(Env):
                 f"{', '.join(plugin.name for plugin in now) or 'none'}: an environment does not follow its simulation. "
                 f"Use make(..., effects=[...]), or a new environment."
             )
-        if len(now := _beginning(self._sim)) != len(self._beginning) or not all(map(is_, now, self._beginning)):
+        if len(now := _default_arrays(self._sim)) != len(self._default_arrays) or not all(
+            map(is_, now, self._default_arrays)
+        ):
             raise ConfigError(
                 "expected the default data with which the environment was made, got others: an environment does not "
                 "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
             )
-        data, mesh = self.resets.default_data(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
+        data, mesh = self.episode_reset.broadcast_default(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
         data = data.replace(core=data.core.replace(rng_key=key))
         if mesh is not None:
             return shard(data, mesh)
         return data if is_traced([key]) else put_on_device(data, self.sim.device)
 
 
-def _beginning(sim: Sim) -> list[Any]:
-    """Return the arrays that episodes begin from, besides those of the scene, which change when it is compiled."""
+def _default_arrays(sim: Sim) -> list[Any]:
+    """Return the arrays that episodes begin from, without the scene's, which change when it is compiled."""
     data = sim.default_data
     return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))

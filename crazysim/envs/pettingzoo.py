@@ -33,15 +33,12 @@ class DroneParallelEnv(ParallelEnv):
     """
 
     def __init__(self, env: Env, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
-        """Take the functional environment.
+        """Wrap a functional environment.
 
         Args:
             env: An environment of one world, without automatic resets.
             render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
             render_size: Width and height of an image, pixels.
-
-        Raises:
-            ConfigError: If it has several worlds, or resets automatically, or there is no such mode.
         """
         if env.sim.n_worlds != 1:
             raise ConfigError(
@@ -62,7 +59,7 @@ class DroneParallelEnv(ParallelEnv):
         }
         self.possible_agents = [f"drone_{i}" for i in range(env.sim.n_drones)]
         self.agents: list[str] = []
-        self.now: EnvState | None = None
+        self.env_state: EnvState | None = None
         self._reset, self._step = jax.jit(env.reset), jax.jit(self._advance)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         shapes = self._reset.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
@@ -91,64 +88,51 @@ class DroneParallelEnv(ParallelEnv):
         Args:
             seed: Seed of all random numbers; None to continue those before, which first come from the system.
             options: Options of PettingZoo; there are none here, and they are ignored.
-
-        Raises:
-            ConfigError: If the seed is no integer that is at least 0.
         """
         del options
         seed = as_seed(seed)
         if seed is not None:
             self._generator, _ = gymnasium.utils.seeding.np_random(seed)
         number = seed if seed is not None else int(self._generator.integers(2**31))
-        self.now = self._reset(jax.random.key(number))
+        self.env_state = self._reset(jax.random.key(number))
         self.agents = list(self.possible_agents)
-        obs, info = jax.device_get((self.now.obs, self.now.info))
-        return self._of_agents(obs), self._of_agents(info)
+        obs, info = jax.device_get((self.env_state.obs, self.env_state.info))
+        return self._split_by_agent(obs), self._split_by_agent(info)
 
     def step(self, actions: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
         """Advance the world by one action of every drone.
 
         Returns:
             Observations, rewards, terminations, truncations and infos, by agent.
-
-        Raises:
-            ConfigError: If no episode is running, or an action is missing or not finite.
-            UnknownNameError: If there is no such agent.
-            ValueError: If an action has another shape.
         """
-        if self.now is None or not self.agents:
+        if self.env_state is None or not self.agents:
             raise ConfigError("expected a running episode, got none. Call reset() first.")
-        self.now, out = self._step(self.now, self._together(actions))
+        self.env_state, out = self._step(self.env_state, self._stack_actions(actions))
         obs, reward, terminated, truncated, info = jax.device_get(out)
         if self.render_mode == "human":
             self.render()
         agents, self.agents = self.agents, [] if terminated or truncated else self.agents
         return (
-            self._of_agents(obs),
+            self._split_by_agent(obs),
             {agent: float(r) for agent, r in zip(agents, reward, strict=True)},
             dict.fromkeys(agents, bool(terminated)),
             dict.fromkeys(agents, bool(truncated)),
-            self._of_agents(info),
+            self._split_by_agent(info),
         )
 
     def state(self) -> np.ndarray:
-        """Return the observations of all drones as one vector: those of the first drone by name, then the next one's.
-
-        Raises:
-            ConfigError: If there was no reset.
-        """
-        if self.now is None:
+        """Return the observations of all drones as one vector: drone after drone, sorted by name for each."""
+        if self.env_state is None:
             raise ConfigError("there is no state before the first reset(): call it first")
-        return np.array(flatten(self.now.obs)).ravel()
+        return np.array(flatten(self.env_state.obs)).ravel()
 
     def render(self) -> np.ndarray | None:
         """Render the world: return an image (height, width, 3), or draw into a window.
 
         Raises:
-            ConfigError: If the environment was made without ``render_mode``, or was not reset.
             RenderError: If this machine cannot render.
         """
-        images = self._renderer(self.now)
+        images = self._renderer(self.env_state)
         return images[0] if images else None
 
     def explain(self) -> str:
@@ -163,7 +147,7 @@ class DroneParallelEnv(ParallelEnv):
         state = self.env.step(state, actions[None])
         return state, (state.obs, state.reward[0], state.terminated[0], state.truncated[0], state.info)
 
-    def _together(self, actions: Mapping[str, Any]) -> np.ndarray:
+    def _stack_actions(self, actions: Mapping[str, Any]) -> np.ndarray:
         """Return the actions of all agents as one array, checked. (n_drones, k)"""
         if unknown := set(actions) - set(self.agents):
             raise UnknownNameError(
@@ -180,14 +164,16 @@ class DroneParallelEnv(ParallelEnv):
                 raise ConfigError(f"expected a finite action of {agent}, got NaN or infinity")
         return np.stack(rows)
 
-    def _of_agents(self, tree: Any) -> dict[str, Any]:
-        """Return the entries of each agent, of arrays (1, n_drones, ...), with those of the whole world, (1,)."""
+    def _split_by_agent(self, tree: Any) -> dict[str, Any]:
+        """Return each agent's entries of arrays (1, n_drones, ...); arrays of the world, (1,), go to all agents."""
 
-        def own(x: Any, i: int) -> Any:
+        def agent_entry(x: Any, i: int) -> Any:
             # A copy: what comes from JAX cannot be written to.
             return (x[0, i] if x.ndim > 1 else x[0]).copy()
 
-        return {agent: jax.tree.map(lambda x, i=i: own(x, i), tree) for i, agent in enumerate(self.possible_agents)}
+        return {
+            agent: jax.tree.map(lambda x, i=i: agent_entry(x, i), tree) for i, agent in enumerate(self.possible_agents)
+        }
 
 
 def make_parallel(task: str, render_mode: str | None = None, **options: Any) -> DroneParallelEnv:

@@ -1,8 +1,8 @@
-"""Phases of an environment step: act, (physics), observe, and begin, which starts an episode.
+"""Phases of an environment step: act, (physics), observe, reset episode.
 
 Each is written for one world, and becomes a stage of the step: ``act`` before the physics, ``observe`` after it, and
-``begin`` where an episode is over. Resets by the user call ``begin`` for all worlds. Tasks and hooks of wrappers are
-called here and nowhere else.
+``reset_episode`` where an episode is over. ``Env.reset`` and ``Env.restart`` also call ``reset_episode``, for all
+worlds. Methods of tasks and hooks of wrappers are called here and nowhere else.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from crazysim.core.functional import stage_command
 from crazysim.core.stage import Phase, Stage, vmap_worlds
 from crazysim.core.stages import nonfinite_worlds
 from crazysim.envs.actions import Actions
+from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.random import episode_key
 from crazysim.envs.reset_policy import ResetPolicy
-from crazysim.envs.resets import Resets
 from crazysim.envs.state import NAME, EnvState, Obs
 from crazysim.envs.task import Task, total
 from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, select_worlds
 
-Apply = Callable[[Callable[..., Any], bool], Callable[..., Any]]
-"""``apply(fn, batched)``: the function as a phase calls it; ``batched`` for functions that take all worlds anyway."""
+Vectorize = Callable[[Callable[..., Any], bool], Callable[..., Any]]
+"""``vectorize(fn, batched)``: a function of one world as a phase calls it: unchanged in one world, or over all worlds.
+``batched`` is True for a function that takes all worlds already."""
 
 
-def one_world(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
+def skip_vectorization(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
     """Return the function unchanged: the phase runs in one world."""
     del batched
     return fn
 
 
-def all_worlds(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
+def vectorize_over_worlds(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
     """Return a function of all worlds."""
     return fn if batched else vmap_worlds(fn)
 
@@ -60,13 +61,13 @@ class Phases:
     """Drones in a world."""
     last_step: int
     """Physics steps of an episode."""
-    resets: Resets
+    episode_reset: EpisodeReset
     """Resets of data at the start of an episode."""
     reset_policy: ResetPolicy | None = None
     """Rule by which new episodes begin within a step; None if none do."""
-    measured: Callable[[SimData], SimData] | None = None
-    """``measured(data)``: the data that the task observes, of one world, or of all if it is batched; None for the true
-    ones."""
+    measure_states: Callable[[SimData], SimData] | None = None
+    """``measure_states(data)``: the data that the task observes, of one world, or of all if it is batched; None for the
+    true states."""
 
     def stages(self, physics: Sequence[Stage], batched: str | None) -> list[Stage]:
         """Return the stages of an environment step.
@@ -78,11 +79,13 @@ class Phases:
 
         def stage(name: str, fn: Callable[..., SimData], phase: Phase, why: str | None, when: Any = None) -> Stage:
             if why is None:
-                return Stage(functools.partial(fn, apply=one_world), "world", when, name=name, phase=phase)
-            return Stage(functools.partial(fn, apply=all_worlds), "batch", name=name, phase=phase, why=why)
+                return Stage(functools.partial(fn, vectorize=skip_vectorization), "world", when, name=name, phase=phase)
+            return Stage(
+                functools.partial(fn, vectorize=vectorize_over_worlds), "batch", name=name, phase=phase, why=why
+            )
 
-        def over(data: SimData) -> Array:
-            return data.plugins[NAME].over
+        def must_reset(data: SimData) -> Array:
+            return data.plugins[NAME].must_reset
 
         # Flagged first, so that the task can read it, and a new episode clears it.
         stages = [
@@ -92,64 +95,70 @@ class Phases:
             stage("observe", self._observe, "after", batched),
         ]
         if self.reset_policy is not None:
-            stages.append(stage("begin", self._begin, "after", batched or self.resets.batched, over))
+            stages.append(
+                stage(
+                    "reset episode", self._reset_episode, "after", batched or self.episode_reset.why_batched, must_reset
+                )
+            )
         return stages
 
-    def _act(self, data: SimData, apply: Apply) -> SimData:
+    def _act(self, data: SimData, vectorize: Vectorize) -> SimData:
         state = EnvState(data)
-        state, action = self.act(state, state.record.next_action, apply)
-        return _as_before(data, state.replace(next_action=action))
+        state, action = self.act(state, state.record.next_action, vectorize)
+        return _restore_types(data, state.replace(next_action=action))
 
-    def _observe(self, data: SimData, apply: Apply) -> SimData:
+    def _observe(self, data: SimData, vectorize: Vectorize) -> SimData:
         before = EnvState(data)
-        return _as_before(data, self.after_physics(before, before.record.next_action, apply))
+        return _restore_types(data, self.after_physics(before, before.record.next_action, vectorize))
 
-    def _begin(self, data: SimData, apply: Apply) -> SimData:
-        ended, batched = EnvState(data), apply is all_worlds
-        default = self.resets.default_of(ended.data) if batched else self.resets.default_of_world(ended.data)
-        new = self.begin(ended, default, apply)
-        new = new if self.reset_policy is None else self.reset_policy.begin(ended, new)
-        return _as_before(data, select_states(data.plugins[NAME].over[:, 0], new, ended) if batched else new)
+    def _reset_episode(self, data: SimData, vectorize: Vectorize) -> SimData:
+        ended, batched = EnvState(data), vectorize is vectorize_over_worlds
+        default = (
+            self.episode_reset.default_for(ended.data) if batched else self.episode_reset.default_for_world(ended.data)
+        )
+        new = self.reset_episode(ended, default, vectorize)
+        new = new if self.reset_policy is None else self.reset_policy.after_reset(ended, new)
+        return _restore_types(data, select_states(data.plugins[NAME].must_reset[:, 0], new, ended) if batched else new)
 
     def outline(self, state: EnvState) -> EnvState:
         """Return a state of all worlds with the structure, shapes and types that a step returns."""
-        state, action = self.act(state, state.record.next_action, all_worlds)
-        return self.after_physics(state, action, all_worlds)
+        state, action = self.act(state, state.record.next_action, vectorize_over_worlds)
+        return self.after_physics(state, action, vectorize_over_worlds)
 
-    def after_physics(self, state: EnvState, action: Array, apply: Apply) -> EnvState:
+    def after_physics(self, state: EnvState, action: Array, vectorize: Vectorize) -> EnvState:
         """Return the result of ``observe``, noting where a new episode begins."""
         was_done = state.done
-        state = self.observe(state, action, apply)
+        state = self.observe(state, action, vectorize)
         if self.reset_policy is None:
             return state
-        return self.reset_policy.end(state).replace(over=self.reset_policy.is_over(was_done, state))
+        return self.reset_policy.after_step(state).replace(must_reset=self.reset_policy.must_reset(was_done, state))
 
-    def act(self, state: EnvState, action: Array, apply: Apply) -> tuple[EnvState, Array]:
+    def act(self, state: EnvState, action: Array, vectorize: Vectorize) -> tuple[EnvState, Array]:
         """Return the state with the action's command staged, and the action as the wrappers pass it on.
 
         Args:
             state: The state before the step.
             action: Action. (n_drones, k)
-            apply: Caller of functions of one world.
+            vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
         for wrapper in reversed(self.wrappers):
-            state, action = apply(wrapper.before_step, wrapper.batched)(state, action)
-        data = apply(self.task.before_step, self.task.batched)(state.data)
+            state, action = vectorize(wrapper.before_step, wrapper.batched)(state, action)
+        data = vectorize(self.task.before_step, self.task.batched)(state.data)
         return state.replace(data=stage_command(data, self.actions.command(action))), action
 
-    def observe(self, state: EnvState, action: Array, apply: Apply) -> EnvState:
+    def observe(self, state: EnvState, action: Array, vectorize: Vectorize) -> EnvState:
         """Return the state after the physics: observations, reward and the end of the episode.
 
         Args:
             state: Result of ``act``, with the data after the physics.
             action: The action that ``act`` returned. (n_drones, k)
-            apply: Caller of functions of one world.
+            vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
         task, last_step = self.task, self.last_step
 
         def evaluate(data: SimData, action: Array, last_action: Array) -> Any:
             reward = jnp.asarray(total(task.rewards(data, action, last_action)), action.dtype)
-            return self._observed(data), reward, task.terminated(data), _step_info(task, data)
+            return self._observe_task(data), reward, task.terminated(data), _step_info(task, data)
 
         def conclude(state: EnvState, action: Array, results: Any) -> EnvState:
             obs, reward, terminated, info = results
@@ -163,27 +172,27 @@ class Phases:
                 info=state.info | {"nonfinite": nonfinite} | info,
             )
 
-        results = apply(evaluate, task.batched)(state.data, action, state.action)
-        state = apply(conclude, False)(state, action, results)
+        results = vectorize(evaluate, task.batched)(state.data, action, state.action)
+        state = vectorize(conclude, False)(state, action, results)
         for wrapper in self.wrappers:
-            state = apply(wrapper.after_step, wrapper.batched)(state)
+            state = vectorize(wrapper.after_step, wrapper.batched)(state)
         return state
 
-    def begin(self, state: EnvState, default: SimData, apply: Apply) -> EnvState:
+    def reset_episode(self, state: EnvState, default: SimData, vectorize: Vectorize) -> EnvState:
         """Return the state at the start of an episode; of the state before, only data, info and memory are read.
 
         Args:
             state: The state before.
             default: Data that the world is reset to.
-            apply: Caller of functions of one world.
+            vectorize: ``skip_vectorization`` or ``vectorize_over_worlds``.
         """
         task, shape = self.task, (self.n_drones, self.actions.size)
-        before = apply(self.resets.data, self.resets.batched_pipeline)(state.data, default)
-        key = apply(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
-        data = apply(task.spawn, task.batched)(before, key)
+        before = vectorize(self.episode_reset.reset_data, self.episode_reset.takes_all_worlds)(state.data, default)
+        key = vectorize(lambda data: episode_key(data, f"spawn {task.name}"), False)(before)
+        data = vectorize(task.spawn, task.batched)(before, key)
         for wrapper in self.wrappers:
-            data = apply(wrapper.after_spawn, wrapper.batched)(data)
-        data = _like(task, before, data)
+            data = vectorize(wrapper.after_spawn, wrapper.batched)(data)
+        data = _check_spawn(task, before, data)
 
         def start(state: EnvState, obs: Obs, info: dict[str, Array]) -> EnvState:
             dtype = state.data.states.pos.dtype
@@ -197,32 +206,32 @@ class Phases:
                 info=state.info | {"nonfinite": state.data.core.nonfinite} | info,
             )
 
-        seen = apply(lambda data: (self._observed(data), _step_info(task, data)), task.batched)(data)
-        state = apply(start, False)(state.replace(data=data), *seen)
+        seen = vectorize(lambda data: (self._observe_task(data), _step_info(task, data)), task.batched)(data)
+        state = vectorize(start, False)(state.replace(data=data), *seen)
         for wrapper in self.wrappers:
-            state = apply(wrapper.after_reset, wrapper.batched)(state)
+            state = vectorize(wrapper.after_reset, wrapper.batched)(state)
         return state
 
-    def _observed(self, data: SimData) -> Obs:
+    def _observe_task(self, data: SimData) -> Obs:
         """Return the observations of the task, of measured states if it is to get these."""
-        return self.task.observe(data if self.measured is None else self.measured(data))
+        return self.task.observe(data if self.measure_states is None else self.measure_states(data))
 
 
-def _flag_nonfinite(data: SimData, apply: Apply) -> SimData:
+def _flag_nonfinite(data: SimData, vectorize: Vectorize) -> SimData:
     """Return the data with worlds flagged that are not finite, which holds for one world and for all."""
-    del apply
+    del vectorize
     return data.replace(core=data.core.replace(nonfinite=nonfinite_worlds(data)))
 
 
-def _as_before(data: SimData, state: EnvState) -> SimData:
+def _restore_types(data: SimData, state: EnvState) -> SimData:
     """Return the data of a state with the types of the data before."""
-    if jax.tree.structure(state.whole) != jax.tree.structure(data):
-        return state.whole  # the engine refuses it, and says what has changed
+    if jax.tree.structure(state.full_data) != jax.tree.structure(data):
+        return state.full_data  # the engine refuses it, and says what has changed
 
     def cast(new: Any, old: Array) -> Array:
         return new if getattr(new, "dtype", None) == old.dtype else jnp.asarray(new, old.dtype)
 
-    return jax.tree.map(cast, state.whole, data)
+    return jax.tree.map(cast, state.full_data, data)
 
 
 def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
@@ -240,12 +249,8 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
     return {"error": task.error(data)} | task.info(data)
 
 
-def _like(task: Task, old: SimData, new: Any) -> SimData:
-    """Return the data of a start with the shapes and types of before: of another type, a step would compile again.
-
-    Raises:
-        ConfigError: If it has other leaves.
-    """
+def _check_spawn(task: Task, old: SimData, new: Any) -> SimData:
+    """Return the data of a start with the shapes and types of before: of another type, a step would compile again."""
     if jax.tree.structure(new) != jax.tree.structure(old):
         had, has = ({keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (old, new))
         what = ", ".join([f"without {x}" for x in sorted(had - has)] + [f"with {x}" for x in sorted(has - had)])

@@ -1,4 +1,4 @@
-"""Random numbers of episodes: as repeatable as those of ``crazysim.core.random``, with a twentieth of the arithmetic.
+"""Random numbers of episodes: as repeatable as ``crazysim.core.random``, with a twentieth of the arithmetic.
 
 A million worlds draw twenty numbers each in every step, for the few episodes that start, and that must cost less than
 the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an integer hash with avalanche (Wellons
@@ -16,24 +16,20 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 
 STRIDE = np.uint32(0x9E3779B9)
 """2^32 divided by the golden ratio: its multiples are spread evenly."""
 
 
 def as_seed(seed: object) -> int | None:
-    """Return a seed of the random numbers of all worlds; None stays None.
-
-    Raises:
-        ConfigError: If it is not an integer from 0 to 2^63 - 1, which both Gymnasium and JAX take.
-    """
+    """Return a seed of the random numbers of all worlds; None stays None."""
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**63:
         raise ConfigError(
             f"expected one integer from 0 to 2^63 - 1 as seed of all worlds, each of which draws its own numbers, got "
-            f"{shown(seed)}. Use for example 0."
+            f"{short_repr(seed)}. Use for example 0."
         )
     return int(seed)
 
@@ -99,14 +95,14 @@ def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, A
     return {name: x.reshape(*batch, *shape) for (name, shape), x in zip(shapes.items(), parts, strict=True)}
 
 
-def between(x: Array, low: Any, high: Any) -> Array:
+def scale_to(x: Array, low: Any, high: Any) -> Array:
     """Return numbers in [0, 1) scaled to a range. (...)"""
     return low + x * (jnp.asarray(high, x.dtype) - jnp.asarray(low, x.dtype))
 
 
-def within(x: Array, most: Any) -> Array:
+def scale_symmetric(x: Array, most: Any) -> Array:
     """Return numbers in [0, 1) scaled to the range from ``-most`` to ``most``. (...)"""
-    return between(x, -jnp.asarray(most, x.dtype), most)
+    return scale_to(x, -jnp.asarray(most, x.dtype), most)
 
 
 def _mix(x: Array) -> Array:

@@ -20,11 +20,11 @@ from types import ModuleType
 from crazysim.cache import caches_folder
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError
-from crazysim.trust import distrust, make_private
+from crazysim.storage import distrust, make_private
 
 GUIDE = "docs/guides/tasks.md"
 _CLASSES: dict[str, type[Task]] = {}
-"""Classes of which this process has made tasks, by their references."""
+"""Classes that this process has made tasks from, by their references."""
 _LOADED: set[str] = set()
 """References that were named in this process."""
 
@@ -34,7 +34,7 @@ def is_reference(name: str) -> bool:
     return ":" in name or name.endswith(".py")
 
 
-def split(reference: str) -> tuple[str, str]:
+def split_reference(reference: str) -> tuple[str, str]:
     """Return the file or module of a reference, and the name in it, which may be empty."""
     if reference.endswith(".py"):
         return reference, ""
@@ -42,9 +42,9 @@ def split(reference: str) -> tuple[str, str]:
     return place, name
 
 
-def absolute(reference: str) -> str:
+def absolute_reference(reference: str) -> str:
     """Return a reference with the absolute path of its file; one of a module as it is."""
-    place, name = split(reference)
+    place, name = split_reference(reference)
     return f"{Path(place).expanduser().resolve()}:{name}" if place.endswith(".py") else reference
 
 
@@ -58,11 +58,11 @@ def reference_of(task: type[Task]) -> str:
     reference = f"{place}:{name}"
     _CLASSES[reference] = task
     if is_in_file:
-        _note(reference)
+        _add_to_list(reference)
     return reference
 
 
-def load(reference: str, names: Container[str]) -> type[Task] | str:
+def load_task(reference: str, names: Container[str]) -> type[Task] | str:
     """Execute the file or module of a reference that a user has written, and note the reference.
 
     Args:
@@ -75,10 +75,10 @@ def load(reference: str, names: Container[str]) -> type[Task] | str:
     Raises:
         ConfigError: If there is no such file, module or task.
     """
-    reference = absolute(reference)
+    reference = absolute_reference(reference)
     if reference in _CLASSES:
         return _CLASSES[reference]
-    place, name = split(reference)
+    place, name = split_reference(reference)
     module = _from_file(Path(place)) if place.endswith(".py") else _from_module(place)
     classes = {k: x for k, x in vars(module).items() if _is_task(x) and x.__module__ == module.__name__}
     if not name and len(classes) == 1:
@@ -91,36 +91,36 @@ def load(reference: str, names: Container[str]) -> type[Task] | str:
             f"subclass of Task, or a name that the file registers; {GUIDE} has an example."
         )
     _LOADED.add(reference)
-    _note(reference)
+    _add_to_list(reference)
     return found if _is_task(found) else name  # type: ignore[return-value]
 
 
-def follow(reference: str, names: Container[str]) -> type[Task] | str:
-    """Return what ``load`` does, for a reference that was read from the files of a run.
+def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
+    """Return what ``load_task`` does, for a reference that was read from the files of a run.
 
     Raises:
-        ConfigError: If this user has not named it before, if others could have changed its file, or if ``load`` fails.
+        ConfigError: If this user has not named it before, others could have changed its file, or ``load_task`` fails.
     """
-    place, name = split(reference)
+    place, name = split_reference(reference)
     if reference in _CLASSES or reference in _LOADED:
-        return load(reference, names)
+        return load_task(reference, names)
     remedy = (
         f"Read the code of the task, and name it yourself: --task FILE.py:{name or 'NAME'} in a command, or "
         f"load_policy(folder, task=...)."
     )
-    if reference not in _noted():
+    if reference not in _read_list():
         raise ConfigError(
             f"expected a task that you have named on this machine, got {reference!r} from the files of a run, which "
             f"others could have made. {remedy}"
         )
     if place.endswith(".py") and (reason := distrust(Path(place))):
         raise ConfigError(f"expected a file that only you can write, got {place!r}: {reason}. {remedy}")
-    return load(reference, names)
+    return load_task(reference, names)
 
 
 def code_digest(reference: str) -> str:
     """Return the hash of the file of a reference, as text; empty if it is not a file."""
-    place, _ = split(reference)
+    place, _ = split_reference(reference)
     with contextlib.suppress(OSError):
         return hashlib.sha256(Path(place).read_bytes()).hexdigest() if place.endswith(".py") else ""
     return ""
@@ -176,7 +176,7 @@ def _list_path() -> Path:
     return caches_folder() / "tasks"
 
 
-def _noted() -> list[str]:
+def _read_list() -> list[str]:
     with contextlib.suppress(ConfigError):
         path = _list_path()
         if path.is_file() and not distrust(path):
@@ -184,12 +184,12 @@ def _noted() -> list[str]:
     return []
 
 
-def _note(reference: str) -> None:
+def _add_to_list(reference: str) -> None:
     """Add a reference to the list; where that is impossible, it is to be named again in another process."""
     with contextlib.suppress(OSError, ConfigError):
         path = _list_path()
         make_private(path.parent)
-        if distrust(path.parent) or reference in _noted():
+        if distrust(path.parent) or reference in _read_list():
             return
         with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags, 0o600)) as file:
             file.write(f"{reference}\n")

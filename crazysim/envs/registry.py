@@ -18,7 +18,7 @@ from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.settings import enum_member, positive_integer
 from crazysim.envs.actions import Actions
 from crazysim.envs.env import DroneEnv
-from crazysim.envs.references import follow, is_reference, load
+from crazysim.envs.references import is_reference, load_noted_task, load_task
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.avoid import Avoid
 from crazysim.envs.tasks.chase import Chase
@@ -31,7 +31,7 @@ from crazysim.envs.tasks.recover import Recover
 from crazysim.envs.tasks.swarm import Swarm
 from crazysim.envs.tasks.track import TrackTrajectory
 from crazysim.envs.tasks.transport import Transport
-from crazysim.errors import ConfigError, UnknownNameError, shown
+from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.plugins.effects.randomize import Randomize
 from crazysim.sim.sim import Sim
 
@@ -73,10 +73,10 @@ TASKS: dict[str, Entry] = {
 
 BUILT_IN = frozenset(TASKS)
 """Names of the tasks of this package."""
-PLUGINS = "crazysim.tasks"
+ENTRY_POINTS = "crazysim.tasks"
 """Group of entry points in which an installed package lists its classes of tasks by name."""
 
-RANGES = {"crazyflie": Randomize.crazyflie, "generic": Randomize.generic}
+RANDOMIZATIONS = {"crazyflie": Randomize.crazyflie, "generic": Randomize.generic}
 """Ready-made ranges of randomisation, by name."""
 SIM_OPTIONS = tuple(inspect.signature(Sim).parameters)
 """Options of ``make`` that belong to the simulation."""
@@ -107,10 +107,6 @@ def make(
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
             and of the task, such as ``seconds``; ``help(crazysim.envs.TASKS[name].task)`` lists those.
-
-    Raises:
-        ConfigError: If neither the simulation nor the task has an option.
-        UnknownNameError: If there is no such task.
     """
     entry = entry_of(task)
     name = task if isinstance(task, str) else entry.task.name or entry.task.__name__
@@ -128,12 +124,12 @@ def make(
     task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
     plugins = [*plugin_list("effects", effects), *plugin_list("sensors", sensors)]
     if randomize is not None:
-        if randomize not in RANGES:
+        if randomize not in RANDOMIZATIONS:
             raise ConfigError(
-                f"expected randomize as one of {', '.join(map(repr, RANGES))}, got {shown(randomize)}. Use "
-                f"effects=[Randomize(...)] for ranges of your own."
+                f"expected randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, got {short_repr(randomize)}. "
+                f"Use effects=[Randomize(...)] for ranges of your own."
             )
-        plugins.append(RANGES[randomize]())
+        plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, **settings)
     twice = [plugin.name for plugin in plugins if plugin.name in sim.plugins]
     if twice:
@@ -160,10 +156,6 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
 
     Returns:
         Id in Gymnasium's registry, such as ``"crazysim/TwoHoops-v0"``, for ``gymnasium.make_vec``.
-
-    Raises:
-        ConfigError: If the name is invalid or that of a built-in task, or the class is not a frozen dataclass of
-            ``Task``.
     """
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in BUILT_IN:
         raise ConfigError(
@@ -171,14 +163,14 @@ def register(name: str, task: type[Task], control: str = "attitude", n_drones: i
             f"Use for example 'two_hoops'."
         )
     control = enum_member(Control, "control", control).value
-    entry = Entry(_checked(task), _id(name), control, positive_integer("n_drones", n_drones))
+    entry = Entry(_check_class(task), _gymnasium_id(name), control, positive_integer("n_drones", n_drones))
     TASKS[name] = entry
-    _announce(name, entry)
+    _register_with_gymnasium(name, entry)
     return entry.id
 
 
 def entry_of(task: str | Task, named: bool = True) -> Entry:
-    """Return the entry of a task: that of a name, or one with the usual command level for a class of your own.
+    """Return the registered entry of a task, or one with the usual command level for a class of your own.
 
     Args:
         task: One of ``TASKS``, a name of the entry points of an installed package, the place of a class of your own,
@@ -187,19 +179,18 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
 
     Raises:
         ConfigError: If there is no such file, module or class, or it may not be executed.
-        UnknownNameError: If there is no task of that name, with those there are.
     """
     if isinstance(task, Task):
         same = (entry for entry in TASKS.values() if entry.task is type(task))
-        return next(same, Entry(_checked(type(task)), ""))
+        return next(same, Entry(_check_class(type(task)), ""))
     if not isinstance(task, str):
         raise ConfigError(f"expected the name of a task or a task, got {task!r}. A class has to be called: Task().")
     if task in TASKS:
         return TASKS[task]
     if is_reference(task):
-        found = load(task, TASKS) if named else follow(task, TASKS)
-        return TASKS[found] if isinstance(found, str) else Entry(_checked(found), "")
-    plugins = importlib.metadata.entry_points(group=PLUGINS)
+        found = load_task(task, TASKS) if named else load_noted_task(task, TASKS)
+        return TASKS[found] if isinstance(found, str) else Entry(_check_class(found), "")
+    plugins = importlib.metadata.entry_points(group=ENTRY_POINTS)
     if task in plugins.names:
         register(task, plugins[task].load())
         return TASKS[task]
@@ -209,12 +200,8 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
     )
 
 
-def _checked(task: object) -> type[Task]:
-    """Return a class of tasks.
-
-    Raises:
-        ConfigError: If it is something else, or the class itself is not a frozen dataclass.
-    """
+def _check_class(task: object) -> type[Task]:
+    """Return a class of tasks."""
     if not inspect.isclass(task) or not issubclass(task, Task) or task is Task:
         raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
     fields = {f.name for f in dataclasses.fields(task)}
@@ -227,11 +214,11 @@ def _checked(task: object) -> type[Task]:
     return task
 
 
-def _id(name: str) -> str:
+def _gymnasium_id(name: str) -> str:
     return f"crazysim/{''.join(part.capitalize() for part in name.split('_'))}-v0"
 
 
-def _announce(name: str, entry: Entry) -> None:
+def _register_with_gymnasium(name: str, entry: Entry) -> None:
     """Register a task with Gymnasium, where it is made by name."""
     if entry.id not in gymnasium.registry:
         gymnasium.register(
@@ -243,4 +230,4 @@ def _announce(name: str, entry: Entry) -> None:
 
 
 for _name, _entry in TASKS.items():
-    _announce(_name, _entry)
+    _register_with_gymnasium(_name, _entry)

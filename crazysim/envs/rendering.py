@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crazysim.envs.state import EnvState
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.sim.sim import Sim
 
 RENDER_MODES = ("rgb_array", "human")
@@ -15,21 +15,18 @@ RENDER_MODES = ("rgb_array", "human")
 
 
 class Renderer:
-    """Renders worlds of a simulation in a given state."""
+    """Renderer of some worlds of a simulation in a given state."""
 
     def __init__(
         self, sim: Sim, mode: str | None, worlds: Sequence[int] | None = (0,), size: tuple[int, int] = (640, 480)
     ):
-        """Take the simulation and the mode.
+        """Create a renderer.
 
         Args:
             sim: The simulation of the states.
             mode: ``"rgb_array"`` for images, ``"human"`` for the first world in a window, None for no rendering.
             worlds: Worlds to render; None for all.
             size: Width and height of an image, pixels.
-
-        Raises:
-            ConfigError: If there is no such mode, or no such world.
         """
         if mode not in (None, *RENDER_MODES):
             raise ConfigError(f"expected render_mode None, {' or '.join(RENDER_MODES)}, got {mode!r}")
@@ -37,8 +34,8 @@ class Renderer:
         is_index = chosen.ndim == 1 and chosen.size and np.issubdtype(chosen.dtype, np.integer)
         if not is_index or not np.all((chosen >= 0) & (chosen < sim.n_worlds)):
             raise ConfigError(
-                f"expected render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}, got {shown(worlds)}. Use "
-                f"[0], or None for all."
+                f"expected render_worlds as a list of worlds from 0 to {sim.n_worlds - 1}, got {short_repr(worlds)}. "
+                f"Use [0], or None for all."
             )
         self.sim, self.mode, self.worlds, self.size = sim, mode, chosen.tolist(), size
 
@@ -46,7 +43,6 @@ class Renderer:
         """Return an image of each world, (height, width, 3), or an empty list after drawing into the window.
 
         Raises:
-            ConfigError: If the environment was made without ``render_mode``, or was not reset.
             RenderError: If this machine cannot render.
         """
         if self.mode is None or state is None:

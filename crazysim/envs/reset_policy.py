@@ -27,14 +27,14 @@ class AutoresetMode(StrEnum):
 class ResetPolicy:
     """Rule by which new episodes begin within a step; all functions take one world or all."""
 
-    is_over: Callable[[Array, EnvState], Array]
-    """``is_over(was_done, ended)``: true where a new episode begins; ``was_done`` is ``done`` before the step. ()"""
-    end: Callable[[EnvState], EnvState]
-    """``end(state)``: the state after a step, whether a new episode begins or not."""
+    must_reset: Callable[[Array, EnvState], Array]
+    """``must_reset(was_done, ended)``: true where a new episode begins; ``was_done`` is ``done`` before the step. ()"""
+    after_step: Callable[[EnvState], EnvState]
+    """``after_step(state)``: the state after a step, whether a new episode begins or not."""
     keeps_final_obs: bool
-    """True if ``end`` adds ``info["final_obs"]``."""
-    begin: Callable[[EnvState, EnvState], EnvState]
-    """``begin(ended, new)``: the state where a new episode begins, from those before and after its reset."""
+    """True if ``after_step`` adds ``info["final_obs"]``."""
+    after_reset: Callable[[EnvState, EnvState], EnvState]
+    """``after_reset(ended, new)``: the state where a new episode begins, from those before and after its reset."""
 
 
 def _with_final_obs(state: EnvState) -> EnvState:

@@ -85,10 +85,6 @@ def rollout(
 
     Returns:
         The state, the memory, and what was kept, with time in front, (n_steps, ...).
-
-    Raises:
-        ConfigError: If the number of steps is not a positive integer.
-        ValueError: If the policy returns actions of another shape.
     """
     n_steps = positive_integer("n_steps", n_steps)
     memory = initial_memory if memory is None else memory
@@ -102,7 +98,7 @@ def rollout(
         after = env.advance(before, validate_action(action, seen, env.actions))
         new = EnvState(after.data())
         if env.reset_policy is not None:
-            over = env.reset_policy.is_over(seen.done, new)
+            over = env.reset_policy.must_reset(seen.done, new)
             memory = jax.tree.map(lambda first, x: select_worlds(over, first, x), initial_memory, memory)
         kept = keep(Transition(seen.obs, action, extras, new))
         return ([after.leaves[i] for i in carried], memory), kept

@@ -34,7 +34,7 @@ class DroneVecEnv(VecEnv):
     A new episode starts within the step that ends one. The infos of worlds whose episode ended have the entries of
     ``Monitor`` and ``DummyVecEnv``, ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` with ``r``, ``l``
     and ``t``, and also ``error`` and ``nonfinite``; other infos are empty. With several drones the reward is their
-    mean, and observations and actions are those of all, drone after drone.
+    mean, and observations and actions are concatenated, drone after drone.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class DroneVecEnv(VecEnv):
         render_worlds: Sequence[int] = (0,),
         render_size: tuple[int, int] = (640, 480),
     ):
-        """Take the functional environment, without automatic resets.
+        """Wrap a functional environment that does not reset automatically.
 
         Args:
             env: The environment.
@@ -55,18 +55,15 @@ class DroneVecEnv(VecEnv):
                 into a window.
             render_worlds: Worlds to render.
             render_size: Width and height of an image, pixels.
-
-        Raises:
-            ConfigError: If there is no such mode, or the environment resets automatically.
         """
         self.env, self.sim, self.dict_obs = AutoReset(EpisodeStatistics(env)), env.sim, dict_obs
         self._renderer = Renderer(env.sim, render_mode, render_worlds, render_size)
-        self._begin, self._advance = jax.jit(self._first), jax.jit(self._next)
+        self._reset_fn, self._step_fn = jax.jit(self._reset_state), jax.jit(self._step_state)
         self._generator, _ = gymnasium.utils.seeding.np_random()
         self._actions: np.ndarray | None = None
-        self._since = time.time()
+        self._started = time.time()
         self.state: EnvState | None = None
-        _, obs = self._begin.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
+        _, obs = self._reset_fn.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
         spaces: dict[str, gymnasium.Space] = {
             name: gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32) for name, x in obs.items()
         }
@@ -86,72 +83,51 @@ class DroneVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        self._actions, self._since = None, time.time()
-        self.state, obs = self._begin(jax.random.key(number))
-        return self._out(jax.device_get(obs))
+        self._actions, self._started = None, time.time()
+        self.state, obs = self._reset_fn(jax.random.key(number))
+        return self._to_numpy(jax.device_get(obs))
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Take the actions of the next step, (num_envs, k).
-
-        Raises:
-            ConfigError: If there was no reset, or they are not finite.
-            ValueError: If they have another shape.
-        """
+        """Take the actions of the next step, (num_envs, k)."""
         if self.state is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
         self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Return observations, rewards, which episodes ended, and infos.
-
-        Raises:
-            ConfigError: If no actions were given.
-        """
+        """Return observations, rewards, which episodes ended, and infos."""
         if self._actions is None:
             raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
-        self.state, out = self._advance(self.state, self._actions)
+        self.state, out = self._step_fn(self.state, self._actions)
         self._actions = None
         obs, final, reward, done, results = jax.device_get(out)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done):
             last = {name: x[world] for name, x in final.items()}
             infos[world] = {
-                "terminal_observation": self._out(last),
+                "terminal_observation": self._to_numpy(last),
                 "TimeLimit.truncated": bool(results["out_of_time"][world]),
                 "episode": {
                     "r": float(results["return"][world]),
                     "l": int(results["length"][world]),
-                    "t": round(time.time() - self._since, 6),
+                    "t": round(time.time() - self._started, 6),
                 },
                 "error": float(results["error"][world]),
                 "nonfinite": bool(results["nonfinite"][world]),
             }
-        return self._out(obs), np.array(reward), np.array(done), infos
+        return self._to_numpy(obs), np.array(reward), np.array(done), infos
 
     def get_attr(self, attr_name: str, indices: ArrayLike | None = None) -> list[Any]:
-        """Return an attribute of the functional environment, which all worlds share, once per world.
-
-        Raises:
-            AttributeError: If there is none of that name.
-        """
+        """Return an attribute of the functional environment, which all worlds share, once per world."""
         value = self._renderer.mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: ArrayLike | None = None) -> None:
-        """Refuse: all worlds are one compiled program.
-
-        Raises:
-            ConfigError: In any case.
-        """
+        """Refuse: all worlds are one compiled program."""
         del value, indices
         raise ConfigError(f"cannot set {attr_name!r}: all worlds are one compiled program. Make another environment.")
 
     def env_method(self, method_name: str, *args: Any, indices: ArrayLike | None = None, **kwargs: Any) -> list[Any]:
-        """Render, the only method of a single world.
-
-        Raises:
-            ConfigError: If another method is called.
-        """
+        """Render, the only method of a single world."""
         del indices
         if method_name != "render" or args or kwargs:
             raise ConfigError(
@@ -167,7 +143,6 @@ class DroneVecEnv(VecEnv):
         """Return an image (height, width, 3) of each world to render, or draw the first into a window.
 
         Raises:
-            ConfigError: If the environment was made without ``render_mode``, or was not reset.
             RenderError: If this machine cannot render.
         """
         return self._renderer(self.state)
@@ -180,11 +155,11 @@ class DroneVecEnv(VecEnv):
         """Close the window."""
         self.sim.close()
 
-    def _first(self, key: Array) -> tuple[EnvState, Obs]:
+    def _reset_state(self, key: Array) -> tuple[EnvState, Obs]:
         state = self.env.reset(key)
-        return state, self._seen(state.obs)
+        return state, self._merge_obs(state.obs)
 
-    def _next(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:
+    def _step_state(self, state: EnvState, actions: Array) -> tuple[EnvState, Any]:
         state = self.env.step(state, actions.reshape(state.action.shape))
         info = state.info
         results = {
@@ -194,15 +169,21 @@ class DroneVecEnv(VecEnv):
             "error": info["error"].mean(axis=1),
             "nonfinite": info["nonfinite"],
         }
-        out = (self._seen(state.obs), self._seen(info["final_obs"]), state.reward.mean(axis=1), state.done, results)
+        out = (
+            self._merge_obs(state.obs),
+            self._merge_obs(info["final_obs"]),
+            state.reward.mean(axis=1),
+            state.done,
+            results,
+        )
         return state, out
 
-    def _seen(self, obs: Obs) -> Obs:
-        """Return observations as one vector ``all``, or, if named, those of all drones by name."""
+    def _merge_obs(self, obs: Obs) -> Obs:
+        """Return the observations of all drones as one vector ``all``, or by name if ``dict_obs``."""
         if not self.dict_obs:
             obs = {"all": flatten(obs)}
         return {name: x.reshape(x.shape[0], -1).astype(jnp.float32) for name, x in obs.items()}
 
-    def _out(self, obs: dict[str, Any]) -> Any:
-        """Return observations as writable arrays, as Torch requires; those of JAX are read-only."""
+    def _to_numpy(self, obs: dict[str, Any]) -> Any:
+        """Return observations as writable arrays, as Torch requires; JAX arrays are read-only."""
         return {name: np.array(x) for name, x in obs.items()} if self.dict_obs else np.array(obs["all"])

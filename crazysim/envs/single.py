@@ -26,15 +26,12 @@ class DroneSingleEnv(gymnasium.Env):
     """
 
     def __init__(self, env: DroneEnv, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
-        """Take the functional environment, without automatic resets.
+        """Wrap a functional environment that does not reset automatically.
 
         Args:
             env: The environment, of one world.
             render_mode: Mode of ``render``: ``"rgb_array"`` returns an image, ``"human"`` draws into a window.
             render_size: Width and height of an image, pixels.
-
-        Raises:
-            ConfigError: If there are several worlds, there is no such mode, or the environment resets automatically.
         """
         if env.sim.n_worlds != 1:
             raise ConfigError(
@@ -50,34 +47,26 @@ class DroneSingleEnv(gymnasium.Env):
         """Start a new episode.
 
         Without a seed the random numbers continue those before; the first ones come from the system.
-
-        Raises:
-            ConfigError: If the seed is no integer that is at least 0, or there are options.
         """
         if options:
             raise ConfigError(f"expected no options of reset, got {', '.join(options)}")
         super().reset(seed=as_seed(seed))
         obs, info = self.vector.reset(seed=int(self.np_random.integers(2**31)) if seed is None else seed)
-        return _first(obs), _first(info)
+        return _squeeze_world(obs), _squeeze_world(info)
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance the world.
 
         Args:
             action: (k,), or (n_drones, k) with several drones.
-
-        Raises:
-            ConfigError: If the environment was not reset, or the action is not finite.
-            ValueError: If the action has another shape.
         """
         obs, reward, terminated, truncated, info = self.vector.step(np.asarray(action)[None])
-        return _first(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
+        return _squeeze_world(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _squeeze_world(info)
 
     def render(self) -> NDArray | None:
         """Return an image (height, width, 3), or draw into a window.
 
         Raises:
-            ConfigError: If the environment was made without ``render_mode``, or was not reset.
             RenderError: If this machine cannot render.
         """
         images = self.vector.render()
@@ -92,7 +81,7 @@ class DroneSingleEnv(gymnasium.Env):
         self.vector.close()
 
 
-def _first(tree: Any) -> Any:
+def _squeeze_world(tree: Any) -> Any:
     """Return the arrays of the only world."""
     return jax.tree.map(lambda x: x[0], tree)
 

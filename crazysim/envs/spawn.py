@@ -40,7 +40,7 @@ def flying(
     return data.replace(states=states, controls=controls)
 
 
-def any_attitude(x: Array) -> Array:
+def random_attitude(x: Array) -> Array:
     """Return attitudes distributed uniformly over all rotations, xyzw (Shoemake 1992). (..., 4)
 
     Args:

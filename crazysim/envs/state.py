@@ -43,7 +43,7 @@ class EnvRecord(PyTree):
     """Memory of the wrappers, by name of the wrapper. (n_worlds, 1, ...) each; records within declare their own axes"""
     next_action: Array = leaf("drone", 1, scratch=True)
     """Action that a step is given, and as the wrappers pass it on. (n_worlds, n_drones, k)"""
-    over: Array = leaf("world", scratch=True)
+    must_reset: Array = leaf("world", scratch=True)
     """True where a new episode begins within the step. (n_worlds, 1)"""
 
 
@@ -54,22 +54,23 @@ OUTPUTS = ("obs", "reward", "terminated", "truncated", "drone_info", "world_info
 class EnvState(PyTree):
     """An environment at one moment: argument and result of ``step``.
 
-    A view of the simulation's data and of the environment's record among its plugins. Functions of one world, those of
-    tasks and wrappers, receive it without the axis of worlds. ``replace`` takes the names of the properties.
+    A view of the simulation's data and of the environment's record among its plugins. Functions of one world,
+    such as the methods of tasks and wrappers, receive it without the axis of worlds. ``replace`` takes the names of the
+    properties.
     """
 
-    whole: SimData
+    full_data: SimData
     """Data of the simulation, with the environment's record in its plugins."""
 
     @property
     def record(self) -> EnvRecord:
         """The environment's record."""
-        return self.whole.plugins[NAME]
+        return self.full_data.plugins[NAME]
 
     @property
     def data(self) -> SimData:
         """The simulation, without the environment's record."""
-        return self.whole.replace(plugins={k: x for k, x in self.whole.plugins.items() if k != NAME})
+        return self.full_data.replace(plugins={k: x for k, x in self.full_data.plugins.items() if k != NAME})
 
     @property
     def obs(self) -> Obs:
@@ -84,12 +85,12 @@ class EnvState(PyTree):
     @property
     def terminated(self) -> Array:
         """True where the episode ended by success or failure. (n_worlds,)"""
-        return self._without_axis(self.record.terminated)
+        return self._squeeze_axis(self.record.terminated)
 
     @property
     def truncated(self) -> Array:
         """True where the episode reached its time limit. (n_worlds,)"""
-        return self._without_axis(self.record.truncated)
+        return self._squeeze_axis(self.record.truncated)
 
     @property
     def done(self) -> Array:
@@ -105,12 +106,12 @@ class EnvState(PyTree):
     def info(self) -> dict[str, Any]:
         """Further quantities by name. (n_worlds,) or (n_worlds, n_drones, ...) each"""
         record = self.record
-        return {k: self._without_axis(x) for k, x in record.world_info.items()} | record.drone_info
+        return {k: self._squeeze_axis(x) for k, x in record.world_info.items()} | record.drone_info
 
     @property
     def memory(self) -> dict[str, Any]:
-        """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; those of records as they declare it"""
-        return _undeclared(self._without_axis, self.record.memory)
+        """State of the wrappers, by name of the wrapper. (n_worlds, ...) each; records declare their own axes"""
+        return _map_undeclared(self._squeeze_axis, self.record.memory)
 
     @property
     def final_obs(self) -> Obs:
@@ -122,34 +123,30 @@ class EnvState(PyTree):
         return self.record.drone_info.get("final_obs", self.obs)
 
     def replace(self, **changes: Any) -> EnvState:
-        """Return the state with other values of some properties.
-
-        Raises:
-            ConfigError: If an entry of ``info`` is neither a number of a world nor has a row for each drone.
-        """
-        whole = changes.pop("whole", self.whole)
-        record = whole.plugins[NAME]
+        """Return the state with other values of some properties."""
+        full_data = changes.pop("full_data", self.full_data)
+        record = full_data.plugins[NAME]
         if "data" in changes:
-            whole = changes.pop("data")
+            full_data = changes.pop("data")
         if "info" in changes:
-            changes |= self._divided(changes.pop("info"))
+            changes |= self._split_info(changes.pop("info"))
         if "memory" in changes:
-            changes["memory"] = _undeclared(self._with_axis, changes["memory"])
-        for name in {"terminated", "truncated", "over"} & changes.keys():
-            changes[name] = self._with_axis(changes[name])
+            changes["memory"] = _map_undeclared(self._add_axis, changes["memory"])
+        for name in {"terminated", "truncated", "must_reset"} & changes.keys():
+            changes[name] = self._add_axis(changes[name])
         record = record.replace(**changes) if changes else record
-        return EnvState(whole.replace(plugins=whole.plugins | {NAME: record}))
+        return EnvState(full_data.replace(plugins=full_data.plugins | {NAME: record}))
 
-    def _divided(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
-        """Return entries of ``info`` as those of drones and those of worlds."""
-        n, n_drones = max(self.whole.core.steps.ndim - 1, 0), self.whole.core.n_drones
+    def _split_info(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        """Return the entries of ``info`` divided into ``drone_info`` and ``world_info``."""
+        n, n_drones = max(self.full_data.core.steps.ndim - 1, 0), self.full_data.core.n_drones
         of_drones, of_worlds = {}, {}
         for name, entry in info.items():
             shapes = [jnp.shape(x) for x in jax.tree.leaves(entry)]
             if all(shape[n : n + 1] == (n_drones,) for shape in shapes):
                 of_drones[name] = entry
             elif all(len(shape) == n for shape in shapes):
-                of_worlds[name] = self._with_axis(entry)
+                of_worlds[name] = self._add_axis(entry)
             else:
                 raise ConfigError(
                     f"expected info[{name!r}] as one number of a world, (), or with a row for each of {n_drones} "
@@ -158,22 +155,22 @@ class EnvState(PyTree):
                 )
         return {"drone_info": of_drones, "world_info": of_worlds}
 
-    def _without_axis(self, x: Any) -> Any:
+    def _squeeze_axis(self, x: Any) -> Any:
         """Return an array of worlds without the axis of length 1; in one world it has none."""
-        axis = self.whole.core.steps.ndim - 1
-        return x if axis < 0 else _reshaped(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
+        axis = self.full_data.core.steps.ndim - 1
+        return x if axis < 0 else _reshape(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
 
-    def _with_axis(self, x: Any) -> Any:
+    def _add_axis(self, x: Any) -> Any:
         """Return an array of worlds with the axis of length 1; in one world it has none."""
-        axis = self.whole.core.steps.ndim - 1
-        return x if axis < 0 else _reshaped(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
+        axis = self.full_data.core.steps.ndim - 1
+        return x if axis < 0 else _reshape(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
 
 
-def _reshaped(x: Any, shape: tuple[int, ...]) -> Any:
+def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
     return jax.ShapeDtypeStruct(shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.reshape(x, shape)
 
 
-def _undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
+def _map_undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
     """Return the memory with a function applied to its arrays outside of records."""
 
     def is_record(x: object) -> bool:
@@ -195,12 +192,7 @@ def flatten(obs: Obs) -> Array:
 
 
 def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return actions of the host for all worlds, checked. (n_worlds, ...)
-
-    Raises:
-        ConfigError: If they are not finite, with the first few worlds where.
-        ValueError: If they have another shape.
-    """
+    """Return actions of the host for all worlds, checked. (n_worlds, ...)"""
     actions = np.asarray(actions, np.float32)
     if actions.shape != shape:
         raise ValueError(f"expected actions of shape {shape}, got {actions.shape}")
@@ -211,11 +203,7 @@ def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def validate_action(action: Array, state: EnvState, actions: Actions) -> Array:
-    """Return an action in the type of the state's.
-
-    Raises:
-        ValueError: If it has another shape.
-    """
+    """Return an action in the type of the state's."""
     if jnp.shape(action) != state.action.shape:
         raise ValueError(
             f"expected an action of shape {state.action.shape} = (n_worlds, n_drones, {actions.size}), got "

@@ -25,10 +25,12 @@ Output = Callable[[EnvState], Any]
 
 
 class EnvStepper:
-    """A state that advances, held flattened; its compiled step returns what a user reads after each call."""
+    """An environment state that is stored flattened and advanced in place.
+
+    Its compiled step returns what ``output`` selects, which is all that a user reads after each call.
+    """
 
     def __init__(self, env: Env, output: Output):
-        """Take the environment, and the function that selects what a step returns."""
         self._env, self._output = env, output
         self._flatten = jax.jit(env.flatten)
         self._unflatten = jax.jit(lambda flat, terminated, truncated: EnvState(flat.data()).replace(
@@ -62,9 +64,6 @@ class EnvStepper:
 
         Args:
             actions: Actions of all drones, for each world in any shape. (n_worlds, ...)
-
-        Raises:
-            ConfigError: If there is no state.
         """
         flat = self._flat
         if flat is None:

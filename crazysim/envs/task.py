@@ -26,7 +26,7 @@ class Task:
     """A task: a frozen record of settings whose methods are pure functions of one world.
 
     Subclasses are frozen dataclasses. They define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and
-    ``error``, and whatever else they need. Leaves of drones are (n_drones, ...), those of worlds have no batch axes.
+    ``error``, and whatever else they need. Leaves of drones are (n_drones, ...); leaves of worlds have no batch axes.
     What must be remembered from step to step is a record in ``data.plugins["task"]``, which ``install`` puts there.
     """
 
@@ -49,11 +49,7 @@ class Task:
     """Time at the end of an episode during which the error must stay below the tolerance, s."""
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation.
-
-        Raises:
-            ConfigError: If one has another type than its field, or a number is not finite or out of its range.
-        """
+        """Check the settings that do not depend on a simulation."""
         check_settings(self)
 
     def install(self, sim: Sim) -> None:

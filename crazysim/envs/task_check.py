@@ -25,11 +25,7 @@ REQUIRED = ("spawn", "observe", "rewards", "terminated", "error")
 
 
 def require_installed(sim: Sim, task: object) -> None:
-    """Check that a task was installed in a simulation.
-
-    Raises:
-        ConfigError: If it was not, or is no task.
-    """
+    """Check that a task was installed in a simulation."""
     if not isinstance(task, Task):
         raise ConfigError(f"expected a Task, got {task!r}. Use a class of crazysim.envs.tasks, or write one.")
     check_settings(task)
@@ -41,11 +37,7 @@ def require_installed(sim: Sim, task: object) -> None:
 
 
 def require_finite_start(task: Task, state: EnvState) -> None:
-    """Check that episodes begin in finite states.
-
-    Raises:
-        ConfigError: If one does not, with the state and the world.
-    """
+    """Check that episodes begin in finite states."""
     states = state.data.states
     for field in dataclasses.fields(states):  # type: ignore[arg-type]
         value = np.asarray(getattr(states, field.name))
@@ -63,11 +55,8 @@ def check_record(state: EnvState, after: EnvState) -> None:
     Args:
         state: State at the start of an episode.
         after: Shapes and types of the state after a step.
-
-    Raises:
-        ConfigError: If a name, a shape or a type differs, or memory has axes of which worlds cannot be divided.
     """
-    kinds = jax.tree.leaves(scopes(state.record))
+    kinds, n_drones = jax.tree.leaves(scopes(state.record)), state.full_data.core.n_drones
     had, has = (dict(tree_leaves_with_path(x.record)) for x in (state, after))
     for (path, x), kind in zip(had.items(), kinds, strict=True):
         name = keystr(path).lstrip(".")
@@ -76,16 +65,16 @@ def check_record(state: EnvState, after: EnvState) -> None:
                 f"expected {name} to be declared for drones, worlds or all of them, got a field that is {kind!r}. "
                 f'Declare it with leaf("drone"), leaf("world") or leaf("shared").'
             )
-        if kind == "drone" and x.shape[1:2] != (state.whole.core.n_drones,):
+        if kind == "drone" and x.shape[1:2] != (n_drones,):
             raise ConfigError(
-                f"expected {name} of shape (n_drones, ...) in one world, with {state.whole.core.n_drones} drones, got "
-                f"{x.shape[1:]}. Return one row for every drone."
+                f"expected {name} of shape (n_drones, ...) in one world, with {n_drones} drones, got {x.shape[1:]}. "
+                f"Return one row for every drone."
             )
         y = has.get(path)
         if y is None or (x.shape, x.dtype) != (y.shape, y.dtype):
             raise ConfigError(
-                f"expected a step to return {name} as it is at the start of an episode, {_described(x)}, got "
-                f"{'none' if y is None else _described(y)}. Tasks and wrappers return the same names and shapes always."
+                f"expected a step to return {name} as it is at the start of an episode, {_describe(x)}, got "
+                f"{'none' if y is None else _describe(y)}. Tasks and wrappers return the same names and shapes always."
             )
     if further := [keystr(path).lstrip(".") for path in has if path not in had]:
         raise ConfigError(
@@ -103,9 +92,6 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         task: The task, installed.
         data: Data of all worlds.
         action_size: Length of the action of one drone.
-
-    Raises:
-        ConfigError: If a method is missing, or returns another type or shape, with task, method and name.
     """
     title = f"task {task.name or type(task).__name__!r}"
     missing = [name for name in REQUIRED if getattr(type(task), name) is getattr(Task, name)]
@@ -116,7 +102,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         )
     n_worlds, n_drones = data.states.pos.shape[:2]
     batch, names = ((n_worlds,), "n_worlds, ") if task.batched else ((), "")
-    one = data if task.batched else jax.tree.map(_of_world, scopes(data), data)
+    one = data if task.batched else jax.tree.map(_world_shape, scopes(data), data)
     action = jax.ShapeDtypeStruct((*batch, n_drones, action_size), data.states.pos.dtype)
     obs, rewards, terminated, error, info = jax.eval_shape(
         lambda data, action: (
@@ -128,7 +114,7 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
     for method, result in (("observe", obs), ("rewards", rewards)):
         if not isinstance(result, Mapping) or not result:
             raise ConfigError(
-                f"{title}: expected {method} to return a dict of names to arrays, got {_described(result)}. {GUIDE} "
+                f"{title}: expected {method} to return a dict of names to arrays, got {_describe(result)}. {GUIDE} "
                 f"has an example."
             )
     per_drone = (*batch, n_drones)
@@ -137,35 +123,35 @@ def check_task(task: Task, data: SimData, action_size: int) -> None:
         if shape[:-1] != per_drone or len(shape) != len(per_drone) + 1:
             raise ConfigError(
                 f"{title}: expected observation {name!r} of shape ({names}n_drones, k) = "
-                f"({', '.join(map(str, per_drone))}, k), got {_described(x)}. For one number per drone use x[:, None]; "
+                f"({', '.join(map(str, per_drone))}, k), got {_describe(x)}. For one number per drone use x[:, None]; "
                 f"for one array per drone use x.reshape(n_drones, -1)."
             )
     for name, x in [(f"reward term {name!r}", x) for name, x in rewards.items()] + [("error", error)]:
         if getattr(x, "shape", None) != per_drone:
             raise ConfigError(
-                f"{title}: expected {name} of shape ({names}n_drones,) = {per_drone}, got {_described(x)}. For the "
+                f"{title}: expected {name} of shape ({names}n_drones,) = {per_drone}, got {_describe(x)}. For the "
                 f"same number for all drones use jnp.full(data.core.n_drones, x)."
             )
     for name, x in info.items():
         if x.shape != batch and x.shape[: len(per_drone)] != per_drone:
             raise ConfigError(
                 f"{title}: expected info {name!r} of shape ({names.removesuffix(', ')}) or ({names}n_drones, ...) = "
-                f"({', '.join(map(str, per_drone))}, ...), got {_described(x)}. For an array of the world use "
+                f"({', '.join(map(str, per_drone))}, ...), got {_describe(x)}. For an array of the world use "
                 f"jnp.broadcast_to(x, (data.core.n_drones, *x.shape))."
             )
     if getattr(terminated, "shape", None) != batch or not jnp.issubdtype(terminated.dtype, jnp.bool_):
         raise ConfigError(
             f"{title}: expected terminated of type bool and shape ({names.removesuffix(', ')}), got "
-            f"{_described(terminated)}. It is of a world: use jnp.any or jnp.all over its drones."
+            f"{_describe(terminated)}. It is of a world: use jnp.any or jnp.all over its drones."
         )
 
 
-def _of_world(scope: str, x: Array) -> jax.ShapeDtypeStruct:
+def _world_shape(scope: str, x: Array) -> jax.ShapeDtypeStruct:
     """Return shape and type of a leaf as functions of one world receive it."""
     return jax.ShapeDtypeStruct(x.shape[n_world_axes(scope) :], x.dtype)
 
 
-def _described(x: object) -> str:
+def _describe(x: object) -> str:
     if not hasattr(x, "shape"):
         return f"a {type(x).__name__}" if not isinstance(x, Mapping) else "an empty dict"
     return f"shape {x.shape} and type {x.dtype}"

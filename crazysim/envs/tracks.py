@@ -16,9 +16,9 @@ CELL = (1.0, 1.2)
 """Size of the cells that a random course spreads its gates over, along x and y, m."""
 MARGIN = (0.5, 0.3)
 """Distance of the cells from the limits of the arena, m."""
-IN_CELL = 0.05
+CELL_JITTER = 0.05
 """Most of each component of a gate's distance from the middle of its cell, m."""
-TURN = 1.0
+MAX_TURN = 1.0
 """Most that a gate of a random course is turned from the way that leads to it, rad."""
 START_SPACING = 0.4
 """Distance of the starts of one world, m."""
@@ -30,7 +30,7 @@ Points = Sequence[Sequence[float]]
 
 @dataclass(frozen=True)
 class Track:
-    """A course. The default is that of lsy_drone_racing's levels 0 to 2, with the start in the air."""
+    """A course. The default is the course of lsy_drone_racing's levels 0 to 2, with the start in the air."""
 
     gates_pos: Points = ((0.5, 0.25, 0.7), (1.05, 0.75, 1.2), (-1.0, -0.25, 0.7), (0.0, -0.75, 1.2))
     """Middle of each gate's opening, in the order of the race, m. (n_gates, 3)"""
@@ -63,7 +63,7 @@ class Track:
         return int(n_x), int(n_y)
 
 
-def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
+def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
     """Return a track that can be flown from its starts.
 
     Args:
@@ -71,10 +71,6 @@ def checked(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
         n_drones: Drones in a world.
         jitter: Farthest that drones, gates and obstacles together are moved from their places in the plane, m.
         random: True if gates and obstacles are placed at random.
-
-    Raises:
-        ConfigError: If a shape or number cannot be, a start is too near to a gate, to an obstacle or to the arena's
-            limits, or a random course finds no room.
     """
     shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
     for name, shape in (shapes | {"start": (3,), "low": (3,), "high": (3,)}).items():
@@ -126,7 +122,7 @@ def start_offsets(n_drones: int) -> np.ndarray:
     return offsets - middle
 
 
-def n_random(track: Track) -> int:
+def random_count(track: Track) -> int:
     """Return how many random numbers a random course takes."""
     n_x, n_y = track.grid
     return n_x * n_y + (n_x + 1) * (n_y + 1) + 3 * track.n_gates
@@ -140,7 +136,7 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     Args:
         track: Heights, numbers and limits.
-        x: Random numbers in [0, 1). (..., n_random)
+        x: Random numbers in [0, 1). (..., random_count)
 
     Returns:
         Start, m (..., 3), positions of gates, m (..., n_gates, 3), their attitudes, xyzw (..., n_gates, 4), positions
@@ -154,17 +150,17 @@ def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
 
     cell = ranks(cells, n + 1)
     flat = jnp.asarray(first) + size * jnp.stack([cell % n_x, cell // n_x], axis=-1)
-    shift = IN_CELL * (2 * within.reshape(*x.shape[:-1], n, 2) - 1)
+    shift = CELL_JITTER * (2 * within.reshape(*x.shape[:-1], n, 2) - 1)
     gates = flat[..., 1:, :] + shift
     start = jnp.concatenate([flat[..., 0, :], jnp.full_like(flat[..., 0, :1], START_HEIGHT)], axis=-1)
 
     way = gates - jnp.concatenate([flat[..., :1, :], gates[..., :-1, :]], axis=-2)
-    yaw = jnp.arctan2(way[..., 1], way[..., 0]) + TURN * (2 * turns - 1)
+    yaw = jnp.arctan2(way[..., 1], way[..., 0]) + MAX_TURN * (2 * turns - 1)
     quat = rotation.from_rpy(jnp.stack([0 * yaw, 0 * yaw, yaw], axis=-1))
 
     corner = ranks(corners, track.n_obstacles)
     poles = jnp.asarray(first - size / 2) + size * jnp.stack([corner % (n_x + 1), corner // (n_x + 1)], axis=-1)
-    return start, _raised(gates, track.gates_pos), quat, _raised(poles, track.obstacles_pos)
+    return start, _add_height(gates, track.gates_pos), quat, _add_height(poles, track.obstacles_pos)
 
 
 def ranks(x: Array, n: int) -> Array:
@@ -183,6 +179,6 @@ def ranks(x: Array, n: int) -> Array:
     return jnp.sum((others < mine) | ((others == mine) & earlier), axis=-1, dtype=jnp.int32)
 
 
-def _raised(flat: Array, points: Points) -> Array:
+def _add_height(flat: Array, points: Points) -> Array:
     height = np.asarray(points, float)[:, 2:].astype(flat.dtype)
     return jnp.concatenate([flat, jnp.broadcast_to(height, (*flat.shape[:-1], 1))], axis=-1)

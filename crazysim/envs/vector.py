@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode as GymnasiumMode
 from jax import Array
 
-from crazysim.cache import announced
+from crazysim.cache import announce_if_slow
 from crazysim.core.settings import as_mask, enum_member, positive_integer
 from crazysim.envs.env import DroneEnv, Env
 from crazysim.envs.random import as_seed
@@ -21,7 +21,7 @@ from crazysim.envs.rendering import RENDER_MODES, Renderer
 from crazysim.envs.state import EnvState, check_actions
 from crazysim.envs.stepper import EnvStepper
 from crazysim.envs.wrappers import AutoReset, AutoresetMode
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 
 
 class DroneVectorEnv(gymnasium.vector.VectorEnv):
@@ -42,7 +42,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         render_size: tuple[int, int] = (640, 480),
         numpy: bool = False,
     ):
-        """Take the functional environment, without automatic resets.
+        """Wrap a functional environment that does not reset automatically.
 
         Args:
             env: The environment.
@@ -52,9 +52,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             render_worlds: Worlds to render; None for all, as Gymnasium's wrapper ``RecordVideo`` needs.
             render_size: Width and height of an image, pixels.
             numpy: True to return NumPy arrays, copies that may be written to.
-
-        Raises:
-            ConfigError: If there is no such mode or world, or the environment resets automatically.
         """
         mode = enum_member(GymnasiumMode, "autoreset_mode", autoreset_mode)
         self.env = AutoReset(env, AutoresetMode(mode.value))
@@ -67,12 +64,12 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         }
         self.num_envs, self._numpy = env.sim.n_worlds, bool(numpy)
         self._single = env.sim.n_drones == 1
-        self._begin = jax.jit(self.env.reset)
-        self._again = jax.jit(self.env.restart)
+        self._reset_fn = jax.jit(self.env.reset)
+        self._restart_fn = jax.jit(self.env.restart)
         self._stepper = EnvStepper(self.env, self._output)
         self._outputs: Any = None
-        shapes = self._begin.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
-        self._of_drone = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
+        shapes = self._reset_fn.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
+        self._drone_entries = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
         self.single_observation_space = gymnasium.spaces.Dict(
             {name: self._box(x, np.inf) for name, x in shapes.obs.items()}
         )
@@ -81,13 +78,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start new episodes in all worlds, or in those of ``options["reset_mask"]``, (num_envs,) of type bool.
+        """Start new episodes in all worlds, or where ``options["reset_mask"]`` is True, (num_envs,) of type bool.
 
         Without a seed the random numbers continue those before; the first ones come from the system.
-
-        Raises:
-            ConfigError: If the seed is no integer that is at least 0, an option does not exist, or there is a mask
-                before the first reset of all worlds.
         """
         options = dict(options or {})
         mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
@@ -97,20 +90,20 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         before = self.state
         if mask is not None and seed is not None:
             raise ConfigError(
-                "expected a seed or a reset_mask, got both. Leave the seed out: it is that of all worlds."
+                "expected a seed or a reset_mask, got both. Leave the seed out: it belongs to all worlds."
             )
         if mask is not None and before is None:
             raise ConfigError("expected a reset of all worlds before the first reset_mask, got none. Call reset().")
         super().reset(seed=seed)
         if mask is not None:
-            state = self._again(before, mask)
+            state = self._restart_fn(before, mask)
         else:
             number = seed if seed is not None else int(self.np_random.integers(2**31))
-            with announced("compiling the environment", "2 to 4 s"):
-                state = self._begin(jax.random.key(number))
+            with announce_if_slow("compiling the environment", "2 to 4 s"):
+                state = self._reset_fn(jax.random.key(number))
         self._stepper.state, self._outputs = state, self._output(state)
         obs, _, info = self._outputs
-        return self._handed((obs, self._with_final_info(info)))
+        return self._convert((obs, self._with_final_info(info)))
 
     @property
     def state(self) -> EnvState | None:
@@ -120,7 +113,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             return None
         obs, reward, info = self._outputs
         n = (self.num_envs, self.sim.n_drones)
-        of_drones = self._of_drone if self._single else ()
+        of_drones = self._drone_entries if self._single else ()
         entries = {k: v.reshape(*n, *v.shape[1:]) if k in of_drones else v for k, v in info.items() if k in state.info}
         if "final_obs" in entries:
             entries["final_obs"] = {k: v.reshape(*n, -1) for k, v in info["final_obs"].items()}
@@ -132,10 +125,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             actions: (num_envs, k), or (num_envs, n_drones, k) with several drones.
-
-        Raises:
-            ConfigError: If the environment was not reset, or actions of the host are not finite.
-            ValueError: If the actions have another shape.
         """
         if self._outputs is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
@@ -148,33 +137,37 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         obs, reward, info = self._outputs
         if self.render_mode == "human":
             self.render()
-        return self._handed((obs, reward, terminated, truncated, self._with_final_info(info)))
+        return self._convert((obs, reward, terminated, truncated, self._with_final_info(info)))
 
     def _with_final_info(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return the info with ``final_info``, that of the episodes that have ended, as Gymnasium defines it."""
+        """Return the info with ``final_info``, the info of the episodes that have ended, as Gymnasium defines it."""
         over = info.get("_final_obs")
         if over is None:
             return info
         final = {k: v for k, v in info.items() if not k.endswith("final_obs")}
         return info | {"final_info": final | {f"_{k}": over for k in final}, "_final_info": over}
 
-    def _handed(self, results: Any) -> Any:
+    def _convert(self, results: Any) -> Any:
         """Return results as the caller gets them."""
         return jax.tree.map(np.array, results) if self._numpy else results
 
     def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
         """Return observations, rewards and infos in Gymnasium's form."""
         reward = state.reward[:, 0] if self._single else jnp.mean(state.reward, axis=1)
-        return self._of_drones(state.obs), reward, self._info(state)
+        return self._squeeze_drones(state.obs), reward, self._info(state)
 
-    def _of_drones(self, tree: Any) -> Any:
+    def _squeeze_drones(self, tree: Any) -> Any:
         """Return arrays of drones, without the axis of drones if there is one drone."""
         return jax.tree.map(lambda x: x[:, 0], tree) if self._single else tree
 
     def _info(self, state: EnvState) -> dict[str, Any]:
-        info = {k: self._of_drones(v) if k in self._of_drone else v for k, v in state.info.items() if k != "final_obs"}
+        info = {
+            k: self._squeeze_drones(v) if k in self._drone_entries else v
+            for k, v in state.info.items()
+            if k != "final_obs"
+        }
         if "final_obs" in state.info:
-            info |= {"final_obs": self._of_drones(state.info["final_obs"]), "_final_obs": state.done}
+            info |= {"final_obs": self._squeeze_drones(state.info["final_obs"]), "_final_obs": state.done}
         return info
 
     def _box(self, x: Any, limit: float) -> gymnasium.spaces.Box:
@@ -185,7 +178,6 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         """Render all worlds, or those that were chosen: return an image (height, width, 3) of each, or draw the first.
 
         Raises:
-            ConfigError: If the environment was made without ``render_mode``, or was not reset.
             RenderError: If this machine cannot render.
         """
         images = self._renderer(self.state)
@@ -219,20 +211,17 @@ def make_vector(
         num_envs: Number of worlds.
         autoreset_mode: Mode of automatic resets.
         render_mode: Mode of ``render``.
-        max_episode_steps: Length of an episode, steps; None for that of the task, or of its setting ``seconds``.
+        max_episode_steps: Length of an episode, steps; None for the task's, or its setting ``seconds``.
         numpy: True to return NumPy arrays, copies that may be written to.
         render_worlds: Worlds to render; None for all.
         render_size: Width and height of an image, pixels.
         options: Options of ``crazysim.envs.make``.
-
-    Raises:
-        ConfigError: If an option does not exist, or both ``max_episode_steps`` and ``seconds`` are given.
     """
     if max_episode_steps is not None:
         if "seconds" in options:
             raise ConfigError(
-                f"expected max_episode_steps or seconds, got {shown(max_episode_steps)} and "
-                f"{shown(options['seconds'])}: both are the length of an episode. Leave one out."
+                f"expected max_episode_steps or seconds, got {short_repr(max_episode_steps)} and "
+                f"{short_repr(options['seconds'])}: both are the length of an episode. Leave one out."
             )
         options["seconds"] = positive_integer("max_episode_steps", max_episode_steps) / positive_integer(
             "freq", options.get("freq", 50)

@@ -15,9 +15,9 @@ from urllib.parse import urlsplit
 
 from crazysim.errors import RenderError
 
-EVERYWHERE = ("0.0.0.0", "::")
+WILDCARD_ADDRESSES = ("0.0.0.0", "::")
 """Addresses to listen at that stand for every network."""
-LOCAL = ("127.0.0.1", "localhost", "::1")
+LOOPBACK_ADDRESSES = ("127.0.0.1", "localhost", "::1")
 """Addresses that other machines cannot reach."""
 
 log = logging.getLogger(__name__)
@@ -27,11 +27,11 @@ class Access:
     """Address of a live page, and the check of its requests.
 
     A page of another site can send requests to this machine, with the name of its own site as ``Origin``, or, once that
-    name is resolved to this machine, as ``Host``. Both are refused, and so is who does not have the token.
+    name is resolved to this machine, as ``Host``. Both are refused, and so are requests without the token.
     """
 
     def __init__(self, host: str, port: int):
-        """Make a new token.
+        """Create the access with a new token.
 
         Args:
             host: Address that the server listens at.
@@ -44,7 +44,7 @@ class Access:
     @property
     def url(self) -> str:
         """Address for a browser, with the token."""
-        host = "127.0.0.1" if self.host in EVERYWHERE else self.host
+        host = "127.0.0.1" if self.host in WILDCARD_ADDRESSES else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}"
 
     def refusal(self, path: str, headers: Mapping[str, str]) -> str:
@@ -56,10 +56,10 @@ class Access:
         """
         host, origin = headers.get("Host", ""), headers.get("Origin")
         if not is_own_name(host, self.host):
-            return wrong_name(host)
+            return wrong_name_message(host)
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
             return f"expected a request of this page itself, got one of {origin!r}. Open the page in a tab of its own."
-        if not hmac.compare_digest(self._first(path).encode(errors="replace"), self._token.encode()):
+        if not hmac.compare_digest(self._first_part(path).encode(errors="replace"), self._token.encode()):
             return "expected the address with its token, got another one. Use the address that the program printed."
         return ""
 
@@ -75,7 +75,7 @@ class Access:
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
 
     @staticmethod
-    def _first(path: str) -> str:
+    def _first_part(path: str) -> str:
         return path.partition("?")[0].split("/")[1] if path.startswith("/") else ""
 
 
@@ -102,7 +102,7 @@ def is_own_name(host: str, listening: str) -> bool:
     return True
 
 
-def wrong_name(host: str) -> str:
+def wrong_name_message(host: str) -> str:
     """Return the message for a ``Host`` header that is refused."""
     return f"expected an address of this machine, got {host!r}. Use its number, its name or localhost."
 
@@ -129,12 +129,12 @@ def guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
         if not handler.__module__.startswith("viser."):
             return original(handler, *args, process_request=process_request, **options)
 
-        def checked(connection: Any, request: Any) -> Any:
+        def process_checked(connection: Any, request: Any) -> Any:
             refused = access.answer(connection, request)
             return process_request(connection, request) if refused is None else refused
 
         guarded = True
-        return original(handler, *args, process_request=checked, **options)
+        return original(handler, *args, process_request=process_checked, **options)
 
     with _LOCK:
         original, library.serve = library.serve, serve

@@ -45,7 +45,6 @@ def render_worlds(
             draw everything.
 
     Raises:
-        ValueError: If a world, the camera or the renderer does not exist, or the size is invalid.
         ImportError: If ``renderer="warp"`` and MuJoCo Warp is not installed.
         RenderError: If this machine cannot draw.
     """

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, RenderError, not_installed
 from crazysim.media.flight import Flight
-from crazysim.media.flight_recorder import Clock, put
+from crazysim.media.flight_recorder import Clock, show_flight_at
 from crazysim.media.view import View
 from crazysim.media.worlds import require_world
 from crazysim.progress import progress_bar
@@ -67,7 +67,6 @@ class Film:
             total: Expected number of frames, for the bar.
 
         Raises:
-            ConfigError: If an argument is invalid.
             ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         """
         self.path, self.view = Path(path), View() if view is None else view
@@ -94,7 +93,6 @@ class Film:
         """Add the frames that are due, and return their number.
 
         Raises:
-            ValueError: If the view shows a world, camera or drone that does not exist.
             RenderError: If this machine cannot draw, or the file cannot be written.
         """
         first = self.view.worlds[0]
@@ -124,7 +122,7 @@ class Film:
             self._bar.total = len(times)
         try:
             for time in times:
-                put(sim, flight, float(time))
+                show_flight_at(sim, flight, float(time))
                 self.write(self.view.render(sim))
         finally:
             sim.data = data
@@ -138,7 +136,6 @@ class Film:
             n_frames: Number of frames.
 
         Raises:
-            ConfigError: If the image has another shape or type.
             RenderError: If the file cannot be written.
         """
         pixels, needed = np.asarray(image), (self.view.height, self.view.width, 3)
@@ -159,7 +156,6 @@ class Film:
         """Finish the file.
 
         Raises:
-            ConfigError: If it has no frame.
             RenderError: If the file cannot be written.
         """
         if self._bar is not None:

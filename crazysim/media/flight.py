@@ -150,9 +150,9 @@ def _shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
     ]
 
 
-SCENE, SAMPLE = b"SCEN", b"SAMP"
+SCENE_CHUNK, SAMPLE_CHUNK = b"SCEN", b"SAMP"
 """Kinds of chunks of a flight: what does not change, and one sample."""
-SAMPLED = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
+SAMPLE_FIELDS = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
 """Fields of a sample, in their order in a chunk."""
 
 
@@ -163,22 +163,18 @@ def pack_scene(scene: dict[str, Any]) -> bytes:
 
 
 def pack_sample(sample: dict[str, Any]) -> bytes:
-    """Return a sample as a chunk of a journal: float64 in the order of ``SAMPLED``; sizes follow from the scene."""
-    return np.concatenate([np.ravel(sample[name]) for name in SAMPLED]).astype("<f8").tobytes()
+    """Return a sample as a chunk of a journal: float64, in the order of ``SAMPLE_FIELDS``; the scene has the sizes."""
+    return np.concatenate([np.ravel(sample[name]) for name in SAMPLE_FIELDS]).astype("<f8").tobytes()
 
 
 def _read_samples(path: Path) -> dict[str, NDArray]:
-    """Return the arrays of a flight in a journal.
-
-    Raises:
-        ValueError: If it holds no sample.
-    """
+    """Return the arrays of a flight in a journal."""
     scene: dict[str, NDArray] = {}
     samples: list[NDArray] = []
     for kind, content in read_journal(path):
-        if kind == SCENE:
+        if kind == SCENE_CHUNK:
             scene = unpack_arrays(content)
-        elif kind == SAMPLE:
+        elif kind == SAMPLE_CHUNK:
             samples.append(np.frombuffer(content, "<f8"))
     if not samples or not scene:
         raise ValueError("expected at least one sample, got none")
@@ -189,5 +185,5 @@ def _read_samples(path: Path) -> dict[str, NDArray]:
     parts = np.split(values, ends, axis=1)
     shapes = [*sizes, (n_worlds, parts[-1].shape[1] // (3 * n_worlds), 3)]
     return scene | {
-        name: part.reshape(len(values), *shape) for name, part, shape in zip(SAMPLED, parts, shapes, strict=True)
+        name: part.reshape(len(values), *shape) for name, part, shape in zip(SAMPLE_FIELDS, parts, shapes, strict=True)
     }

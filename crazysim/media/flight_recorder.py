@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crazysim.core.functional import feedforward_of, stage_command, staged_leaves
 from crazysim.eager import fetch_rows
 from crazysim.errors import ConfigError
-from crazysim.media.flight import SAMPLE, SCENE, Flight, pack_sample, pack_scene
+from crazysim.media.flight import SAMPLE_CHUNK, SCENE_CHUNK, Flight, pack_sample, pack_scene
 from crazysim.media.journal import Journal
 from crazysim.media.poses import mocap_poses
 from crazysim.media.worlds import world_indices
@@ -26,7 +26,6 @@ class Clock:
     """Time since the start of a recording, which resets of the world do not set back."""
 
     def __init__(self) -> None:
-        """Begin at zero."""
         self.elapsed = 0.0
         self._last: float | None = None
 
@@ -52,7 +51,7 @@ class Recorder:
     """
 
     def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
-        """Prepare to record; ``add`` records the first sample.
+        """Create a recorder without samples.
 
         Args:
             sim: Simulation.
@@ -70,7 +69,7 @@ class Recorder:
         self._n, self._last = 0, -np.inf
         self._journal = None if path is None else Journal(path)
         if self._journal is not None:
-            self._journal.append(SCENE, pack_scene(self._scene))
+            self._journal.append(SCENE_CHUNK, pack_scene(self._scene))
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -82,7 +81,7 @@ class Recorder:
         A second sample at the same time replaces the first, or in a file is left out.
 
         Args:
-            time: Time since the start of the recording, s; None for that of the first recorded world, which resets of
+            time: Time since the start of the recording, s; None for the first recorded world's, which resets of
                 the world do not set back.
 
         Raises:
@@ -111,15 +110,11 @@ class Recorder:
         if self._journal is None:
             self._samples.append(sample)
         else:
-            self._journal.append(SAMPLE, pack_sample(sample))
+            self._journal.append(SAMPLE_CHUNK, pack_sample(sample))
         self._n, self._last = self._n + 1, time
 
     def flight(self) -> Flight:
-        """Return the flight up to the last sample.
-
-        Raises:
-            ConfigError: If there is no sample.
-        """
+        """Return the flight up to the last sample."""
         if not self._n:
             raise ConfigError("expected at least one sample, got none. Call recorder.add() between steps.")
         if self._journal is not None:
@@ -142,9 +137,6 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
         states: Record with ``pos`` (n, n_worlds, n_drones, 3) and ``quat`` (n, n_worlds, n_drones, 4).
         dt: Time between two states, s.
         worlds: Indices of the worlds to record; None for all.
-
-    Raises:
-        ConfigError: If the states have other shapes, or a world does not exist.
     """
     indices, needed = world_indices(sim, worlds), (sim.n_worlds, sim.n_drones)
     if np.shape(states.pos)[1:] != (*needed, 3) or np.shape(states.quat) != (len(states.pos), *needed, 4):
@@ -169,8 +161,8 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
     )
 
 
-def put(sim: Sim, flight: Flight, time: float) -> None:
-    """Set poses, setpoints and clock of a simulation to those of a flight, to draw them.
+def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
+    """Set poses, setpoints and clock of a simulation to a moment of a flight, to draw it.
 
     Bodies are drawn as they were recorded, also those that plugins place, such as loads. Velocities, controllers and
     records of plugins stay as they are. To continue a simulation, keep ``data = sim.data`` and restore it.
@@ -179,9 +171,6 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
         sim: Simulation with the drones, worlds and bodies of the one that was recorded.
         flight: Flight.
         time: Time of the flight, s.
-
-    Raises:
-        ConfigError: If the simulation has other drones, worlds or bodies.
     """
     worlds = flight.worlds
     world_indices(sim, worlds.tolist())
@@ -210,7 +199,7 @@ def put(sim: Sim, flight: Flight, time: float) -> None:
     data = data.replace(states=states, core=core, objects=objects)
     if "setpoint" in changed:
         command, (_, *before) = changed["setpoint"], staged_leaves(data)
-        feedforward = [x.at[worlds].set(feedforward_of(command)[worlds]) for x in before]  # those of other worlds stay
+        feedforward = [x.at[worlds].set(feedforward_of(command)[worlds]) for x in before]  # other worlds keep theirs
         data = stage_command(data, command, *feedforward)
     sim.data = data
     body_pos, body_quat = _bodies(sim, worlds)

@@ -19,15 +19,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.closing import Closing
 from crazysim.errors import ConfigError
-from crazysim.storage import read_arrays
+from crazysim.storage import Closing, read_arrays
 
 log = logging.getLogger(__name__)
 
 MAGIC = b"crazysim journal 1\n"
 """First line of a journal."""
-HEAD = struct.Struct("<4sQI")
+CHUNK_HEADER = struct.Struct("<4sQI")
 """Head of a chunk: kind, length of the content, checksum."""
 
 
@@ -70,15 +69,13 @@ class Journal(Closing):
             content: Content.
 
         Raises:
-            ConfigError: If the kind has another length.
             OSError: If it cannot be written, for example because the disk is full.
         """
         if len(kind) != 4:
             raise ConfigError(f"expected a kind of 4 bytes, got {kind!r}")
-        self._write(HEAD.pack(kind, len(content), zlib.crc32(content, zlib.crc32(kind))) + content)
+        self._write(CHUNK_HEADER.pack(kind, len(content), zlib.crc32(content, zlib.crc32(kind))) + content)
 
     def close(self) -> None:
-        """Close the file."""
         if self.is_open:
             os.close(self._file)
             self._file = -1
@@ -103,8 +100,8 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
             raise ValueError(f"the first line is not {MAGIC.decode().strip()!r}")
         size = os.fstat(file.fileno()).st_size
         while (start := file.tell()) < size:
-            head = file.read(HEAD.size)
-            kind, length, checksum = HEAD.unpack(head) if len(head) == HEAD.size else (b"", size, 0)
+            head = file.read(CHUNK_HEADER.size)
+            kind, length, checksum = CHUNK_HEADER.unpack(head) if len(head) == CHUNK_HEADER.size else (b"", size, 0)
             content = file.read(length) if length <= size - file.tell() else b""
             if len(content) < length or zlib.crc32(content, zlib.crc32(kind)) != checksum:
                 log.warning("%s is cut off or damaged at byte %d of %d; what is before it was read", path, start, size)

@@ -31,13 +31,10 @@ class Trail:
     """
 
     def __init__(self, seconds: float):
-        """Begin with an empty trail.
+        """Create an empty trail.
 
         Args:
             seconds: Duration of the trail, s.
-
-        Raises:
-            ConfigError: If the duration is not positive.
         """
         if not np.isfinite(seconds) or seconds <= 0:
             raise ConfigError(f"expected a positive duration of a trail, s, got {seconds!r}")
@@ -54,9 +51,6 @@ class Trail:
         Args:
             time: Time of each world, s. (n_worlds,)
             pos: Positions of the drones, world frame, m. (n_worlds, n_drones, 3)
-
-        Raises:
-            ConfigError: If the shapes do not match each other or earlier calls.
         """
         now, pos = np.array(time, float), np.array(pos, float)
         if pos.ndim != 3 or pos.shape[2] != 3 or now.shape != pos.shape[:1]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import check_settings, color, positive_integer, setting
 from crazysim.eager import fetch_rows
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.media.trail import Trail, colors_of
 from crazysim.media.worlds import world_indices
 from crazysim.sim.sim import Sim
@@ -23,9 +23,9 @@ BORDER_COLOR = 40
 MAX_PIXELS = 16_384
 """Largest width and height of an image."""
 
-LEAST_RADIUS = 0.25
+MIN_VIEW_RADIUS = 0.25
 """Least radius around points that a camera holds in view, m: at it a Crazyflie is a sixth of the image's height."""
-ROOM = 1.25
+DISTANCE_MARGIN = 1.25
 """Distance of a camera that holds points in view, as a multiple of that from which they just fit."""
 
 
@@ -71,11 +71,7 @@ class View:
     _aim: dict[int, tuple[float, NDArray]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation.
-
-        Raises:
-            ConfigError: If a setting is invalid.
-        """
+        """Check the settings that do not depend on a simulation."""
         check_settings(self)
         self.width, self.height = (
             positive_integer(name, getattr(self, name), MAX_PIXELS) for name in ("width", "height")
@@ -128,7 +124,6 @@ class View:
         Overlays that were drawn with ``crazysim.sim.visualize`` appear in each of the worlds.
 
         Raises:
-            ValueError: If a world, the camera or the drone does not exist.
             RenderError: If this machine cannot draw.
         """
         time, pos = self._sample(sim)
@@ -150,7 +145,6 @@ class View:
         """Show the first of the worlds in a window of the view's size.
 
         Raises:
-            ValueError: If the world, the camera or the drone does not exist.
             RenderError: If there is no screen.
         """
         time, pos = self._sample(sim)
@@ -187,20 +181,22 @@ class View:
         """Return the settings of the free camera for the k-th world, with drones at ``pos``."""
         config = self.cam_config(time) if callable(self.cam_config) else self.cam_config
         if config is not None and not isinstance(config, Mapping):
-            raise ConfigError(f"expected cam_config to return a dict, got {shown(config)}. Use {{'distance': 3.0}}.")
+            raise ConfigError(
+                f"expected cam_config to return a dict, got {short_repr(config)}. Use {{'distance': 3.0}}."
+            )
         config = dict(config or {})
         if self.follow is not None:
-            config["lookat"] = self._smooth(k, time, pos[self.follow])
+            config["lookat"] = self._smooth_aim(k, time, pos[self.follow])
         if self.hold is not None:
             held = np.asarray(self.hold(sim, self.worlds[k]), float)
             if held.shape[-1:] != (3,):
                 raise ConfigError(f"expected hold to return points of shape (n, 3), got shape {held.shape}.")
             points = np.concatenate([pos, held.reshape(-1, 3)])
-            aim = self._smooth(k, time, _aim_at(points, float(sim.mj_model.vis.global_.fovy)))
+            aim = self._smooth_aim(k, time, _aim_at(points, float(sim.mj_model.vis.global_.fovy)))
             config |= {"lookat": aim[:3], "distance": aim[3]}
         return config
 
-    def _smooth(self, k: int, time: float, aim: NDArray) -> NDArray:
+    def _smooth_aim(self, k: int, time: float, aim: NDArray) -> NDArray:
         """Return where the camera of the k-th world aims, with first-order lag; after a reset it jumps."""
         before, value = self._aim.get(k, (np.inf, aim))
         weight = 1.0 if time < before or self.lag == 0 else 1 - np.exp(-(time - before) / self.lag)
@@ -221,8 +217,8 @@ def _aim_at(points: NDArray, fovy: float) -> NDArray:
     if not len(points):
         return np.full(4, np.nan)
     middle = (points.min(0) + points.max(0)) / 2
-    radius = max(float(np.linalg.norm(points - middle, axis=-1).max()), LEAST_RADIUS)
-    return np.append(middle, ROOM * radius / np.sin(np.radians(fovy) / 2))
+    radius = max(float(np.linalg.norm(points - middle, axis=-1).max()), MIN_VIEW_RADIUS)
+    return np.append(middle, DISTANCE_MARGIN * radius / np.sin(np.radians(fovy) / 2))
 
 
 def _fill(text: str | None, world: int, time: float) -> str:

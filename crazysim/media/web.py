@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, RenderError, not_installed
-from crazysim.media.access import LOCAL, Access, guarded_server, is_own_name, wrong_name
+from crazysim.media.access import LOOPBACK_ADDRESSES, Access, guarded_server, is_own_name, wrong_name_message
 from crazysim.media.flight import Flight
 from crazysim.media.trail import colors_of
 from crazysim.scene.visual_geoms import VisualGeom
@@ -89,7 +89,7 @@ def server_of(html: str, port: int, host: str = "127.0.0.1") -> http.server.Thre
         def do_GET(self) -> None:
             name = self.headers.get("Host", "")
             if not is_own_name(name, host):
-                self.send_error(403, explain=wrong_name(name))
+                self.send_error(403, explain=wrong_name_message(name))
                 return
             self.send_response(200)
             self.send_header("Content-Type", "text/html; charset=utf-8")
@@ -134,7 +134,7 @@ def serve_page(html: str, port: int = 8080, host: str = "127.0.0.1") -> None:
     """
     with server_of(html, port, host) as server:
         print(f"serving the flight at http://{host}:{server.server_port}; stop with Ctrl-C", flush=True)
-        if host not in LOCAL:
+        if host not in LOOPBACK_ADDRESSES:
             print("every machine of that network can watch", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()

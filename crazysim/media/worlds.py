@@ -17,9 +17,6 @@ def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
     Args:
         sim: Simulation.
         worlds: Indices; None for all worlds.
-
-    Raises:
-        ConfigError: If there are none, or one does not exist.
     """
     indices = list(range(sim.n_worlds) if worlds is None else worlds)
     if not indices:
@@ -30,10 +27,6 @@ def world_indices(sim: Sim, worlds: Sequence[int] | None) -> NDArray:
 
 
 def require_world(sim: Sim, world: int) -> None:
-    """Check that a world exists.
-
-    Raises:
-        ConfigError: If it does not.
-    """
+    """Check that a world exists."""
     if world not in range(sim.n_worlds):
         raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world!r}")

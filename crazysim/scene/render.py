@@ -10,7 +10,7 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError, RenderError, UnknownNameError, shown
+from crazysim.errors import ConfigError, RenderError, UnknownNameError, short_repr
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.software import quality
 from crazysim.scene.window import Window
@@ -93,7 +93,8 @@ class Viewer:
         mujoco.mjv_defaultFreeCamera(self._model, cam)
         if cam_config is not None and not isinstance(cam_config, Mapping):
             raise ConfigError(
-                f"expected cam_config as a dict, got {shown(cam_config)}. Use {{'lookat': (0, 0, 1), 'distance': 3.0}}."
+                f"expected cam_config as a dict, got {short_repr(cam_config)}. "
+                f"Use {{'lookat': (0, 0, 1), 'distance': 3.0}}."
             )
         for key, value in (cam_config or {}).items():
             if not hasattr(cam, key):

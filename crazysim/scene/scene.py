@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.cache import announced
+from crazysim.cache import announce_if_slow
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
@@ -339,7 +339,7 @@ class Scene:
         """Bring ``mjx_data`` up to date in all worlds, and return the data with ``core.mjx_synced`` set."""
         self.compile_if_edited()
         first = not self._mjx.is_allocated
-        with announced("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
+        with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
             return self._mjx.sync(data)
 
     def sync_one(self, data: SimData, world: int) -> None:

@@ -32,7 +32,7 @@ def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
     Raises:
         ConfigError: If the file cannot be written; then nothing of it stays.
     """
-    arrays = {name: np.asarray(_plain(x)) for name, x in _named(tree)}
+    arrays = {name: np.asarray(_key_data(x)) for name, x in _named_leaves(tree)}
     with replacing(path) as file:
         np.savez(file, allow_pickle=False, **{META: np.array(json.dumps(meta))}, **arrays)
 
@@ -44,12 +44,12 @@ def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged or not a checkpoint.
     """
-    with opened(path), open(path, "rb") as file:
+    with reading_checkpoint(path), open(path, "rb") as file:
         arrays = read_arrays(file, str(path))
         return arrays, dict(json.loads(str(arrays.pop(META))))
 
 
-def opened(path: str | Path) -> AbstractContextManager[None]:
+def reading_checkpoint(path: str | Path) -> AbstractContextManager[None]:
     """Raise errors of a block that reads a checkpoint as ``crazysim.storage.reading`` does."""
     remedy = "Use the folder of an intact run, or train again: crazysim train TASK --out FOLDER."
     return reading(path, "a checkpoint of crazysim", remedy)
@@ -62,11 +62,8 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], like: T) -> T:
         path: The file, for messages.
         arrays: Its arrays, from ``read``.
         like: Pytree of the same structure and shapes, of arrays or of ``jax.ShapeDtypeStruct``.
-
-    Raises:
-        ConfigError: If the arrays have other names, shapes or types.
     """
-    named = _named(like)
+    named = _named_leaves(like)
     if others := {name for name, _ in named} ^ set(arrays):
         raise ConfigError(
             f"expected the arrays of this task and version in {path}, got others: {', '.join(sorted(others)[:5])}. "
@@ -75,7 +72,7 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], like: T) -> T:
     leaves = []
     for name, x in named:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        with opened(path):
+        with reading_checkpoint(path):
             value = jax.device_put(arrays[name])
             value = jax.random.wrap_key_data(value) if is_key else value
         if value.shape != x.shape or value.dtype != x.dtype:
@@ -87,9 +84,9 @@ def restore(path: str | Path, arrays: Mapping[str, NDArray], like: T) -> T:
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
-def _named(tree: Any) -> list[tuple[str, Any]]:
+def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
     return [(jax.tree_util.keystr(path), x) for path, x in jax.tree_util.tree_leaves_with_path(tree)]
 
 
-def _plain(x: Any) -> Any:
+def _key_data(x: Any) -> Any:
     return jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x

@@ -15,7 +15,7 @@ from crazysim.core.data import as_key
 from crazysim.core.settings import positive_integer
 from crazysim.drones.loading import is_airframe_file
 from crazysim.envs.env import DroneEnv
-from crazysim.envs.references import absolute, is_reference, reference_of, split
+from crazysim.envs.references import absolute_reference, is_reference, reference_of, split_reference
 from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, UnknownNameError
@@ -68,7 +68,7 @@ RECIPES: dict[str, Recipe] = {
 }
 """Recipes by task."""
 
-GENERAL: dict[str, Recipe] = {
+DEFAULT_RECIPES: dict[str, Recipe] = {
     "ppo": Recipe(),
     "apg": Recipe("apg", n_worlds=64, config={"iterations": 200}, evaluate_every=40),
 }
@@ -82,11 +82,11 @@ def recipe_of(task: str, algorithm: str | None = None) -> Recipe:
         task: Name of the task.
         algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for that which suits the task.
     """
-    recipe = RECIPES.get(task, GENERAL["ppo"])
-    return recipe if algorithm in (None, recipe.algorithm) else GENERAL.get(algorithm, Recipe(algorithm))
+    recipe = RECIPES.get(task, DEFAULT_RECIPES["ppo"])
+    return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
 
 
-ALTERABLE = (
+ALTERABLE_HYPERPARAMETERS = (
     "iterations", "learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm",
 )  # fmt: skip
 """Hyperparameters that may change when a run is resumed: neither shapes nor counters of its state depend on them."""
@@ -94,7 +94,7 @@ ALTERABLE = (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Complete configuration of a run; a checkpoint resumes only with one that differs in ``ALTERABLE`` alone."""
+    """Complete configuration of a run. A checkpoint resumes with the same one but for ``ALTERABLE_HYPERPARAMETERS``."""
 
     task: str
     """Name of a registered task, or the absolute place of its class, ``FILE.py:NAME`` or ``MODULE:NAME``."""
@@ -110,12 +110,7 @@ class TrainConfig:
     """Hyperparameters of the algorithm; omitted ones have their defaults."""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is not of its type or range, or the algorithm has no such hyperparameter.
-            UnknownNameError: If there is no such algorithm.
-        """
+        """Check the values."""
         if self.algorithm not in ALGORITHMS:
             raise UnknownNameError(f"expected an algorithm of {', '.join(ALGORITHMS)}, got {self.algorithm!r}")
         if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)):
@@ -155,10 +150,6 @@ class TrainConfig:
             options: Options of ``crazysim.envs.make``.
             config: Hyperparameters of the algorithm.
             resumed: Configuration of the run to continue, from which omitted values come instead; None for a new run.
-
-        Raises:
-            ConfigError: If a value is not of its type or range, or the algorithm has no such hyperparameter.
-            UnknownNameError: If there is no such task or algorithm.
         """
         entry = entry_of(task)
         known = {} if resumed is None else resumed.options
@@ -166,10 +157,10 @@ class TrainConfig:
             fields = [f for f in dataclasses.fields(task) if f.init]
             own = {f.name: getattr(task, f.name) for f in fields}
             usual = {f.name: known.get(f.name, f.default) for f in fields}
-            options = {k: x for k, x in own.items() if not _same(x, usual[k])} | dict(options or {})
+            options = {k: x for k, x in own.items() if not _is_same_setting(x, usual[k])} | dict(options or {})
             task = next((name for name, one in TASKS.items() if one is entry), None) or reference_of(entry.task)
         elif is_reference(task):
-            task = absolute(task) if split(task)[1] else reference_of(entry.task)
+            task = absolute_reference(task) if split_reference(task)[1] else reference_of(entry.task)
         recipe = recipe_of(task, algorithm)
         if resumed is not None:
             seed = resumed.seed if seed is None else seed
@@ -184,14 +175,14 @@ class TrainConfig:
     @property
     def title(self) -> str:
         """Name of the task in messages and of the default folder: without the place of its class, in lower case."""
-        name = split(self.task)[1] if is_reference(self.task) else self.task
+        name = split_reference(self.task)[1] if is_reference(self.task) else self.task
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
 
     def make_env(self, n_worlds: int | None = None, **defaults: Any) -> DroneEnv:
         """Return an environment of the run.
 
         Args:
-            n_worlds: Number of worlds; None for that of the run.
+            n_worlds: Number of worlds; None for the run's.
             **defaults: Options of ``crazysim.envs.make`` where the run does not set them.
 
         Raises:
@@ -213,7 +204,7 @@ class TrainConfig:
         return ALGORITHMS[self.algorithm].Config(**self.config)
 
 
-def _same(x: Any, y: Any) -> bool:
+def _is_same_setting(x: Any, y: Any) -> bool:
     """Return true if a setting has a value, in the form that JSON gives it: lists and tuples are alike."""
     try:
         return json.dumps(x) == json.dumps(y)

@@ -17,11 +17,11 @@ from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
-from crazysim.train.networks import QUICK
+from crazysim.train.networks import QUICK_COMPILATION
 
-HELD_OUT = 0x5EED
+EVALUATION_SEED = 0x5EED
 """Seed of the held-out initial states; keys of training are folded, so they never coincide with it."""
-TERM = "reward "
+TERM_PREFIX = "reward "
 """Beginning of the names of the terms of a reward, as in ``RewardTerms``."""
 
 
@@ -41,7 +41,7 @@ def as_tree(policy: Callable[[Obs], Array]) -> Any:
     return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
 
 
-@partial(jax.jit, static_argnames=("env",), compiler_options=QUICK)
+@partial(jax.jit, static_argnames=("env",), compiler_options=QUICK_COMPILATION)
 def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     """Fly one episode in every world and return its record.
 
@@ -61,7 +61,9 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     def keep(transition: Transition) -> dict[str, Any]:
         state = transition.state
         kept = {
-            name: state.info[name] for name in state.info if name in ("error", "nonfinite") or name.startswith(TERM)
+            name: state.info[name]
+            for name in state.info
+            if name in ("error", "nonfinite") or name.startswith(TERM_PREFIX)
         }
         return kept | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
 
@@ -76,9 +78,9 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
         "nonfinite": jnp.any(kept["nonfinite"] & ~before, axis=0),
         "reward": jnp.where(flies, kept["reward"], 0.0).sum(axis=0),
         "terms": {
-            name[len(TERM) :]: jnp.where(flies, x, 0.0).mean(axis=(1, 2))
+            name[len(TERM_PREFIX) :]: jnp.where(flies, x, 0.0).mean(axis=(1, 2))
             for name, x in kept.items()
-            if name.startswith(TERM)
+            if name.startswith(TERM_PREFIX)
         },
     }
     succeeded = kept["succeeded"]
@@ -103,7 +105,7 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         seconds, m (at the end of the episode for tasks with ``task.succeeded``), NaN if all crashed; ``reward``: mean
         return of an episode; ``reward NAME``: part of it by each term.
     """
-    flight = fly(env, as_tree(policy), jax.random.key(HELD_OUT) if key is None else key)
+    flight = fly(env, as_tree(policy), jax.random.key(EVALUATION_SEED) if key is None else key)
     by_task = "succeeded" in flight
     last = 1 if by_task else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
     flight = jax.device_get(flight)  # the rest takes less time on the host than compiling it
@@ -120,7 +122,7 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         "length": float(steps.mean()) * env.task.seconds / env.max_steps,
         "error": float(error.mean()) if error.size else float("nan"),
         "reward": float(flight["reward"].mean()),
-        **{f"{TERM}{name}": float(x.sum()) for name, x in flight["terms"].items()},
+        **{f"{TERM_PREFIX}{name}": float(x.sum()) for name, x in flight["terms"].items()},
     }
 
 

@@ -79,7 +79,6 @@ def to_onnx(policy: Policy, path: str | Path, meta: Mapping[str, Any]) -> Path:
         The path.
 
     Raises:
-        ConfigError: If the sizes of policy and description differ, or the policy is not finite.
         ImportError: If onnx is not installed.
     """
     try:
@@ -138,10 +137,6 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
 
     Returns:
         The path.
-
-    Raises:
-        ConfigError: If the sizes of policy and description differ, the policy is not finite, or the name is not valid
-            in C.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigError(f"expected the name of a C function, got {name!r}; use letters, digits and underscores")
@@ -173,11 +168,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
 
 
 def _numbers(policy: Policy, meta: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, HostLayers]:
-    """Return mean and standard deviation of the inputs, and the layers, as float32.
-
-    Raises:
-        ConfigError: If their sizes differ from those of the description, or they are not finite.
-    """
+    """Return mean and standard deviation of the inputs, and the layers, as float32."""
     layers = [(np.asarray(weight, np.float32), np.asarray(bias, np.float32)) for weight, bias in policy.layers]
     mean, var = np.asarray(policy.stats.mean, np.float32), np.asarray(policy.stats.var, np.float32)
     n_obs, n_actions = sum(meta["observations"].values()), len(meta["actions"]["centre"])

@@ -15,7 +15,7 @@ from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 
-QUICK = {"xla_gpu_autotune_level": 0}
+QUICK_COMPILATION = {"xla_gpu_autotune_level": 0}
 """Compiler options: autotuning matrix products on a GPU takes longer than it saves for networks of this size."""
 
 Layers = list[tuple[Array, Array]]
@@ -25,7 +25,7 @@ Layers = list[tuple[Array, Array]]
 def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
     """Return layers with uniformly distributed weights and zero biases.
 
-    Their variance is that of the entries of orthogonal matrices, scale^2 / max(n_in, n_out), which take longer to trace
+    They have the variance of the entries of orthogonal matrices, scale^2 / max(n_in, n_out), which take longer to trace
     and compile than one draw of all weights.
 
     Args:

@@ -19,7 +19,7 @@ from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import QUICK, Layers, Policy, all_finite, init_mlp, mlp
+from crazysim.train.networks import QUICK_COMPILATION, Layers, Policy, all_finite, init_mlp, mlp
 
 
 @dataclass(frozen=True)
@@ -98,16 +98,12 @@ class Sample(PyTree):
     """Value estimate before the step."""
     reward: Array
     """Reward, plus the discounted value of the final state where the episode was truncated."""
-    over: Array
+    done: Array
     """True where the episode ended with the step."""
 
 
 def init(env: Env, config: Config, key: Array) -> Learner:
-    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode.
-
-    Raises:
-        ConfigError: If the samples of a rollout cannot be divided into the minibatches.
-    """
+    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode."""
     n_samples = config.n_steps * env.sim.n_worlds * env.sim.n_drones
     if n_samples % config.minibatches:
         raise ConfigError(
@@ -126,7 +122,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     return Learner(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, state, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK)
+@partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK_COMPILATION)
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and its updates, and the metrics of the iteration.
 
@@ -137,7 +133,7 @@ def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[s
     advantages, targets = _advantages(samples, _value(learner, learner.stats.normalize(flatten(state.obs))), config)
     returns = learner.returns.update(targets[..., None])
     targets = (targets - returns.mean) / _scale(returns)
-    parameters = (learner.policy, learner.log_std, _rescaled(learner.value, learner.returns, returns))
+    parameters = (learner.policy, learner.log_std, _rescale_value(learner.value, learner.returns, returns))
     parameters, optimizer, losses = _learn(parameters, learner.optimizer, samples, advantages, targets, config, k_learn)
     policy, log_std, value = parameters
     stats = learner.stats.update(raw)
@@ -169,7 +165,7 @@ def _collect(
         return sample, raw, (transition.reward.mean(), transition.terminated, error)
 
     state, _, (samples, raw, (reward, crashed, error)) = rollout(env, learner.env, policy, key, config.n_steps, keep)
-    over = samples.over.any(axis=-1)
+    over = samples.done.any(axis=-1)
     metrics = {
         "reward": reward.mean(),
         "crashed": crashed.sum() / jnp.maximum(over.sum(), 1),
@@ -188,7 +184,7 @@ def _advantages(samples: Sample, last: Array, config: Config) -> tuple[Array, Ar
         advantage = reward + discount * value_after - value + discount * config.gae_lambda * advantage
         return (advantage, value), advantage
 
-    sequence = (samples.reward, samples.value, samples.over)
+    sequence = (samples.reward, samples.value, samples.done)
     _, advantages = jax.lax.scan(back, (jnp.zeros_like(last), last), sequence, reverse=True)
     return advantages, advantages + samples.value
 
@@ -241,7 +237,7 @@ def _scale(returns: RunningStats) -> Array:
     return jnp.sqrt(returns.var + EPSILON)
 
 
-def _rescaled(layers: Layers, old: RunningStats, new: RunningStats) -> Layers:
+def _rescale_value(layers: Layers, old: RunningStats, new: RunningStats) -> Layers:
     """Return the value network whose outputs, scaled by new statistics, are what they were with the old ones."""
     *hidden, (weight, bias) = layers
     ratio = _scale(old) / _scale(new)

@@ -19,7 +19,7 @@ from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
 from crazysim.storage import reading, write_figure
-from crazysim.train.evaluation import HELD_OUT, TERM, as_tree, fly
+from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, as_tree, fly
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE
 
@@ -31,7 +31,7 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     """Plot success, error and the terms of the reward over a training, as the evaluations found them.
 
     Args:
-        curves: Contents of ``curve.json`` of each run, by the name of the run. The terms are those of the first.
+        curves: Contents of ``curve.json`` of each run, by the name of the run. The terms of the first are plotted.
         path: Image to write, such as a ``.png``.
 
     Raises:
@@ -47,8 +47,8 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
         axes[2].semilogy(steps, [p["error"] for p in curve])
     first = next(iter(curves.values()))
     steps = np.array([p["env_steps"] for p in first]) / 1e6
-    for name in (name for name in first[-1] if name.startswith(TERM)):
-        axes[3].plot(steps, [p[name] for p in first], label=name.removeprefix(TERM))
+    for name in (name for name in first[-1] if name.startswith(TERM_PREFIX)):
+        axes[3].plot(steps, [p[name] for p in first], label=name.removeprefix(TERM_PREFIX))
     axes[3].plot(steps, [p["reward"] for p in first], "k--", label="sum")
     axes[3].legend(fontsize="small")
     million = "environment steps, millions"
@@ -77,7 +77,7 @@ def plot_episode(
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    flight = jax.device_get(fly(env, as_tree(policy), jax.random.key(HELD_OUT) if key is None else key))
+    flight = jax.device_get(fly(env, as_tree(policy), jax.random.key(EVALUATION_SEED) if key is None else key))
     terms, over = flight["terms"], flight["over"]
     t = env.task.seconds * (1 + np.arange(len(over))) / len(over)
     figure, axes = _figure(3)
@@ -130,13 +130,16 @@ def _save(figure: Any, path: Path) -> None:
 def read_curve(folder: Path) -> list[dict[str, float]]:
     """Return the learning curve of a run, one point per evaluation.
 
+    Files of earlier versions have ``round`` in place of ``iteration``.
+
     Raises:
         ConfigError: If the file does not exist.
         DamagedFileError: If it is damaged.
     """
     path = folder / CURVE
     with reading(path, "a learning curve", "Write it again with 'crazysim train TASK --resume'."):
-        return json.loads(path.read_bytes())
+        curve = json.loads(path.read_bytes())
+        return [{"iteration" if name == "round" else name: x for name, x in point.items()} for point in curve]
 
 
 def film(
@@ -163,7 +166,7 @@ def film(
         found = of(state)
         return np.zeros((0, 3)) if found is None else np.asarray(found[world]).reshape(-1, 3)
 
-    def held(_: Sim, world: int) -> np.ndarray:
+    def points_in_view(_: Sim, world: int) -> np.ndarray:
         return np.concatenate([points(targets, world), points(subjects, world)])
 
     def draw_target(sim: Sim, world: int) -> None:
@@ -187,7 +190,7 @@ def film(
         text="{time:.1f} s",
         draw=draw_target,
         cam_config=camera,
-        hold=None if "distance" in camera else held,
+        hold=None if "distance" in camera else points_in_view,
         lag=0.6,
     )
     n_frames = env.max_steps // skip + 1

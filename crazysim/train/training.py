@@ -19,11 +19,11 @@ import numpy as np
 from jax import Array
 
 import crazysim
-from crazysim.cache import announced, keep_programs
+from crazysim.cache import announce_if_slow, keep_programs
 from crazysim.core.settings import positive_integer
 from crazysim.engine.backends.native import compiling_threads
 from crazysim.envs.env import DroneEnv
-from crazysim.envs.references import code_digest, is_reference, split
+from crazysim.envs.references import code_digest, is_reference, split_reference
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import require_finite_start
@@ -32,7 +32,7 @@ from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.storage import replacing
 from crazysim.train import apg, checkpoint, ppo
-from crazysim.train.config import ALGORITHMS, ALTERABLE, TrainConfig, recipe_of
+from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, recipe_of
 from crazysim.train.evaluation import evaluate, outcome
 from crazysim.train.export import describe
 from crazysim.train.networks import Policy
@@ -40,8 +40,8 @@ from crazysim.train.networks import Policy
 CHECKPOINT, POLICY, CURVE = "checkpoint.npz", "policy.npz", "curve.json"
 """Names of the files of a run."""
 
-CHECK = 0xC4EC
-"""Seed of the initial states on which the policy to keep is chosen; see ``HELD_OUT``."""
+CHECK_SEED = 0xC4EC
+"""Seed of the initial states on which the policy to keep is chosen; see ``EVALUATION_SEED``."""
 Learner = ppo.Learner | apg.Learner
 """State of a training run."""
 
@@ -53,7 +53,7 @@ class TrainResult:
     folder: Path
     """Folder of the files of the run."""
     metrics: dict[str, float]
-    """Metrics of ``evaluate`` for the kept policy on held-out initial states; ``round``, iteration that it is of;
+    """Metrics of ``evaluate`` for the kept policy on held-out initial states; ``iteration``, its iteration;
     ``check``, its success on the check set; of the whole run ``seconds``, ``compile_seconds`` of them, s, and
     ``env_steps``, environment steps of all drones."""
     policy: Policy
@@ -97,8 +97,8 @@ def train(
     started = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
     meta = _meta(config)
-    stored, curve, code = _stored(path, config) if resume else ({}, [], meta["code"])
-    check_key = jax.random.key(CHECK)
+    stored, curve, code = _read_run(path, config) if resume else ({}, [], meta["code"])
+    check_key = jax.random.key(CHECK_SEED)
     if path.exists() and not resume:
         raise ConfigError(
             f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
@@ -133,11 +133,11 @@ def train(
     @keep_programs()
     def compile_iteration() -> tuple[Any, float]:
         compiling = time.perf_counter()
-        compiled = algorithm.iterate.lower(_on_device(shapes, base.sim.device), env, hyperparameters).compile()
+        compiled = algorithm.iterate.lower(_attach_device(shapes, base.sim.device), env, hyperparameters).compile()
         return compiled, time.perf_counter() - compiling
 
     # Each compiles for seconds, mostly on one core.
-    with announced("compiling the training", "5 to 20 s"), compiling_threads(3) as pool:
+    with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as pool:
         compiling, starting = pool.submit(compile_iteration), pool.submit(start)
         evaluating = pool.submit(compile_evaluation)
         (learner, kept), description = starting.result(), evaluating.result()
@@ -160,12 +160,12 @@ def train(
         iteration, policy = int(learner.iteration), learner.as_policy()
         require_finite(finite, iteration)
         metrics, check = evaluate(eval_env, policy), evaluate(eval_env, policy, check_key)["success"]
-        curve[:] = [earlier for earlier in curve if earlier["round"] < iteration]
+        curve[:] = [earlier for earlier in curve if earlier["iteration"] < iteration]
         seconds = seconds_before + time.perf_counter() - started
-        point = {"round": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
+        point = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
         point |= {"compile_seconds": compile_s, "check": check}
         best_check = max((earlier["check"] for earlier in curve if earlier["kept"]), default=0.0)
-        point["kept"] = check >= least_tied(best_check, evaluation_worlds)
+        point["kept"] = check >= least_kept_success(best_check, evaluation_worlds)
         best = policy if point["kept"] else kept
         checkpoint.save(folder / POLICY, best, meta | description)
         with replacing(folder / CURVE) as file:
@@ -180,8 +180,9 @@ def train(
         if not finite:
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
-                f"by {config.algorithm}; {path} is that of iteration {curve[-1]['round']}, {POLICY} that of iteration "
-                f"{kept_point(curve)['round']}. Use a smaller learning_rate or max_grad_norm, with another --out."
+                f"by {config.algorithm}; {path} is of iteration {curve[-1]['iteration']}, {POLICY} of "
+                f"iteration {kept_point(curve)['iteration']}. Use a smaller learning_rate or max_grad_norm, with "
+                f"another --out."
             )
 
     finite: Array | bool = True
@@ -206,8 +207,8 @@ def train(
     best = kept_point(curve)
     if best is not last:
         log(
-            f"kept the policy of iteration {best['round']}: later ones succeeded less often on {evaluation_worlds:,} "
-            f"other starts, by more than two standard errors"
+            f"kept the policy of iteration {best['iteration']}: later ones succeeded less often on "
+            f"{evaluation_worlds:,} other starts, by more than two standard errors"
         )
     point = best | {name: last[name] for name in ("env_steps", "seconds", "compile_seconds")}
     judged = f"error below {base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s"
@@ -221,10 +222,10 @@ def train(
     return TrainResult(folder, point, kept, eval_env)
 
 
-def least_tied(success: float, n_worlds: int) -> float:
+def least_kept_success(success: float, n_worlds: int) -> float:
     """Return the success rate from which on a later policy is kept: two standard errors below the best.
 
-    The standard error is that of the rate after two more successes and two more failures (Agresti and Coull 1998,
+    The standard error is computed for the rate after two more successes and two more failures (Agresti and Coull 1998,
     "Approximate is better than exact"), which is not zero where all have succeeded.
 
     Args:
@@ -241,7 +242,7 @@ def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
     return next(point for point in reversed(curve) if point["kept"])
 
 
-def _on_device(shapes: Learner, device: jax.Device) -> Learner:
+def _attach_device(shapes: Learner, device: jax.Device) -> Learner:
     """Return the shapes with a device attached."""
     place = jax.sharding.SingleDeviceSharding(device)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes)
@@ -261,7 +262,7 @@ def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, Tr
     """
     path = Path(folder) / POLICY
     arrays, meta = checkpoint.read(path)
-    with checkpoint.opened(path):
+    with checkpoint.reading_checkpoint(path):
         config = TrainConfig(**meta["settings"])
         if task is not None:
             config = dataclasses.replace(config, task=TrainConfig.create(task).task)
@@ -276,11 +277,7 @@ def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, Tr
 
 
 def _meta(config: TrainConfig) -> dict[str, Any]:
-    """Return the metadata of the files of a run.
-
-    Raises:
-        ConfigError: If JSON cannot hold the options.
-    """
+    """Return the metadata of the files of a run."""
     settings = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     meta = {"crazysim": crazysim.__version__, "settings": settings, "code": code_digest(config.task)}
     try:
@@ -293,11 +290,7 @@ def _meta(config: TrainConfig) -> dict[str, Any]:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make the folder of a run.
-
-    Raises:
-        ConfigError: If that is impossible.
-    """
+    """Make the folder of a run."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -312,28 +305,24 @@ def stored_config(folder: str | Path) -> TrainConfig:
     """
     path = Path(folder) / CHECKPOINT
     meta = checkpoint.read(path)[1]
-    with checkpoint.opened(path):
+    with checkpoint.reading_checkpoint(path):
         return TrainConfig(**meta["settings"])
 
 
-def _stored(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str]:
+def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str]:
     """Return the arrays of a checkpoint, the learning curve until then, and the hash of the code of the task.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
     """
     arrays, meta = checkpoint.read(path)
-    with checkpoint.opened(path):
+    with checkpoint.reading_checkpoint(path):
         _require_same(path, meta, config)
         return arrays, list(meta["curve"]), meta["code"]
 
 
 def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None:
-    """Check that a checkpoint belongs to a run with this configuration, but for what may change.
-
-    Raises:
-        ConfigError: With the first difference.
-    """
+    """Check that a checkpoint belongs to a run with this configuration, but for what may change."""
     if meta["crazysim"] != crazysim.__version__:
         raise ConfigError(
             f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a new "
@@ -342,7 +331,7 @@ def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None
     stored, given = (_settings(settings) for settings in (meta["settings"], _meta(config)["settings"]))
     for name in {**stored, **given}:
         if stored.get(name, "its default") != given.get(name, "its default"):
-            alterable = [x for x in ALTERABLE if x in config.config]
+            alterable = [x for x in ALTERABLE_HYPERPARAMETERS if x in config.config]
             raise ConfigError(
                 f"expected {name} = {stored.get(name, 'its default')!r} as in {path}, got "
                 f"{given.get(name, 'its default')!r}; resume with the same value, or start a new run in another folder "
@@ -351,10 +340,10 @@ def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None
 
 
 def _settings(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a configuration that a resumed run keeps, by name, those of options and config too."""
-    place, name = split(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
+    """Return the settings of a configuration that a resumed run keeps, by name, with options and hyperparameters."""
+    place, name = split_reference(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
     flat = {k: x for k, x in settings.items() if k not in ("options", "config")}
-    kept = {k: x for k, x in settings["config"].items() if k not in ALTERABLE}
+    kept = {k: x for k, x in settings["config"].items() if k not in ALTERABLE_HYPERPARAMETERS}
     options = {k: x for k, x in settings["options"].items() if k != "device"}
     return flat | {"task": f"{Path(place).name}:{name}" if place else name} | options | kept
 

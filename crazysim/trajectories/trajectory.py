@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import jit_unless_traced
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, floating, leaf
 from crazysim.trajectories.interpolation import unit_coefficients
 
@@ -302,7 +302,7 @@ class Trajectory(PyTree):
             array = np.asarray(value) if is_known else value
             finite = is_known and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
             if array.shape != shape or (is_known and not finite):
-                raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {shown(value)}")
+                raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {short_repr(value)}")
         xp = _module([self, offset, yaw])
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
         cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)

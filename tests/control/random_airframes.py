@@ -5,7 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
-from crazysim.commands.airframe_check import UNSTABLE
+from crazysim.commands.airframe_check import MAX_PRECESSION_RATIO
 from crazysim.control import Auto
 from crazysim.control.allocation import allocation_matrix
 from crazysim.control.bandwidth import authority, precession
@@ -81,7 +81,7 @@ def draw(rng, n, name):
         acc = authority(airframe)
         if not np.all(acc > LEAST) or 2 * TURN * precession(airframe) > np.min(acc[:2]):
             continue
-        if precession(airframe) < UNSTABLE * np.sqrt(Auto().params(airframe).stiffness[0]):
+        if precession(airframe) < MAX_PRECESSION_RATIO * np.sqrt(Auto().params(airframe).stiffness[0]):
             return airframe
 
 

@@ -47,7 +47,40 @@ def mixes(result):
     assert 0.3 < closest < 2.0
 
 
-CHECKS = {"crazyswarm2": lands, "fit_flight": fits, "mixed_reality": mixes, "race": races, "replayed_twin": repeats}
+def calms(errors):
+    """Check that the pushes moved the loads, and that the loads came back to their goals."""
+    assert errors[0] > 0.02
+    assert errors[-1] < 0.02
+
+
+def places(result):
+    """Check that every load was carried along its path, and set down within millimetres."""
+    placed, distance, rms = result
+    assert placed.all()
+    assert distance.max() < 5e-3
+    assert rms < 0.03
+
+
+def keeps_apart(result):
+    """Check that a drone escorted a car, and that nothing touched or left its path."""
+    closest, touches, rms = result
+    assert closest[0] > 0.2
+    assert 0.2 < closest[1] < 0.8
+    assert not touches.any()
+    assert rms.shape == (5,)
+    assert rms.max() < 0.15
+
+
+CHECKS = {
+    "crazyswarm2": lands,
+    "fit_flight": fits,
+    "hooked_load": calms,
+    "mixed_fleet": keeps_apart,
+    "mixed_reality": mixes,
+    "pick_and_place": places,
+    "race": races,
+    "replayed_twin": repeats,
+}
 """Further checks of the values that ``main`` of an example returns."""
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from crazysim.engine.backends import kernel_cache
 from crazysim.errors import ConfigError
-from crazysim.trust import distrust
+from crazysim.storage import distrust
 from crazysim.utils import enable_cache
 
 OTHERS = 12345

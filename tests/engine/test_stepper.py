@@ -65,7 +65,7 @@ def test_a_step_that_compiles_for_long_is_announced_once(sim, stepper, monkeypat
         announced.append(work)
         return contextlib.nullcontext()
 
-    monkeypatch.setattr(stepper_module, "announced", announce)
+    monkeypatch.setattr(stepper_module, "announce_if_slow", announce)
     for _ in range(3):
         stepper.advance(1)
     assert announced == ["compiling the step"]

@@ -10,7 +10,7 @@ from crazysim import ConfigError, Control, Drone, Dynamics, load_airframe
 from crazysim.core.data import create_params
 from crazysim.dynamics import first_principles, fitted, supported_dynamics
 from crazysim.envs import Actions, actions_of
-from crazysim.envs.actions import RATES, REACH, TILT, YAW, hover_thrust
+from crazysim.envs.actions import MAX_BODY_RATES, MAX_OFFSET, MAX_TILT, MAX_YAW, hover_thrust
 
 CASES = [
     (drone, dynamics, control)
@@ -72,9 +72,9 @@ def test_the_map_is_affine_and_ends_at_one(control):
     np.testing.assert_array_equal(at(-9.0), at(-1.0))
     most = 4 * airframe.value("rotors.thrust_max", ())
     ends = {
-        "state": np.array([0, 0, 1]) + REACH,
-        "attitude": [TILT, TILT, YAW, most],
-        "body_rate": [*RATES, most],
+        "state": np.array([0, 0, 1]) + MAX_OFFSET,
+        "attitude": [MAX_TILT, MAX_TILT, MAX_YAW, most],
+        "body_rate": [*MAX_BODY_RATES, most],
         "force_torque": [most, *at(1.0)[1:]],
         "rotor_vel": np.broadcast_to(first_principles.Params.create(airframe).rotor_vel_max, 4),
     }[control]

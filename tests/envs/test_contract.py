@@ -26,7 +26,7 @@ from gymnasium.vector.utils import batch_space
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import cuda
 from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
-from crazysim.envs.phases import all_worlds
+from crazysim.envs.phases import vectorize_over_worlds
 from crazysim.envs.spawn import flying
 from crazysim.envs.state import EnvState
 from crazysim.envs.tasks.hover import Hover
@@ -160,7 +160,7 @@ for name in TASKS:
     env = AutoReset(make(name))
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.action.dtype == np.float64
-    program = Step({stage.__name__: stage for stage in env.step_fn.stages}, "lanes").plan(state.whole, ()).program
+    program = Step({stage.__name__: stage for stage in env.step_fn.stages}, "lanes").plan(state.full_data, ()).program
     kernel.write(program, "host")
     assert program.fused, (name, program.unfused_stages)
 """
@@ -383,11 +383,13 @@ def test_the_gradient_of_the_reward_is_finite(env, begun, flown):
     @jax.grad
     def slope(wrt, state):
         action, states = wrt
-        state, action = env.phases.act(state.replace(data=state.data.replace(states=states)), action, all_worlds)
+        state, action = env.phases.act(
+            state.replace(data=state.data.replace(states=states)), action, vectorize_over_worlds
+        )
         data = state.data
         for stage in env.base.physics.stages:
             data = stage(data)
-        return env.phases.observe(state.replace(data=data), action, all_worlds).reward.sum()
+        return env.phases.observe(state.replace(data=data), action, vectorize_over_worlds).reward.sum()
 
     end = first_worlds(flown.end.replace(info=flown.end.info | {}, memory={}))
     end = end.replace(info={name: end.info[name] for name in begun.info})

@@ -204,7 +204,7 @@ def test_law_02_entries_of_a_state_are_of_worlds_or_drones_as_declared():
     state = one.reset(jax.random.key(0))
     after = one.step(state, state.action)
     assert jax.tree.structure(state) == jax.tree.structure(after)
-    scopes = {x.name: x.scope for x in one.step_fn.plan(state.whole, ()).program.leaves if ".memory" in x.name}
+    scopes = {x.name: x.scope for x in one.step_fn.plan(state.full_data, ()).program.leaves if ".memory" in x.name}
     assert sorted(scopes.values()) == ["drone", "world", "world"]
     plain, record = after.memory["Remembers"]
     assert (plain.shape, record.of_drones.shape, record.of_world.shape) == ((N, 2), (N, 2), (N, 1, 2))
@@ -353,7 +353,7 @@ def test_episodes_begin_as_the_simulation_resets(hover, make):
     if make is with_reset_stage:
         np.testing.assert_array_equal(state.data.controls.rotor_vel, 7.0)
     else:
-        fresh = np.asarray(jax.jit(env.base.resets.default_of)(state.data).states.pos)
+        fresh = np.asarray(jax.jit(env.base.episode_reset.default_for)(state.data).states.pos)
         np.testing.assert_array_equal(fresh[:, 0, 0], [1.0, *np.zeros(N - 1)])
 
 

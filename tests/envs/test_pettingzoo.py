@@ -57,14 +57,14 @@ def test_every_drone_has_its_own(env):
     assert all(obs[agent] in env.observation_space(agent) for agent in env.agents)
     assert all(x.flags.writeable for agent in env.agents for x in obs[agent].values())
     assert not np.allclose(obs["drone_0"]["pos"], obs["drone_1"]["pos"])
-    state = env.now
+    state = env.env_state
     for i, agent in enumerate(env.agents):
         np.testing.assert_array_equal(obs[agent]["pos"], state.obs["pos"][0, i])
         np.testing.assert_array_equal(info[agent]["error"], state.info["error"][0, i])
         assert info[agent]["nonfinite"] == np.False_
     obs, reward, terminated, truncated, _ = env.step(zeros(env) | {"drone_1": np.ones(4)})
     assert obs["drone_1"]["vel"][2] > obs["drone_0"]["vel"][2] or obs["drone_1"]["ang_vel"].any()
-    assert reward == {f"drone_{i}": float(env.now.reward[0, i]) for i in range(2)}
+    assert reward == {f"drone_{i}": float(env.env_state.reward[0, i]) for i in range(2)}
     assert reward["drone_0"] != reward["drone_1"]
     assert terminated == truncated == {"drone_0": False, "drone_1": False}
 

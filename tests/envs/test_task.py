@@ -10,7 +10,7 @@ import pytest
 from crazysim import ConfigError, Sim, Wind
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import DroneEnv, DroneVectorEnv, Task, draw, make, uniform
-from crazysim.envs.random import between, episode_key, within
+from crazysim.envs.random import episode_key, scale_symmetric, scale_to
 from crazysim.envs.task import total
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.tasks.land import Land
@@ -73,8 +73,8 @@ def test_draws_are_uniform_and_scaled():
     x = np.asarray(uniform(key, 20_000))
     assert 0 <= x.min() < 1e-3 < 0.999 < x.max() < 1
     np.testing.assert_allclose(np.histogram(x, 10, (0, 1))[0], 2000, atol=200)
-    np.testing.assert_allclose(between(x, 2.0, 4.0), 2 + 2 * x, rtol=1e-6)
-    np.testing.assert_allclose(within(x, 0.5), x - 0.5, atol=1e-6)
+    np.testing.assert_allclose(scale_to(x, 2.0, 4.0), 2 + 2 * x, rtol=1e-6)
+    np.testing.assert_allclose(scale_symmetric(x, 0.5), x - 0.5, atol=1e-6)
     np.testing.assert_allclose(uniform(key, 5, low=-1.0, high=3.0), 4 * x[:5] - 1, rtol=1e-5, atol=1e-6)
 
 

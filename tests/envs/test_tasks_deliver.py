@@ -8,7 +8,7 @@ import pytest
 from crazysim import ConfigError
 from crazysim.core.stage import vmap_worlds
 from crazysim.envs import make
-from crazysim.envs.tasks.deliver import LOWEST, moving_rings, rings_of
+from crazysim.envs.tasks.deliver import MIN_HEIGHT, moving_rings, rings_of
 
 N_WORLDS = 5
 
@@ -81,7 +81,7 @@ def test_a_load_is_delivered_after_half_a_second_at_its_goal(env, begun, step):
 
 
 def test_too_low_is_a_crash(begun, step):
-    pos = begun.data.states.pos.at[0, 0, 2].set(LOWEST - 0.01)
+    pos = begun.data.states.pos.at[0, 0, 2].set(MIN_HEIGHT - 0.01)
     state = step(moved(begun, pos, jnp.zeros_like(pos)), begun.action)
     np.testing.assert_array_equal(state.terminated, np.arange(N_WORLDS) == 0)
     assert float(state.reward[0, 0]) < -3

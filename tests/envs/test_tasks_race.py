@@ -195,8 +195,8 @@ def test_drawn_inertias_have_their_inverses_and_masses_their_range(drawn):
     product = np.einsum("...ij,...jk->...ik", data.params.J, data.params.J_inv)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
     mass = np.asarray(data.params.mass) / 0.0434
-    assert 1 - task.MASS <= mass.min() < 0.95
-    assert 1.05 < mass.max() <= 1 + task.MASS
+    assert 1 - task.MASS_DEVIATION <= mass.min() < 0.95
+    assert 1.05 < mass.max() <= 1 + task.MASS_DEVIATION
     assert not np.allclose(mass[:, 0], mass[:, 1])
     np.testing.assert_allclose(env.actions.centre[3], 0.0434 * 9.81, rtol=1e-3)  # hover is the nominal drone's
 
@@ -262,7 +262,7 @@ def test_poses_are_nominal_until_the_drone_was_near(drawn):
 def test_the_same_key_gives_the_same_course_in_any_world(drawn):
     env, _ = drawn[1]
     spawn = jax.jit(vmap_worlds(env.task.spawn))
-    default, keys = env.resets.default_of(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
+    default, keys = env.episode_reset.default_for(env.sim.default_data), world_keys(env.sim.default_data, "spawn")
     data, again, other = spawn(default, keys), spawn(default, keys), spawn(default, jnp.roll(keys, 1))
     for name in ("pos", "quat"):
         one, twice, moved = (np.asarray(getattr(x.states, name)) for x in (data, again, other))
@@ -276,7 +276,7 @@ def test_way_leads_around_a_gate_from_behind_and_back_from_beside_it():
     beside = np.array([[1e-7, 0.45, 0.0], [-1e-7, 0.45, 0.0]])
     places = [[-1.0, 0.0, 0.0], [-4.0, 3.0, 0.0], [-3.0, 4.0, 0.0], [0.5, 0.0, 0.0], [0.3, 0.9, 0.0], *beside]
     before_the_frame = np.array([-0.01, 0.38, 0.1])
-    way = jax.jit(lambda places, pos: (rules.way(places), jax.grad(rules.way)(pos)))
+    way = jax.jit(lambda places, pos: (rules.way_to_gate(places), jax.grad(rules.way_to_gate)(pos)))
     ahead, slope = way(jnp.asarray(places), jnp.asarray(before_the_frame))
     around = 2 * 0.45 - 0.15  # from beside the frame, where both ways are the same
     expected = [1.0, 5.0, 5.0 + 0.85, np.hypot(0.5, 0.45) + around, np.hypot(0.3, 0.45) + around]

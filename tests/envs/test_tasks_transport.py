@@ -115,7 +115,7 @@ def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
     at = GATE + rng.uniform(-corner, corner, (64, 3))
     aim = GATE - np.array([0.0, 0.0, LENGTH / 2], np.float32)
     at[0] = aim
-    ways, to_go = [], jax.jit(vmap_worlds(env.task.to_go))
+    ways, to_go = [], jax.jit(vmap_worlds(env.task.remaining_way))
     for x in (-1.0, -1e-3, 1e-3, 1.0):
         load = (at + np.array([x, 0.0, 0.0])).astype(np.float32)
         ways.append(np.asarray(to_go(placed(state, load - DOWN, load, 0.0).data))[:, 0])
@@ -125,7 +125,7 @@ def test_progress_pays_for_the_way_only_and_passing_the_gate_never_costs(rng):
     assert np.all(ways[1] - ways[2] > -1e-3)
     np.testing.assert_allclose(ways[1][0], ways[2][0], atol=3e-3)
     data = placed(state, GOAL - DOWN, GOAL, 0.0).data
-    own = data.plugins["task"].replace(to_go_before=jnp.asarray(ways[0])[:, None])
+    own = data.plugins["task"].replace(remaining_way_before=jnp.asarray(ways[0])[:, None])
     data = data.replace(plugins=data.plugins | {"task": own})
     paid = jax.jit(vmap_worlds(env.task.rewards))(data, state.action, state.action)
     np.testing.assert_allclose(paid["progress"][:, 0], 5 * ways[0], rtol=1e-4)

@@ -369,5 +369,5 @@ def test_construction_and_the_first_reset_share_a_trace(envs, monkeypatch):
     traces, real = [], AutoReset.reset
     monkeypatch.setattr(AutoReset, "reset", lambda *args: traces.append(1) or real(*args))
     env = DroneVectorEnv(envs["NextStep"].env.env)
-    env._begin.trace(jax.random.key(3))
+    env._reset_fn.trace(jax.random.key(3))
     assert len(traces) == 1

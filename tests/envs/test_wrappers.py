@@ -253,7 +253,7 @@ def test_given_statistics_stay(env):
 def test_noise_is_as_large_as_said_and_reproducible(env):
     std = {"pos": 0.1, "vel": 0.01}
     wrapped = ObservationNoise(env, std)
-    noisy, plain = jax.jit(vmap_worlds(wrapped._noisy)), env.reset(jax.random.key(0))
+    noisy, plain = jax.jit(vmap_worlds(wrapped._add_noise)), env.reset(jax.random.key(0))
     seen = {name: [] for name in plain.obs}
     for state in (plain, *steps(env, plain, 60)):
         obs = noisy(state.obs, state.data)

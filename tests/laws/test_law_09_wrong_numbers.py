@@ -35,7 +35,7 @@ from crazysim.plugins.sensors.onboard import Noisy
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.plugins.vehicles import Path
 from crazysim.plugins.vehicles.following import PathController
-from crazysim.tables import LARGEST
+from crazysim.tables import MAX_NUMBER
 from crazysim.trajectories import circle
 
 ABSTRACT = {
@@ -147,7 +147,7 @@ def impossible(kind, name, declared, rng):
         array.flat[rng.integers(array.size)] = rng.choice([np.nan, -np.inf])
         yield array
     for bound, sign in ((declared.range.low, -1), (declared.range.high, 1)):
-        if abs(bound) < LARGEST:
+        if abs(bound) < MAX_NUMBER:
             beyond = bound + sign * max(1e-3 * abs(bound), 1e-3)
             yield int(np.ceil(sign * beyond)) * sign if is_whole else float(beyond)
 

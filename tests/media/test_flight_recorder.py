@@ -11,7 +11,7 @@ from pictures import of_colour
 from crazysim import SlungLoad
 from crazysim.errors import ConfigError, DamagedFileError
 from crazysim.media import Flight, Recorder, View, flight_of
-from crazysim.media.flight_recorder import put
+from crazysim.media.flight_recorder import show_flight_at
 from crazysim.scene.mjx_scene import MjxScene
 from crazysim.sim import Sim
 
@@ -135,7 +135,7 @@ def test_a_file_gives_back_all_of_it(flight, tmp_path):
 def test_another_simulation_is_put_where_the_flight_was(flight, opengl):
     """A new simulation shows drones and ball of world 2 where they were, also where its own ball was elsewhere."""
     other = build()
-    put(other, flight, 0.25)
+    show_flight_at(other, flight, 0.25)
     np.testing.assert_allclose(other.data.states.pos[2, 1], [0.5, 0, 1.5])
     np.testing.assert_allclose(other.time[:, 0], [0.25, 0, 0.25], atol=2e-3)
     np.testing.assert_allclose(other.data.controls.state.staged_cmd[2, 0, :3], 0.15, atol=1e-6)
@@ -154,7 +154,7 @@ def test_setpoints_are_put_without_the_feedforward_of_earlier_ones(flight):
     """That of the worlds that the flight has not stays."""
     other = build()
     other.state_control(pos=[0.0, 0.0, 1.0], feedforward=np.ones((3, 2, 8)))
-    put(other, flight, 0.25)
+    show_flight_at(other, flight, 0.25)
     found = np.asarray(other.data.controls.state.staged_feedforward)
     np.testing.assert_array_equal(found, np.broadcast_to(np.array([0.0, 1.0, 0.0])[:, None, None], (3, 2, 8)))
 
@@ -178,7 +178,7 @@ def test_objects_with_handles_are_recorded_and_put_back():
     np.testing.assert_allclose(flight.body_pos[1], [[[1, 0, 0.5], [2, 1, 1]], [[1, 1, 0.5], [2, 1, 1]]], atol=1e-6)
     np.testing.assert_allclose(flight.body_quat[1], np.broadcast_to(ROLL[1], (2, 2, 4)), atol=1e-6)
     other, its_boxes = build()
-    put(other, flight, 0.5)
+    show_flight_at(other, flight, 0.5)
     pos, quat = its_boxes.pose(other.data)
     np.testing.assert_allclose(pos, flight.at(0.5)["body_pos"], atol=1e-6)
     np.testing.assert_allclose(quat, flight.at(0.5)["body_quat"], atol=1e-6)
@@ -203,7 +203,7 @@ def test_loads_are_put_back_where_they_were(cable):
     sim.data = load.release(sim.data)
     sim.step(100)
     now = sim.data
-    put(sim, flight, 1.0)
+    show_flight_at(sim, flight, 1.0)
     sim.sync(1)
     np.testing.assert_allclose(sim.mj_data.body("load:0").xpos, [0.3, 0, 1.5], atol=1e-5)
     ids = flight.body_ids
@@ -255,9 +255,9 @@ def test_invalid_recordings_are_refused(sim):
 
 def test_a_flight_of_another_simulation_is_refused(flight):
     with pytest.raises(ConfigError, match="got 2"):
-        put(Sim(n_worlds=2, n_drones=2), flight, 0.0)
+        show_flight_at(Sim(n_worlds=2, n_drones=2), flight, 0.0)
     with pytest.raises(ConfigError, match="2 drones and 1 other mocap bodies, as the flight has, got 2 and 0"):
-        put(Sim(n_worlds=3, n_drones=2), flight, 0.0)
+        show_flight_at(Sim(n_worlds=3, n_drones=2), flight, 0.0)
     with pytest.raises(ConfigError, match=r"one of \[2, 0\], got 1"):
         flight.index(1)
 

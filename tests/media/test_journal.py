@@ -12,7 +12,7 @@ from waiting import wait_for
 
 from crazysim.errors import ConfigError
 from crazysim.media import Film, Flight, Recorder, View
-from crazysim.media.journal import HEAD, Journal, is_journal, read_journal
+from crazysim.media.journal import CHUNK_HEADER, Journal, is_journal, read_journal
 from crazysim.sim import Sim
 from crazysim.storage import unfinished_path
 
@@ -32,8 +32,8 @@ def written(tmp_path):
 
 def test_cut_anywhere_it_has_the_chunks_before(written, caplog):
     content = written.read_bytes()
-    last = len(content) - HEAD.size - len(CHUNKS[-1][1])
-    for length in (last, last + 1, last + HEAD.size, len(content) - 1):
+    last = len(content) - CHUNK_HEADER.size - len(CHUNKS[-1][1])
+    for length in (last, last + 1, last + CHUNK_HEADER.size, len(content) - 1):
         written.write_bytes(content[:length])
         caplog.clear()
         assert list(read_journal(written)) == CHUNKS[:2]

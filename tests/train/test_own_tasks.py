@@ -278,7 +278,7 @@ def test_an_installed_package_lists_its_tasks(monkeypatch):
         def load(self):
             return Low
 
-    points = importlib.metadata.EntryPoints([Point("of_a_package", "package.tasks:Low", registry.PLUGINS)])
+    points = importlib.metadata.EntryPoints([Point("of_a_package", "package.tasks:Low", registry.ENTRY_POINTS)])
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points.select(group=group))
     with pytest.raises(
         UnknownNameError, match=r"task 'of' does not exist; there are hover.*of_a_package.*FILE\.py:CLASS"

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from crazysim import jaxcompat
-from crazysim.cache import announce, announced
+from crazysim.cache import announce, announce_if_slow
 from crazysim.core.sharding import Location
 from crazysim.engine.backends import Run, kernel, lanes, reverse
 from crazysim.engine.backends.frame import Kernel
@@ -88,7 +88,7 @@ class DerivativeKernels:
                 self._launches[launch_key] = None
                 source = write(made, TARGETS[platform])
                 location = self.location if platform == self.location.platform else Location(platform)
-                with announced("compiling a derivative of the steps", "2 to 10 s"):
+                with announce_if_slow("compiling a derivative of the steps", "2 to 10 s"):
                     self._launches[launch_key] = compile_kernel(source, location)
                 self.used[f"{kind}: one kernel, {describe_kernel(source, platform, location.devices)}"] = None
         except UnsupportedError as error:

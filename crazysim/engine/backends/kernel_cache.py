@@ -29,7 +29,7 @@ from pathlib import Path
 
 from crazysim import cache
 from crazysim.errors import warn
-from crazysim.trust import REMEDY, distrust, make_private
+from crazysim.storage import FOLDER_REMEDY, distrust, make_private
 
 DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
@@ -68,7 +68,7 @@ def _refuse(shared: Path, reason: str) -> None:
     """Warn, once, that a folder is not used."""
     warn(
         f"expected a folder of kernels that only this user can write, got {str(shared)!r}: {reason}, so kernels are "
-        f"compiled again in every process. {REMEDY}"
+        f"compiled again in every process. {FOLDER_REMEDY}"
     )
 
 

@@ -31,7 +31,7 @@ from crazysim.engine.backends.frame import Kernel, interval
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError
-from crazysim.version import __version__
+from crazysim.startup import __version__
 
 COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
                   "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip

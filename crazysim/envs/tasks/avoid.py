@@ -18,27 +18,27 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.goals import install_rules, nearest, others_near, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, nearest_drones, nearest_entries, state_of, with_record
 from crazysim.envs.tracks import ranks
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
-CELL, IN_CELL = 0.8, 0.15
+CELL, CELL_JITTER = 0.8, 0.15
 """Width of the cells that hold at most one obstacle each, and largest component of the distance of an obstacle from the
 middle of its cell, m: a drone fits between a pole and whatever is next to it."""
-LENGTH = 4
+FIELD_LENGTH = 4
 """Number of cells from the starts to the goals."""
-GAP = 0.6
+FIELD_GAP = 0.6
 """Distance of starts and goals from the field, m."""
-POLE_RADIUS, BOX = 0.05, 0.3
+POLE_RADIUS, BOX_WIDTH = 0.05, 0.3
 """Radius of a pole, and width of a box, m."""
 HEIGHT = 2.0
 """Height of poles and ceiling, m."""
 JITTER = 0.15
 """Largest component of the distance of starts and goals from their places, m."""
-CRUISE = 2.5
+CRUISE_SPEED = 2.5
 """Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so it brakes with up
 to g, and stops from there within v^2 / 2 g = 0.32 m, less than half a cell."""
 SPACING = 0.6
@@ -56,7 +56,7 @@ class Crossing(PyTree):
     """True where it has touched something, or left the arena. (n_worlds, n_drones)"""
     out_before: Array = leaf("drone", 0)
     """True where it had arrived or was disabled before this environment step. (n_worlds, n_drones)"""
-    to_go_before: Array = leaf("drone", 0)
+    remaining_way_before: Array = leaf("drone", 0)
     """Distance from the goal before this environment step, m. (n_worlds, n_drones)"""
     handles: tuple[Handle, ...] = static()
     """Handles of the poles, then of the boxes."""
@@ -104,11 +104,6 @@ class Avoid(Task):
     """Distance at which a goal counts as reached, m."""
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If a number is out of range, or there is no obstacle.
-        """
         super().__post_init__()
         if self.n_poles + self.n_boxes == 0:
             raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
@@ -116,20 +111,23 @@ class Avoid(Task):
     def field(self, n_drones: int) -> Field:
         """Return the size of the field: a third of the cells stay free, and all drones fit beside each other."""
         n = self.n_poles + self.n_boxes
-        width = max(4, -(-3 * n // (2 * LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
-        size = CELL * np.array([LENGTH, width])
-        half = np.array([size[0] / 2 + GAP + JITTER + 0.5, size[1] / 2 + 0.5])
+        width = max(4, -(-3 * n // (2 * FIELD_LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
+        size = CELL * np.array([FIELD_LENGTH, width])
+        half = np.array([size[0] / 2 + FIELD_GAP + JITTER + 0.5, size[1] / 2 + 0.5])
         row = SPACING * (np.arange(n_drones) - (n_drones - 1) / 2)
-        goals = np.stack([np.full(n_drones, size[0] / 2 + GAP + JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1)
+        goals = np.stack(
+            [np.full(n_drones, size[0] / 2 + FIELD_GAP + JITTER), row, np.full(n_drones, HEIGHT / 2)], axis=-1
+        )
         return Field(width, size, half, goals)
 
     def install(self, sim: Sim) -> None:
-        """Add the obstacles and the check of contacts."""
         handles = []
         if self.n_poles:
             handles.append(sim.scene.add("pole", count=self.n_poles, pos=(0, 0, 0), radius=POLE_RADIUS, height=HEIGHT))
         if self.n_boxes:
-            handles.append(sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX, BOX, BOX)))
+            handles.append(
+                sim.scene.add("box", count=self.n_boxes, pos=(0, 0, HEIGHT / 2), size=(BOX_WIDTH, BOX_WIDTH, BOX_WIDTH))
+            )
         contacts = sim.scene.contact_fn(handles, drones=False)
         shape = (sim.n_worlds, sim.n_drones)
         zero, no = device_array(np.zeros((*shape, 3)), sim.data.states.pos.dtype), device_array(np.zeros(shape), bool)
@@ -152,11 +150,15 @@ class Avoid(Task):
         """Return drones in flight before the field, and obstacles in cells of their own."""
         n, n_drones, dtype = self.n_poles + self.n_boxes, data.core.n_drones, data.states.pos.dtype
         field = self.field(n_drones)
-        x = draw(key, cells=LENGTH * field.width, obstacles=(n, 4), drones=(n_drones, 12))
+        x = draw(key, cells=FIELD_LENGTH * field.width, obstacles=(n, 4), drones=(n_drones, 12))
         cell, stands = ranks(x["cells"], n), 2 * x["obstacles"] - 1
         corner = jnp.asarray((CELL - field.size) / 2, dtype)
-        flat = corner + CELL * jnp.stack([cell % LENGTH, cell // LENGTH], axis=-1) + IN_CELL * stands[:, :2]
-        hangs = (np.arange(n) >= self.n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX) * stands[:, 2])
+        flat = (
+            corner
+            + CELL * jnp.stack([cell % FIELD_LENGTH, cell // FIELD_LENGTH], axis=-1)
+            + CELL_JITTER * stands[:, :2]
+        )
+        hangs = (np.arange(n) >= self.n_poles) * jnp.asarray(HEIGHT / 2 + (HEIGHT / 2 - BOX_WIDTH) * stands[:, 2])
         angle = jnp.pi * stands[:, 3:] / 2
         pos = jnp.concatenate([flat, hangs[:, None]], axis=-1)
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
@@ -171,18 +173,17 @@ class Avoid(Task):
         return with_record(data, own.replace(goal=goals + JITTER * aim))
 
     def before_step(self, data: SimData) -> SimData:
-        """Note the distance from the goal, and which drones are out."""
         own = crossing_of(data)
-        return with_record(data, own.replace(out_before=own.out, to_go_before=self.error(data)))
+        return with_record(data, own.replace(out_before=own.out, remaining_way_before=self.error(data)))
 
-    def seen(self, data: SimData) -> Array:
+    def nearest_ways(self, data: SimData) -> Array:
         """Return the ways to the nearest points of the nearest obstacles, m. (n_drones, n_seen, 3)"""
         dtype, handles = data.states.pos.dtype, crossing_of(data).handles
         places = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
         n_poles, n_boxes = self.n_poles, self.n_boxes
         # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
         middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
-        size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX / 2] * 3] * n_boxes)
+        size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX_WIDTH / 2] * 3] * n_boxes)
         thick = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
         pos, quat = (x[..., places, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
         inside = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
@@ -191,29 +192,28 @@ class Avoid(Task):
         far = rotation.safe_norm(ways)
         gap = far - thick[:, None].astype(dtype)
         ways = rotation.rotate(quat, ways) * (gap / jnp.where(far > 1e-3, far, 1))
-        return nearest(gap[..., 0], ways, min(self.n_seen, n_poles + n_boxes))
+        return nearest_entries(gap[..., 0], ways, min(self.n_seen, n_poles + n_boxes))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and the ways to its goal, to the nearest obstacles and to other drones, m."""
         n_drones = data.core.n_drones
         obs = state_of(data) | {
             "difference_to_goal": crossing_of(data).goal - data.states.pos,
-            "obstacles_near": self.seen(data).reshape(n_drones, -1),
+            "obstacles_near": self.nearest_ways(data).reshape(n_drones, -1),
         }
         if n_drones > 1:
-            others, _ = others_near(data, 2, ~crossing_of(data).out)
+            others, _ = nearest_drones(data, 2, ~crossing_of(data).out)
             obs["drones_near"] = others.reshape(n_drones, -1)
         return obs
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress and the outcome, and costs of flying close, fast, of turning, and of changing actions."""
         own = crossing_of(data)
-        gap = rotation.safe_norm(self.seen(data)[..., 0, :])[..., 0]
+        gap = rotation.safe_norm(self.nearest_ways(data)[..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
         paid = {
-            "progress": 2.0 * (own.to_go_before - self.error(data)),
+            "progress": 2.0 * (own.remaining_way_before - self.error(data)),
             "closeness": -0.05 * jnp.exp(-10 * gap),
-            "haste": -0.1 * jnp.maximum(speed - CRUISE, 0),
+            "haste": -0.1 * jnp.maximum(speed - CRUISE_SPEED, 0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
             "reached": 10.0 * own.reached,
@@ -222,7 +222,6 @@ class Avoid(Task):
         return terms.only_where(~own.out_before, paid)
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where every drone is disabled or has arrived."""
         return jnp.all(crossing_of(data).out)
 
     def error(self, data: SimData) -> Array:
@@ -230,20 +229,16 @@ class Avoid(Task):
         return rotation.safe_norm(crossing_of(data).goal - data.states.pos)[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return which drones have arrived and are disabled."""
         return {"reached": crossing_of(data).reached, "disabled": crossing_of(data).disabled}
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"elevation": -35}
 
     def target(self, data: SimData) -> Array:
-        """Return the goal, m."""
         return crossing_of(data).goal
 
     def succeeded(self, data: SimData) -> Array:
-        """Return which drones have arrived."""
         return crossing_of(data).reached
 
 

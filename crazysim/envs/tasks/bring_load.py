@@ -25,8 +25,8 @@ class Delivery(PyTree):
 
     goal: Array = leaf("drone", 1)
     """Goal of the load, world frame, m. (n_worlds, n_drones, 3)"""
-    to_go_before: Array = leaf("drone", 0)
-    """Remaining way, ``to_go``, at the beginning of this environment step, m. (n_worlds, n_drones)"""
+    remaining_way_before: Array = leaf("drone", 0)
+    """Remaining way, ``remaining_way``, at the beginning of this environment step, m. (n_worlds, n_drones)"""
     steps_there: Array = leaf("drone", 0)
     """Number of physics steps for which the load has been at its goal without a break. (n_worlds, n_drones)"""
     delivered: Array = leaf("drone", 0)
@@ -39,9 +39,9 @@ class Delivery(PyTree):
 class BringLoad(Task):
     """Base of tasks in which every drone brings a load of its own to a goal and holds it there.
 
-    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``to_go``, ``observe`` and ``rewards``. Their
-    ``install`` adds the load, whose plugin is named ``load``, and a stage of one drone that stores the record of
-    ``judged``. An episode ends when a drone crashes.
+    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``remaining_way``, ``observe`` and
+    ``rewards``. Their ``install`` adds the load, whose plugin is named ``load``, and a stage of one drone that stores
+    the record that ``update_outcome`` returns. An episode ends when a drone crashes.
     """
 
     Record = Delivery
@@ -51,11 +51,11 @@ class BringLoad(Task):
     hold: float = 0.5
     """Time for which the load must stay at its goal, s."""
 
-    def to_go(self, data: SimData) -> Array:
+    def remaining_way(self, data: SimData) -> Array:
         """Return the length of the remaining way, m. (...)"""
-        raise NotImplementedError(self._undefined("to_go(data)"))
+        raise NotImplementedError(self._undefined("remaining_way(data)"))
 
-    def judged(self, data: SimData, crashed: Array) -> Any:
+    def update_outcome(self, data: SimData, crashed: Array) -> Any:
         """Return the record after a physics step, with crashes and deliveries up to now.
 
         Args:
@@ -69,8 +69,7 @@ class BringLoad(Task):
         return own.replace(crashed=crashed, steps_there=steps, delivered=delivered)
 
     def before_step(self, data: SimData) -> SimData:
-        """Store the remaining way."""
-        return with_record(data, delivery_of(data).replace(to_go_before=self.to_go(data)))
+        return with_record(data, delivery_of(data).replace(remaining_way_before=self.remaining_way(data)))
 
     def at_goal(self, data: SimData) -> Array:
         """Return True where a load is near its goal and slow. (...)"""
@@ -78,7 +77,6 @@ class BringLoad(Task):
         return (rotation.dot(vel, vel)[..., 0] < SETTLED_SPEED**2) & (self.error(data) < self.tolerance)
 
     def terminated(self, data: SimData) -> Array:
-        """Return True in worlds where a drone has crashed. ()"""
         return jnp.any(delivery_of(data).crashed)
 
     def error(self, data: SimData) -> Array:
@@ -86,16 +84,13 @@ class BringLoad(Task):
         return rotation.safe_norm(delivery_of(data).goal - load_pos(data))[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return masks of delivered loads and crashed drones. (...)"""
         own = delivery_of(data)
         return {"delivered": own.delivered, "crashed": own.crashed}
 
     def target(self, data: SimData) -> Array:
-        """Return the goal of the load, world frame, m. (..., 3)"""
         return delivery_of(data).goal
 
     def succeeded(self, data: SimData) -> Array:
-        """Return True where a load has been delivered. (...)"""
         return delivery_of(data).delivered
 
 
@@ -104,14 +99,14 @@ def delivery_of(data: SimData) -> Any:
     return data.plugins[NAME]
 
 
-def not_yet(data: SimData) -> dict[str, Array]:
+def initial_outcome(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Delivery`` at the start: nothing is delivered, and no drone has crashed. All worlds."""
     pos = data.states.pos
     shape = pos.shape[:2]
     no = device_array(np.zeros(shape), bool)
     return {
         "goal": device_array(np.zeros(pos.shape), pos.dtype),
-        "to_go_before": device_array(np.zeros(shape), pos.dtype),
+        "remaining_way_before": device_array(np.zeros(shape), pos.dtype),
         "steps_there": device_array(np.zeros(shape), np.int32),
         "delivered": no,
         "crashed": no,

@@ -14,10 +14,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
 from crazysim.core.plugin import Placement
 from crazysim.core.settings import setting
-from crazysim.envs.random import between, draw, within
+from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import pick
-from crazysim.envs.tasks.touch_down import Landing, TouchDown, not_yet
+from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
 from crazysim.plugins.vehicles.model import load_vehicle
@@ -27,11 +27,11 @@ CARS, VEHICLE = "cars", "f1tenth_ros"
 """Name of the population, and vehicle model."""
 SPACING = 6.0
 """Distance between the first places of the cars of several drones, m; a drone observes its own car only."""
-FARTHEST, CEILING = 3.0, 2.5
+MAX_DISTANCE, CEILING = 3.0, 2.5
 """Largest horizontal distance of a drone from its car, and largest height of a drone, m."""
-SLOWEST = 0.3
+MIN_SPEED_SHARE = 0.3
 """Smallest speed of a car, as a share of the largest."""
-STEER = 0.25
+MAX_STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
 RADIUS = 0.12
 """Largest horizontal distance of a drone from the middle of the roof at touch-down, m."""
@@ -57,30 +57,29 @@ class Chase(TouchDown):
     """Largest speed of a car, m/s; the smallest is 0.3 times that."""
 
     def install(self, sim: Sim) -> None:
-        """Add the cars and the check of contacts."""
         cars = Cars(sim.n_drones, vehicle=VEHICLE, pos=SPACING * grid_2d(sim.n_drones), level="speed", name=CARS)
         sim.add(cars)
         contacts = sim.scene.contact_fn([f"{CARS}:{k}" for k in range(sim.n_drones)], drones=False)
         touch = Placement(self.touch(contacts, RADIUS, "world"), before="increment_steps")
-        self.add_record(sim, Landing(**not_yet(sim.data)), [touch])
+        self.add_record(sim, Landing(**initial_outcome(sim.data)), [touch])
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, and drones in flight around them."""
         n, car, vehicle = data.core.n_drones, data.plugins[CARS], load_vehicle(VEHICLE)
         x = draw(key, n, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1)
-        speed, steer = self.speed * between(x["speed"], SLOWEST, 1.0), within(x["steer"], STEER)
+        speed, steer = self.speed * scale_to(x["speed"], MIN_SPEED_SHARE, 1.0), scale_symmetric(x["steer"], MAX_STEER)
         # Those of a car that rolls without slip; its tyres then slip a little.
         side = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
         car = car.replace(
-            yaw=within(x["yaw"], np.pi),
+            yaw=scale_symmetric(x["yaw"], np.pi),
             body_vel=jnp.concatenate([speed, side * speed], axis=-1),
             yaw_rate=speed * jnp.tan(steer) / vehicle.wheelbase,
             steer=steer,
             command=jnp.concatenate([speed, steer], axis=-1),
         )
         data = data.replace(plugins=data.plugins | {CARS: car})
-        pos = car.pos + within(x["start"], np.array([1.0, 1.0, 0.4])) + np.array([0.0, 0.0, 1.1])
-        return flying(data, pos, rotation.from_rpy(within(x["rpy"], 0.2)), within(x["vel"], 0.3))
+        pos = car.pos + scale_symmetric(x["start"], np.array([1.0, 1.0, 0.4])) + np.array([0.0, 0.0, 1.1])
+        return flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.2)), scale_symmetric(x["vel"], 0.3))
 
     def target_motion(self, data: SimData, ahead: int = 0) -> tuple[Array, Array]:
         """Return position, m, and velocity, m/s, of each drone's roof, of one drone or one world. (..., 3) each"""
@@ -92,11 +91,10 @@ class Chase(TouchDown):
         vel = car.vel + rotation.cross(turning, arm)
         return pick(car.pos + arm, data.core.drone_id), pick(vel, data.core.drone_id)
 
-    def beyond(self, data: SimData) -> Array:
-        """Return true where a drone is too far from its car, or too high. (...)"""
+    def has_left_arena(self, data: SimData) -> Array:
         pos = data.states.pos
         away = (pos - self.target_motion(data)[0])[..., :2]
-        return (rotation.dot(away, away)[..., 0] > FARTHEST**2) | (pos[..., 2] > CEILING)
+        return (rotation.dot(away, away)[..., 0] > MAX_DISTANCE**2) | (pos[..., 2] > CEILING)
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the way to its roof, m, the roof's relative velocity, m/s, and the car's turning.
@@ -108,7 +106,6 @@ class Chase(TouchDown):
         return super().observe(data) | {"heading": pick(heading, drone), "yaw_rate": pick(car.yaw_rate, drone)}
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"elevation": -25}
 

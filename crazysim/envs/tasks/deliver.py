@@ -16,9 +16,9 @@ from crazysim.core.data import SimData, grid_2d
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms
-from crazysim.envs.random import between, draw, within
+from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
+from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
 from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
@@ -33,20 +33,20 @@ CARS, VEHICLE = "cars", "f1tenth_ros"
 """Name of the population, and vehicle model."""
 SPACING = 10.0
 """Distance between the first places of the cars of several drones, m."""
-HALF_WIDTH, LOWEST, CEILING = 4.5, 0.25, 2.5
+HALF_WIDTH, MIN_HEIGHT, CEILING = 4.5, 0.25, 2.5
 """Largest distance of a drone from its car's first place along x and y, and its smallest and largest height, m. The
 smallest keeps it above cars and trailers."""
 SIZE, RING = (0.08, 0.08, 0.05), 0.07
 """Full lengths of a load, and height of its ring above its middle, m."""
 HOOK_MASS, DAMPING, REACH, MAX_SPEED = 0.003, 2e-4, 0.07, 0.6
 """Mass of the hook, kg, damping of its joint, N m s, and its reach, m, and largest speed, m/s, to pick up a load."""
-SLOWEST = 0.3
+MIN_SPEED_SHARE = 0.3
 """Smallest speed of a car, as a share of the largest."""
-STEER = 0.25
+MAX_STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
 GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
 """Lowest and highest goal of a load from its car's first place, m."""
-DROPPED = 0.15
+DROP_HEIGHT = 0.15
 """Height of a ring below which a load that was taken counts as dropped, m: it hangs lower than the trailer."""
 
 
@@ -82,7 +82,6 @@ class Deliver(BringLoad):
     """Length of an episode, s."""
 
     def install(self, sim: Sim) -> None:
-        """Add the cars with their trailers, the hooks with the loads on the trailers, and the rules."""
         places = SPACING * grid_2d(sim.n_drones)
         settings: dict[str, Any] = {"pos": places, "level": "speed", "trailer": True, "name": CARS}
         sim.add(Cars(sim.n_drones, vehicle=VEHICLE, **settings))
@@ -98,18 +97,18 @@ class Deliver(BringLoad):
             ring, vel = (pick(x, data.core.drone_id) for x in moving_rings(data.plugins[CARS]))
             load = load.replace(pos=jnp.where(taken, load.pos, ring), vel=jnp.where(taken, load.vel, vel))
             data = data.replace(plugins=data.plugins | {"load": load})
-            crashed = beyond(data) | (taken & (load.pos[2] < DROPPED))
-            return with_record(data, self.judged(data, crashed).replace(taken=taken))
+            crashed = has_left_arena(data) | (taken & (load.pos[2] < DROP_HEIGHT))
+            return with_record(data, self.update_outcome(data, crashed).replace(taken=taken))
 
         not_taken = device_array(np.zeros((sim.n_worlds, sim.n_drones)), bool)
-        install_rules(sim, TrailerDelivery(**not_yet(sim.data), taken=not_taken), judge)
+        install_rules(sim, TrailerDelivery(**initial_outcome(sim.data), taken=not_taken), judge)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return cars that drive, loads on their trailers, drones in flight above, and goals."""
         car, load = data.plugins[CARS], data.plugins["load"]
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1, goal=3)
-        speed, steer = self.speed * between(x["speed"], SLOWEST, 1.0), within(x["steer"], STEER)
-        yaw = within(x["yaw"], np.pi)
+        speed, steer = self.speed * scale_to(x["speed"], MIN_SPEED_SHARE, 1.0), scale_symmetric(x["steer"], MAX_STEER)
+        yaw = scale_symmetric(x["yaw"], np.pi)
         car = car.replace(
             yaw=yaw,
             body_vel=jnp.concatenate([speed, 0 * speed], axis=-1),
@@ -118,9 +117,9 @@ class Deliver(BringLoad):
             command=jnp.concatenate([speed, steer], axis=-1),
         )
         ring, ring_vel = moving_rings(car)
-        pos = ring + within(x["start"], np.array([0.8, 0.8, 0.3])) + np.array([0.0, 0.0, self.length + 0.6])
-        vel = within(x["vel"], 0.3)
-        data = flying(data, pos, rotation.from_rpy(within(x["rpy"], 0.1)), vel)
+        pos = ring + scale_symmetric(x["start"], np.array([0.8, 0.8, 0.3])) + np.array([0.0, 0.0, self.length + 0.6])
+        vel = scale_symmetric(x["vel"], 0.3)
+        data = flying(data, pos, rotation.from_rpy(scale_symmetric(x["rpy"], 0.1)), vel)
         s = data.states
         load = load.replace(
             pos=ring,
@@ -130,10 +129,10 @@ class Deliver(BringLoad):
             grip=jnp.ones_like(load.grip),
         )
         data = data.replace(plugins=data.plugins | {CARS: car, "load": load})
-        goal = between(x["goal"], *np.array(GOAL)) + middle_of(data)
+        goal = scale_to(x["goal"], *np.array(GOAL)) + middle_of(data)
         return with_record(data, delivery_of(data).replace(goal=goal))
 
-    def to_go(self, data: SimData) -> Array:
+    def remaining_way(self, data: SimData) -> Array:
         """Return the way of the hook to the load, and of the load to its goal, m. (...)"""
         load = data.plugins["load"]
         return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
@@ -156,12 +155,11 @@ class Deliver(BringLoad):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress, carrying and proximity, and costs of turning, changing actions and a crash."""
-        own, load, to_go = delivery_of(data), data.plugins["load"], self.to_go(data)
+        own, load, to_go = delivery_of(data), data.plugins["load"], self.remaining_way(data)
         apart = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
-            "progress": 5.0 * (own.to_go_before - to_go),
+            "progress": 5.0 * (own.remaining_way_before - to_go),
             "meeting": jnp.where(own.taken, 1.0, 0.1 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
             "proximity": 2.0 * own.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
@@ -170,15 +168,12 @@ class Deliver(BringLoad):
         }
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return which loads are taken and delivered, and which drones have crashed."""
         return {"taken": delivery_of(data).taken} | super().info(data)
 
     def subjects(self, data: SimData) -> Array:
-        """Return the places of the loads, m. (n_drones, 3)"""
         return data.plugins["load"].pos
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"elevation": -20}
 
@@ -197,8 +192,8 @@ def rings_of(car: CarData) -> Array:
 def moving_rings(car: CarData) -> tuple[Array, Array]:
     """Return the rings of ``rings_of`` and their velocities, m/s, of one world. (n_members, 3) each
 
-    The velocities are those of the joints that turn: a difference of two positions in float32, times 500 Hz, would be
-    off by 2e-4 m/s.
+    The velocities follow from the turning joints: a difference of two positions in float32, times 500 Hz, would be off
+    by 2e-4 m/s.
     """
 
     def place(*moved: Array) -> Array:
@@ -214,8 +209,8 @@ def middle_of(data: SimData) -> Array:
     return pick(jnp.asarray(places, data.states.pos.dtype), data.core.drone_id)
 
 
-def beyond(data: SimData) -> Array:
+def has_left_arena(data: SimData) -> Array:
     """Return true where a drone has left its part of the arena. (...)"""
     pos = data.states.pos
     far = jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1)
-    return far | (pos[..., 2] < LOWEST) | (pos[..., 2] > CEILING)
+    return far | (pos[..., 2] < MIN_HEIGHT) | (pos[..., 2] > CEILING)

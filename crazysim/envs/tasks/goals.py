@@ -43,7 +43,6 @@ class GoalTask(Task):
     """Height of the arena, m."""
 
     def install(self, sim: Sim) -> None:
-        """Give every drone a goal."""
         install_goal(sim)
 
     def observe(self, data: SimData) -> dict[str, Array]:
@@ -55,7 +54,6 @@ class GoalTask(Task):
         return out_of_bounds(data, self.half_width, self.height)
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where a drone has left the arena."""
         return jnp.any(self.crashed(data))
 
     def error(self, data: SimData) -> Array:
@@ -63,7 +61,6 @@ class GoalTask(Task):
         return rotation.safe_norm(goal_of(data).pos - data.states.pos)[..., 0]
 
     def target(self, data: SimData) -> Array:
-        """Return the goal, m."""
         return goal_of(data).pos
 
 
@@ -131,7 +128,7 @@ def pick(x: Array, number: Array) -> Array:
     return jnp.sum(jnp.where(chosen, x, 0), axis=-2)
 
 
-def nearest(distance: Array, x: Array, n: int) -> Array:
+def nearest_entries(distance: Array, x: Array, n: int) -> Array:
     """Return the entries with the smallest distances, nearest first.
 
     Args:
@@ -186,7 +183,7 @@ def collision_stage(sim: Sim) -> Stage:
     return collide
 
 
-def others_near(data: SimData, n: int, counts: Array | None = None) -> tuple[Array, Array]:
+def nearest_drones(data: SimData, n: int, counts: Array | None = None) -> tuple[Array, Array]:
     """Return positions, m, and velocities, m/s, of the nearest other drones of a world relative to each drone.
 
     Args:
@@ -203,5 +200,5 @@ def others_near(data: SimData, n: int, counts: Array | None = None) -> tuple[Arr
     seen = others if counts is None else counts[None] & others
     relative, passing = (jnp.where(seen[..., None], x[None] - x[:, None], 0) for x in (s.pos, s.vel))
     far = jnp.where(seen, jnp.sum(relative * relative, axis=-1), jnp.inf)
-    found = nearest(far, jnp.concatenate([relative, passing], axis=-1), min(n, n_drones - 1))
+    found = nearest_entries(far, jnp.concatenate([relative, passing], axis=-1), min(n, n_drones - 1))
     return found[..., :3], found[..., 3:]

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
 from crazysim.envs import terms
-from crazysim.envs.random import draw, within
+from crazysim.envs.random import draw, scale_symmetric
 from crazysim.envs.spawn import flying
 from crazysim.envs.tasks.goals import GoalTask, with_goal
 
@@ -43,10 +43,10 @@ class Hover(GoalTask):
         """Return drones in flight, and their goals."""
         x = draw(key, data.core.n_drones, start=3, goal=3, rpy=3, vel=3, ang_vel=3)
         box = np.array([self.reach, self.reach, 0.7 * self.reach])
-        quat = rotation.from_rpy(within(x["rpy"], 0.2))
-        vel, ang_vel = within(x["vel"], 0.5), within(x["ang_vel"], 0.5)
-        data = flying(data, MIDDLE + within(x["start"], box), quat, vel, ang_vel)
-        return with_goal(data, MIDDLE + within(x["goal"], box))
+        quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))
+        vel, ang_vel = scale_symmetric(x["vel"], 0.5), scale_symmetric(x["ang_vel"], 0.5)
+        data = flying(data, MIDDLE + scale_symmetric(x["start"], box), quat, vel, ang_vel)
+        return with_goal(data, MIDDLE + scale_symmetric(x["goal"], box))
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return proximity to the goal, and costs of turning, of changing actions and of a crash."""

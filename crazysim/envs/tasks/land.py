@@ -19,7 +19,7 @@ from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME
 from crazysim.envs.tasks.goals import pick, with_record
-from crazysim.envs.tasks.touch_down import Landing, TouchDown, landing_of, not_yet
+from crazysim.envs.tasks.touch_down import Landing, TouchDown, initial_outcome, landing_of
 from crazysim.pytree import device_array, leaf, static
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
@@ -78,7 +78,7 @@ class Land(TouchDown):
             return pads.set_pose(data, pos, vel=vel)
 
         zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
-        record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **not_yet(sim.data))
+        record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
         placements = [Placement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
             placements.insert(0, Placement(move, before="increment_steps", name=f"{NAME}_pads"))
@@ -104,7 +104,7 @@ class Land(TouchDown):
         """Return position, m, and velocity, m/s, of each drone's pad, of one drone or one world. (..., 3) each"""
         return pad_of(data, data.core.steps + ahead if ahead else data.core.steps)
 
-    def beyond(self, data: SimData) -> Array:
+    def has_left_arena(self, data: SimData) -> Array:
         """Return true where a drone has left its part of the arena. (...)"""
         pos = data.states.pos
         return jnp.any(jnp.abs(pos - middle_of(data))[..., :2] > HALF_WIDTH, axis=-1) | (pos[..., 2] > CEILING)

@@ -21,9 +21,9 @@ from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
 from crazysim.envs.tasks import race_rules as rules
 from crazysim.envs.tasks.goals import install_rules, pick, with_record
-from crazysim.envs.tasks.race_observations import observe, visited
+from crazysim.envs.tasks.race_observations import observe, visited_objects
 from crazysim.envs.tasks.race_rules import OPENING, POLE_HEIGHT, dense, gates_of, race_of
-from crazysim.envs.tracks import Track, checked, n_random, random_course, start_offsets
+from crazysim.envs.tracks import Track, check_track, random_count, random_course, start_offsets
 from crazysim.errors import ConfigError
 from crazysim.pytree import device_array, host_array
 from crazysim.sim.sim import Sim
@@ -32,7 +32,7 @@ SENSOR_RANGE = 0.7
 """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
 START_JITTER = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1)
 """Largest component of the distance of a start from its place, m, and of its roll, pitch and yaw, rad."""
-MASS, INERTIA = 0.115, 0.04
+MASS_DEVIATION, INERTIA_DEVIATION = 0.115, 0.04
 """Largest relative deviation of mass and inertia from the airframe's from level 1 on: 5 g and 1e-6 kg m^2 of a
 cf21B_500, as in lsy_drone_racing."""
 GATE_JITTER = (0.15, 0.15, 0.1, 0.05, 0.1, 0.2)
@@ -80,17 +80,12 @@ class Race(Task):
     counts as passed."""
 
     def install(self, sim: Sim) -> None:
-        """Add gates, obstacles and the rules, and from level 1 on masses and inertias per drone.
-
-        Raises:
-            ConfigError: If the track cannot be flown from its starts, or several drones practise.
-        """
         if self.practice and sim.n_drones > 1:
             raise ConfigError(
                 f"expected a single drone for practice, got {sim.n_drones}: there is no room behind a gate"
             )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
-        course = checked(self.track, sim.n_drones, float(jitter), self.level == 3)
+        course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
         tallest = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
         # All posts have one length, so that they are computed side by side; the rest is below the floor.
         gates = sim.scene.add("gate", count=course.n_gates, pos=course.gates_pos, quat=self._gates_quat(),
@@ -98,7 +93,7 @@ class Race(Task):
         obstacles_pos = np.asarray(course.obstacles_pos, float) - FOOT
         obstacles = sim.scene.add("pole", "obstacle", count=course.n_obstacles, pos=obstacles_pos, height=POLE_HEIGHT)
         if self.level >= 1:
-            _one_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
+            _repeat_per_drone(sim, {"mass": 1, "J": 2, "J_inv": 2})
         pos, shape = sim.data.states.pos, (sim.n_worlds, sim.n_drones)
 
         def zeros(*shape: int, dtype: DTypeLike = pos.dtype) -> Array:
@@ -114,7 +109,7 @@ class Race(Task):
             obstacles_visited=zeros(*shape, course.n_obstacles, dtype=bool),
             passed_before=zero,
             out_before=none,
-            to_go_before=zeros(*shape),
+            remaining_way_before=zeros(*shape),
             nominal_pos=zeros(sim.n_worlds, 1, n, 3) if moved else None,
             nominal_quat=zeros(sim.n_worlds, 1, course.n_gates, 4) if moved else None,
             gates=gates,
@@ -129,7 +124,7 @@ class Race(Task):
             record, pos = race_of(data), data.states.pos
             left = jnp.any((pos < low) | (pos > high), axis=-1)
             disabled = record.disabled | (~record.finished & (left | contacts(data).any))
-            passed = record.passed + (rules.passes(data) & ~disabled)
+            passed = record.passed + (rules.passes_gate(data) & ~disabled)
             return with_record(data, record.replace(passed=passed, disabled=disabled, last_pos=pos))
 
         install_rules(sim, record, judge, collisions=True)
@@ -143,7 +138,7 @@ class Race(Task):
         if self.level >= 2:
             sizes |= {"gates": (course.n_gates, 6), "obstacles": (course.n_obstacles, 3)}
         if self.level == 3:
-            sizes["course"] = n_random(course)
+            sizes["course"] = random_count(course)
         if self.practice:
             sizes |= {"passed": 1, "behind": (1, 2)}
         x = draw(key, **sizes)
@@ -151,28 +146,27 @@ class Race(Task):
         if self.level >= 2:
             data, start = self._place(data, x)
         if self.level >= 1:
-            data = data.replace(params=_drawn(data.params, 2 * x["inertia"] - 1))
+            data = data.replace(params=_randomize_inertia(data.params, 2 * x["inertia"] - 1))
         offset = (2 * x["start"] - 1) * np.array(START_JITTER, dtype)
         pos = start + start_offsets(n_drones).astype(dtype) + offset[..., :3]
         record, vel = race_of(data), jnp.zeros((), dtype)
         if self.practice:
             passed = (x["passed"] * course.n_gates).astype(jnp.int32)
-            behind, vel = _behind(data, passed, x["behind"])
+            behind, vel = _pos_behind_gate(data, passed, x["behind"])
             pos = jnp.where(passed[..., None] > 0, behind, pos)
             record = record.replace(passed=passed)
         data = flying(data, pos, rotation.from_rpy(offset[..., 3:]), vel)
         return with_record(data, record.replace(last_pos=data.states.pos))
 
     def before_step(self, data: SimData) -> SimData:
-        """Note what each drone has observed, its progress, and the way to go."""
         record = race_of(data)
-        seen_gates, seen_obstacles = visited(data, self.sensor_range)
+        seen_gates, seen_obstacles = visited_objects(data, self.sensor_range)
         new = record.replace(
             gates_visited=seen_gates,
             obstacles_visited=seen_obstacles,
             passed_before=record.passed,
             out_before=record.out,
-            to_go_before=rules.to_go(data),
+            remaining_way_before=rules.remaining_way(data),
         )
         return with_record(data, new)
 
@@ -181,33 +175,27 @@ class Race(Task):
         return observe(data, self.sensor_range)
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return the terms of ``reward``."""
         return self.reward(data, action, last_action)
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where every drone has finished or is disabled."""
         return jnp.all(race_of(data).out)
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the next gate, m."""
-        return rules.to_next_gate(data)
+        return rules.next_gate_distance(data)
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return the number of gates passed, and which drones have finished and are disabled."""
         record = race_of(data)
         return {"gates_passed": record.passed, "finished": record.finished, "disabled": record.disabled}
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"elevation": -50}
 
     def target(self, data: SimData) -> Array:
-        """Return the middle of the next gate, m."""
         return rules.next_gate(data)[0]
 
     def succeeded(self, data: SimData) -> Array:
-        """Return which drones have finished."""
         return race_of(data).finished
 
     def _gates_quat(self) -> np.ndarray:
@@ -230,28 +218,28 @@ class Race(Task):
         return with_record(data, record), start
 
 
-def _one_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
+def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
     """Give every drone parameters of its own, by name and number of dimensions."""
 
-    def spread(data: SimData) -> SimData:
+    def repeat_params(data: SimData) -> SimData:
         params, shape, each = data.params, data.states.pos.shape[:2], {}
         for name, ndim in names.items():  # they may be one per drone already
             value = getattr(params, name)
             each[name] = device_array(np.broadcast_to(value, (*shape, *value.shape[-ndim:])), value.dtype)
         return data.replace(params=params.replace(**each))
 
-    sim.data, sim.default_data = spread(sim.data), spread(sim.default_data)
+    sim.data, sim.default_data = repeat_params(sim.data), repeat_params(sim.default_data)
 
 
-def _drawn(params: SimParams, shares: Array) -> SimParams:
+def _randomize_inertia(params: SimParams, shares: Array) -> SimParams:
     """Return parameters with other masses and inertias, from numbers in [-1, 1]. (n_drones, 4)"""
-    mass = params.mass * (1 + MASS * shares[..., :1])
-    root = jnp.sqrt(1 + INERTIA * shares[..., 1:])
+    mass = params.mass * (1 + MASS_DEVIATION * shares[..., :1])
+    root = jnp.sqrt(1 + INERTIA_DEVIATION * shares[..., 1:])
     scale = root[..., :, None] * root[..., None, :]
     return params.replace(mass=mass, J=params.J * scale, J_inv=params.J_inv / scale)
 
 
-def _behind(data: SimData, passed: Array, x: Array) -> tuple[Array, Array]:
+def _pos_behind_gate(data: SimData, passed: Array, x: Array) -> tuple[Array, Array]:
     """Return a position of a drone that has just passed some gates, m, and its velocity, m/s; at rest if it has not.
 
     Args:

@@ -8,22 +8,22 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.envs.tasks.goals import nearest, others_near, pick
+from crazysim.envs.tasks.goals import nearest_drones, nearest_entries, pick
 from crazysim.envs.tasks.race_rules import OPENING, gates_of, obstacles_of, race_of
 
 CORNERS = OPENING / 2 * np.array([[0, 1, 1], [0, 1, -1], [0, -1, -1], [0, -1, 1]])
 """Corners of the opening in the gate's frame, m. (4, 3)"""
 
 
-def visited(data: SimData, sensor_range: float) -> tuple[Array, Array]:
+def visited_objects(data: SimData, sensor_range: float) -> tuple[Array, Array]:
     """Return true for gates and obstacles that each drone is or has been near. (n_drones, n) each"""
     record = race_of(data)
 
-    def near(pos: Array) -> Array:
+    def is_near(pos: Array) -> Array:
         flat = (pos - data.states.pos[..., None, :])[..., :2]
         return jnp.sum(flat * flat, axis=-1) < sensor_range**2
 
-    return record.gates_visited | near(gates_of(data)[0]), record.obstacles_visited | near(obstacles_of(data))
+    return record.gates_visited | is_near(gates_of(data)[0]), record.obstacles_visited | is_near(obstacles_of(data))
 
 
 def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
@@ -37,7 +37,7 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
     gates_pos, gates_quat, poles = (
         jnp.broadcast_to(x, (n_drones, *x.shape)) for x in (*gates_of(data), obstacles_of(data))
     )
-    seen_gates, seen_obstacles = visited(data, sensor_range)
+    seen_gates, seen_obstacles = visited_objects(data, sensor_range)
     n_gates, n_obstacles = seen_gates.shape[-1], seen_obstacles.shape[-1]
     nominal_pos, nominal_quat = record.nominal_pos, record.nominal_quat
     if nominal_pos is not None and nominal_quat is not None:
@@ -71,8 +71,8 @@ def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
         "rot": matrix,
         "vel_body": in_body(s.vel[..., None, :]),
         "gate_corners": jnp.concatenate(corners, axis=-2),
-        "obstacles_near": in_body(nearest(far, to_poles, min(2, n_obstacles))),
+        "obstacles_near": in_body(nearest_entries(far, to_poles, min(2, n_obstacles))),
     }
     if n_drones > 1:
-        obs["drones_near"] = in_body(others_near(data, 2, ~record.out)[0])
+        obs["drones_near"] = in_body(nearest_drones(data, 2, ~record.out)[0])
     return {name: x.reshape(n_drones, -1).astype(s.pos.dtype) for name, x in obs.items()}

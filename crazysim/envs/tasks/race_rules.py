@@ -21,7 +21,7 @@ OPENING = 0.45
 """Width and height of a gate's opening, m."""
 POLE_HEIGHT = 1.7
 """Height of an obstacle, m; the part that is too long for its place is below the floor."""
-AROUND = 0.45
+BYPASS_DISTANCE = 0.45
 """Distance from the middle of a gate at which a way around it passes, m."""
 FUNNEL = 0.15
 """Distance from the axis of a gate, m, that is no detour at the gate itself; it grows by a metre for each before it."""
@@ -44,7 +44,7 @@ class RaceRecord(PyTree):
     """Number of gates passed before this environment step. (n_worlds, n_drones)"""
     out_before: Array = leaf("drone", 0)
     """True where it was finished or disabled before this environment step. (n_worlds, n_drones)"""
-    to_go_before: Array = leaf("drone", 0)
+    remaining_way_before: Array = leaf("drone", 0)
     """Way to go before this environment step, m. (n_worlds, n_drones)"""
     nominal_pos: Array | None = leaf("world", 2)
     """Nominal positions of gates, then of obstacles, m; None if they stand there. (n_worlds, 1, n, 3)"""
@@ -92,7 +92,7 @@ def next_gate(data: SimData) -> tuple[Array, Array]:
     return pick(pos, number), pick(quat, number)
 
 
-def passes(data: SimData) -> Array:
+def passes_gate(data: SimData) -> Array:
     """Return true where the last physics step led forwards through the opening of the next gate. (...)"""
     record = race_of(data)
     pos, quat = next_gate(data)
@@ -103,24 +103,24 @@ def passes(data: SimData) -> Array:
     return crossed & jnp.all(jnp.abs(there[..., 1:]) < OPENING / 2, axis=-1) & ~record.finished
 
 
-def to_next_gate(data: SimData) -> Array:
+def next_gate_distance(data: SimData) -> Array:
     """Return the distance to the middle of the next gate, m; zero where all are passed. (n_drones,)"""
     pos, _ = next_gate(data)
     return jnp.where(race_of(data).finished, 0, rotation.safe_norm(data.states.pos - pos)[..., 0])
 
 
-def to_go(data: SimData) -> Array:
+def remaining_way(data: SimData) -> Array:
     """Return the way to the end of the course through the middle of every gate, m. (n_drones,)"""
     record = race_of(data)
     pos, quat = gates_of(data)
-    legs = way(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
+    legs = way_to_gate(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
     left = np.arange(1, pos.shape[-2], dtype=np.int32) > record.passed[..., None]
     next_pos, next_quat = next_gate(data)
-    first = way(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
+    first = way_to_gate(rotation.rotate_inverse(next_quat, data.states.pos - next_pos))
     return jnp.where(record.finished, 0, first + jnp.sum(jnp.where(left, legs, 0), axis=-1))
 
 
-def way(pos: Array) -> Array:
+def way_to_gate(pos: Array) -> Array:
     """Return the way to the middle of a gate, from beside it by a detour, and from behind it around its frame, m.
 
     By the distance in a straight line the best place would be one beside the frame, where the frame is in the way.
@@ -131,11 +131,11 @@ def way(pos: Array) -> Array:
     Returns:
         (...)
     """
-    beside = AROUND * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
+    beside = BYPASS_DISTANCE * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1]], pos.dtype)
     around = rotation.safe_norm(pos[..., None, :] - beside)[..., 0]
     off = rotation.safe_norm(pos[..., 1:])[..., 0]
     detour = jnp.maximum(off - (FUNNEL - pos[..., 0]), 0)
-    behind = 2 * AROUND - FUNNEL + jnp.min(around, axis=-1)
+    behind = 2 * BYPASS_DISTANCE - FUNNEL + jnp.min(around, axis=-1)
     return jnp.where(pos[..., 0] > 0, behind, rotation.safe_norm(pos)[..., 0] + detour)
 
 
@@ -143,7 +143,7 @@ def dense(data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
     """Return rewards for progress, m, and gates, and costs of turning, changing actions and being disabled."""
     record = race_of(data)
     paid = {
-        "progress": 2.0 * (record.to_go_before - to_go(data)),
+        "progress": 2.0 * (record.remaining_way_before - remaining_way(data)),
         "gates": 2.0 * (record.passed - record.passed_before),
         "spin": -0.001 * terms.spin(data),
         "action_rate": -0.01 * terms.action_rate(action, last_action),

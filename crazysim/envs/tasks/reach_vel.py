@@ -12,7 +12,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.settings import setting
 from crazysim.envs import terms
-from crazysim.envs.random import draw, within
+from crazysim.envs.random import draw, scale_symmetric
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import Task
 from crazysim.envs.tasks.goals import Goal, goal_of, install_goal, on_floor, state_of, with_goal
@@ -41,23 +41,21 @@ class ReachVel(Task):
     """Difference below which the velocity counts as reached, m/s."""
 
     def install(self, sim: Sim) -> None:
-        """Give every drone a goal."""
         install_goal(sim)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight, and the velocities they should reach."""
         x = draw(key, data.core.n_drones, start=3, rpy=3, vel=3, ang_vel=3, goal=3)
-        start = within(x["start"], np.array([1.0, 1.0, 0.0])) + np.array([0.0, 0.0, HEIGHT])
-        quat = rotation.from_rpy(within(x["rpy"], 0.2))
-        data = flying(data, start, quat, within(x["vel"], 0.5), within(x["ang_vel"], 0.5))
-        return with_goal(data, start, within(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
+        start = scale_symmetric(x["start"], np.array([1.0, 1.0, 0.0])) + np.array([0.0, 0.0, HEIGHT])
+        quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.2))
+        data = flying(data, start, quat, scale_symmetric(x["vel"], 0.5), scale_symmetric(x["ang_vel"], 0.5))
+        return with_goal(data, start, scale_symmetric(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state and the missing velocity, m/s."""
         return state_of(data) | {"difference_to_target_vel": goal_of(data).vel - data.states.vel}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return proximity to the velocity, and costs of turning, of changing actions and of a crash."""
         return {
             "proximity": terms.proximity(self.error(data), coarse=1.0, fine=10.0),
             "spin": -0.002 * terms.spin(data),
@@ -66,7 +64,6 @@ class ReachVel(Task):
         }
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where a drone is on the floor."""
         return jnp.any(on_floor(data))
 
     def error(self, data: SimData) -> Array:

@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import setting
 from crazysim.envs import terms
 from crazysim.envs.random import draw
-from crazysim.envs.spawn import any_attitude, flying
+from crazysim.envs.spawn import flying, random_attitude
 from crazysim.envs.tasks.goals import GoalTask, with_goal
 
 GOAL = np.array([0.0, 0.0, 3.0])
@@ -43,10 +43,9 @@ class Recover(GoalTask):
         goal = GOAL.astype(data.states.pos.dtype)
         pos = goal + 2 * x["start"] - 1
         vel, ang_vel = self.speed * (2 * x["vel"] - 1), self.spin * (2 * x["ang_vel"] - 1)
-        return with_goal(flying(data, pos, any_attitude(x["attitude"]), vel, ang_vel), goal)
+        return with_goal(flying(data, pos, random_attitude(x["attitude"]), vel, ang_vel), goal)
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return proximity to the goal and uprightness, and costs of turning, of changing actions and of a crash."""
         return {
             "proximity": terms.proximity(self.error(data), coarse=1.0, fine=10.0),
             "upright": 0.5 * rotation.z_axis(data.states.quat)[..., 2],
@@ -56,6 +55,5 @@ class Recover(GoalTask):
         }
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 2.5), "distance": 9.0, "elevation": -15}

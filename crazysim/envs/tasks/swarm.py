@@ -19,7 +19,7 @@ from crazysim.envs import terms
 from crazysim.envs.random import draw
 from crazysim.envs.spawn import flying
 from crazysim.envs.task import NAME, Task
-from crazysim.envs.tasks.goals import install_rules, on_floor, others_near, state_of, with_record
+from crazysim.envs.tasks.goals import install_rules, nearest_drones, on_floor, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
@@ -72,11 +72,7 @@ class Swarm(Task):
     """Distance below which a drone counts as in its place, m."""
 
     def install(self, sim: Sim) -> None:
-        """Give every drone a goal, and check separation at every physics step.
-
-        Raises:
-            ConfigError: If there is only one drone, or the formation does not fit.
-        """
+        """Give every drone a goal, and check separation at every physics step."""
         if sim.n_drones < 2:
             raise ConfigError(f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more.")
         if self.formation is not None:
@@ -116,7 +112,7 @@ class Swarm(Task):
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, the way to its goal, and the nearest other drones, m and m/s."""
-        near, passing = (x.reshape(x.shape[0], -1) for x in others_near(data, self.n_seen))
+        near, passing = (x.reshape(x.shape[0], -1) for x in nearest_drones(data, self.n_seen))
         return state_of(data) | {
             "difference_to_goal": swarm_of(data).goal - data.states.pos,
             "drones_near": near,
@@ -131,10 +127,10 @@ class Swarm(Task):
             "crowding": -(jnp.maximum(1.5 - gap, 0) + 2.0 * (gap < 1)),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "lost": -10.0 * self.lost(data),
+            "lost": -10.0 * self.is_lost(data),
         }
 
-    def lost(self, data: SimData) -> Array:
+    def is_lost(self, data: SimData) -> Array:
         """Return true where a drone is on the floor, outside of the arena, or too close to another. (n_drones,)"""
         pos = data.states.pos
         beyond = jnp.any(jnp.abs(pos) > self.limits(data.core.n_drones).astype(pos.dtype), axis=-1)
@@ -149,7 +145,7 @@ class Swarm(Task):
 
     def terminated(self, data: SimData) -> Array:
         """Return true where a drone is lost."""
-        return jnp.any(self.lost(data))
+        return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the goal, m."""
@@ -174,11 +170,7 @@ def swarm_of(data: SimData) -> SwarmRecord:
 
 
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:
-    """Return a formation as an array, checked. (n_drones, 3)
-
-    Raises:
-        ConfigError: If it has another shape, is too low, or two of its places are too close to each other.
-    """
+    """Return a formation as an array, checked. (n_drones, 3)"""
     try:
         slots = np.asarray(formation, float)
     except (TypeError, ValueError) as error:

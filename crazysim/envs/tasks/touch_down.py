@@ -18,9 +18,9 @@ from crazysim.envs.tasks.goals import state_of, with_record
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.contact_report import ContactFn
 
-SOFT = 0.5
+MAX_TOUCH_DOWN_SPEED = 0.5
 """Largest speed relative to the place at touch-down, m/s."""
-UPRIGHT = np.cos(np.pi / 9)
+MIN_UP_AXIS_Z = np.cos(np.pi / 9)
 """Smallest vertical component of the body z axis at touch-down: 20 degrees of tilt."""
 
 
@@ -33,7 +33,7 @@ class Landing(PyTree):
     """True where it has touched anything otherwise, or left its part of the arena. (n_worlds, n_drones)"""
     out_before: Array = leaf("drone", 0)
     """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
-    to_go_before: Array = leaf("drone", 0)
+    remaining_way_before: Array = leaf("drone", 0)
     """Distance from its place before this environment step, m. (n_worlds, n_drones)"""
 
     @property
@@ -46,7 +46,7 @@ class Landing(PyTree):
 class TouchDown(Task):
     """Base of tasks in which every drone lands on a place of its own, which may move.
 
-    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``place`` and ``beyond``.
+    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``place`` and ``has_left_arena``.
     """
 
     Record = Landing
@@ -69,15 +69,15 @@ class TouchDown(Task):
         """
         raise NotImplementedError(self._undefined("target_motion(data)"))
 
-    def beyond(self, data: SimData) -> Array:
+    def has_left_arena(self, data: SimData) -> Array:
         """Return true where a drone has left its part of the arena. (...)"""
-        raise NotImplementedError(self._undefined("beyond(data)"))
+        raise NotImplementedError(self._undefined("has_left_arena(data)"))
 
     def touch(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:
         """Return the stage that decides at the first contact whether it is a landing, before the steps increase.
 
         Args:
-            contacts: Contacts with floor and objects, of which object i belongs to drone i.
+            contacts: Contacts with floor and objects; object i belongs to drone i.
             radius: Largest horizontal distance from the middle of the place at touch-down, m.
             scope: Scope of the stage: ``drone``, or ``world`` for objects that a population places.
         """
@@ -93,18 +93,19 @@ class TouchDown(Task):
             elsewhere = jnp.any(report.objects & ~mine, axis=-1) | report.floor
             offset, drift = s.pos - pos, s.vel - vel
             within = offset[..., 0] * offset[..., 0] + offset[..., 1] * offset[..., 1] < radius**2
-            soft = (rotation.dot(drift, drift)[..., 0] <= SOFT**2) & (rotation.z_axis(s.quat)[..., 2] >= UPRIGHT)
+            soft = (rotation.dot(drift, drift)[..., 0] <= MAX_TOUCH_DOWN_SPEED**2) & (
+                rotation.z_axis(s.quat)[..., 2] >= MIN_UP_AXIS_Z
+            )
             good = on_place & (offset[..., 2] > 0) & within & soft & ~elsewhere
-            bad = (on_place & ~good) | elsewhere | self.beyond(data)
+            bad = (on_place & ~good) | elsewhere | self.has_left_arena(data)
             new = own.replace(landed=own.landed | (good & ~own.crashed), crashed=own.crashed | (bad & ~own.landed))
             return with_record(data, new)
 
         return touch
 
     def before_step(self, data: SimData) -> SimData:
-        """Note the distance from the place, and which drones are out."""
         own = landing_of(data)
-        return with_record(data, own.replace(out_before=own.out, to_go_before=self.error(data)))
+        return with_record(data, own.replace(out_before=own.out, remaining_way_before=self.error(data)))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and the way to its place, m, and the place's relative velocity, m/s."""
@@ -115,11 +116,10 @@ class TouchDown(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return progress and the outcome, and costs of speed near the place, of turning and of changing actions."""
         own, d = landing_of(data), self.error(data)
         drift = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
         paid = {
-            "progress": self.progress * (own.to_go_before - d),
+            "progress": self.progress * (own.remaining_way_before - d),
             "speed": -0.1 * drift * jnp.exp(-4 * d),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
@@ -129,7 +129,6 @@ class TouchDown(Task):
         return terms.only_where(~own.out_before, paid)
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where every drone has landed or crashed."""
         return jnp.all(landing_of(data).out)
 
     def error(self, data: SimData) -> Array:
@@ -137,15 +136,12 @@ class TouchDown(Task):
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return which drones have landed and crashed."""
         return {"landed": landing_of(data).landed, "crashed": landing_of(data).crashed}
 
     def target(self, data: SimData) -> Array:
-        """Return the middle of the place, m."""
         return self.target_motion(data)[0]
 
     def succeeded(self, data: SimData) -> Array:
-        """Return which drones have landed."""
         return landing_of(data).landed
 
 
@@ -154,8 +150,8 @@ def landing_of(data: SimData) -> Any:
     return data.plugins[NAME]
 
 
-def not_yet(data: SimData) -> dict[str, Array]:
+def initial_outcome(data: SimData) -> dict[str, Array]:
     """Return the fields of ``Landing`` for drones in the air, of all worlds."""
     pos = data.states.pos
     zero, no = device_array(np.zeros(pos.shape[:2]), pos.dtype), device_array(np.zeros(pos.shape[:2]), bool)
-    return {"landed": no, "crashed": no, "out_before": no, "to_go_before": zero}
+    return {"landed": no, "crashed": no, "out_before": no, "remaining_way_before": zero}

@@ -24,7 +24,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.sim.sim import Sim
 from crazysim.trajectories import Trajectory, figure_eight
 
-TOO_FAR = 1.5
+MAX_ERROR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 MAX_SAMPLES = 1000
 """Most samples of the time ahead: 3,000 numbers of an observation."""
@@ -66,7 +66,6 @@ class TrackTrajectory(Task):
     """Time at the end of an episode during which it must stay there, s."""
 
     def install(self, sim: Sim) -> None:
-        """Give every drone its time on the trajectory."""
         self.add_record(sim, Phase(device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)))
 
     def spawn(self, data: SimData, key: Array) -> SimData:
@@ -108,31 +107,27 @@ class TrackTrajectory(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        """Return proximity to the trajectory, and costs of changing actions and of losing it."""
         return {
             "proximity": terms.proximity(self.error(data), coarse=3.0),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "lost": -10.0 * self.lost(data),
+            "lost": -10.0 * self.is_lost(data),
         }
 
-    def lost(self, data: SimData) -> Array:
+    def is_lost(self, data: SimData) -> Array:
         """Return true where a drone is on the floor or too far from the trajectory. (n_drones,)"""
-        return on_floor(data) | (self.error(data) > TOO_FAR)
+        return on_floor(data) | (self.error(data) > MAX_ERROR)
 
     def terminated(self, data: SimData) -> Array:
-        """Return true where a drone is lost."""
-        return jnp.any(self.lost(data))
+        return jnp.any(self.is_lost(data))
 
     def error(self, data: SimData) -> Array:
         """Return the distance from the trajectory, m."""
         return rotation.safe_norm(self.target(data) - data.states.pos)[..., 0]
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 0.9), "distance": 3.5, "elevation": -30}
 
     def target(self, data: SimData) -> Array:
-        """Return the point of the trajectory, m."""
         t = self.time(data)
         return self._derivatives(t, 0)[0] if isinstance(self.trajectory, Trajectory) else self.motion(t)[0]

@@ -15,9 +15,9 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms
-from crazysim.envs.random import between, draw, within
+from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
-from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, not_yet
+from crazysim.envs.tasks.bring_load import BringLoad, Delivery, delivery_of, initial_outcome
 from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
 from crazysim.errors import ConfigError
 from crazysim.plugins.payloads import SlungLoad, direction, load_pos, load_vel
@@ -80,11 +80,6 @@ class Transport(BringLoad):
     """Length of an episode, s."""
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If drone and load do not fit through the opening together.
-        """
         super().__post_init__()
         if not self.length + ROOM <= self.opening <= 1.6:
             raise ConfigError(
@@ -93,7 +88,6 @@ class Transport(BringLoad):
             )
 
     def install(self, sim: Sim) -> None:
-        """Add the loads, the gates and the check of both."""
         sim.add(SlungLoad(mass=self.mass, length=self.length, cable=self.cable, size=RADIUS))
         middle = lanes(sim.n_drones) + np.mean(GATE, axis=0)
         gates = sim.scene.add("gate", count=sim.n_drones, pos=middle, width=self.opening, height=self.opening, bar=BAR)
@@ -102,22 +96,26 @@ class Transport(BringLoad):
         @stage("drone")
         def judge(data: SimData) -> SimData:
             """Note a crash, and a load that stays at its goal."""
-            return with_record(data, self.judged(data, contacts(data).any | self.misses(data) | out_of_lane(data)))
+            return with_record(
+                data, self.update_outcome(data, contacts(data).any | self.misses(data) | out_of_lane(data))
+            )
 
-        install_rules(sim, GateDelivery(**not_yet(sim.data), gates=gates), judge)
+        install_rules(sim, GateDelivery(**initial_outcome(sim.data), gates=gates), judge)
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight with swinging loads before the gates, and goals behind them."""
         n_drones, own = data.core.n_drones, delivery_of(data)
         x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
         lane = jnp.asarray(lanes(n_drones), data.states.pos.dtype)
-        quat = rotation.from_rpy(within(x["rpy"], 0.1))
-        data = flying(data, lane + between(x["start"], *np.array(START)), quat, within(x["vel"], 0.3))
-        yaw = within(x["turn"], TURN)
+        quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.1))
+        data = flying(data, lane + scale_to(x["start"], *np.array(START)), quat, scale_symmetric(x["vel"], 0.3))
+        yaw = scale_symmetric(x["turn"], TURN)
         turned = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
-        data = own.gates.set_pose(data, lane + between(x["gate"], *np.array(GATE)), turned)
-        data = self.hang(data, within(x["swing"], self.swing), within(x["swing_rate"], 1.5 * self.swing))
-        return with_record(data, own.replace(goal=lane + between(x["goal"], *np.array(GOAL))))
+        data = own.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE)), turned)
+        data = self.hang(
+            data, scale_symmetric(x["swing"], self.swing), scale_symmetric(x["swing_rate"], 1.5 * self.swing)
+        )
+        return with_record(data, own.replace(goal=lane + scale_to(x["goal"], *np.array(GOAL))))
 
     def hang(self, data: SimData, angle: Array, rate: Array) -> SimData:
         """Return the data with loads on taut links.
@@ -138,7 +136,7 @@ class Transport(BringLoad):
         load = load.replace(pos=s.pos + self.length * link, vel=s.vel + self.length * turning)
         return data.replace(plugins=data.plugins | {"load": load})
 
-    def to_go(self, data: SimData) -> Array:
+    def remaining_way(self, data: SimData) -> Array:
         """Return the way of the load to its goal, before the gate by way of its opening, m. (...)
 
         There the load aims half the link's length below the middle, so that drone and load pass with equal margins.
@@ -162,7 +160,6 @@ class Transport(BringLoad):
         return outside[0] | outside[1]
 
     def at_goal(self, data: SimData) -> Array:
-        """Return true where a load is near its goal, slow, and behind the gate. (...)"""
         return is_behind(load_pos(data), *gate_of(data)) & super().at_goal(data)
 
     def observe(self, data: SimData) -> dict[str, Array]:
@@ -187,10 +184,10 @@ class Transport(BringLoad):
         The approach reaches far, so that waiting before the gate pays less than passing it; proximity rewards rest at
         the goal.
         """
-        own, to_go = delivery_of(data), self.to_go(data)
+        own, to_go = delivery_of(data), self.remaining_way(data)
         rate = direction(data)[1]
         return {
-            "progress": 5.0 * (own.to_go_before - to_go),
+            "progress": 5.0 * (own.remaining_way_before - to_go),
             "approach": 0.5 * jnp.exp(-to_go),
             "proximity": terms.proximity(self.error(data), coarse=5.0),
             "swing": -0.01 * rotation.dot(rate, rate)[..., 0],
@@ -200,12 +197,10 @@ class Transport(BringLoad):
         }
 
     def info(self, data: SimData) -> dict[str, Array]:
-        """Return which loads are behind the gate and delivered, and which drones have crashed."""
         behind = is_behind(load_pos(data), *gate_of(data))
         return {"passed": behind & ~delivery_of(data).crashed} | super().info(data)
 
     def camera(self, n_drones: int) -> Mapping[str, Any]:
-        """Return the camera of images and films."""
         del n_drones
         return {"lookat": (0, 0, 1.1), "distance": 5.0, "azimuth": 60, "elevation": -20}
 

@@ -20,20 +20,17 @@ class ActionQueue(PyTree):
 
 
 class ActionDelay(Wrapper):
-    """Delay actions by some environment steps; until the first one arrives, the action is zero, which hovers."""
+    """Delay actions by ``n`` environment steps; until the first one arrives, the action is zero, which hovers."""
 
     def __init__(self, env: Env, n: int):
-        """Take the environment and the delay, environment steps."""
         super().__init__(env)
         self.n = positive_integer("n", n)
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with a queue of zeros."""
         n_drones, size = state.action.shape
         return self.remember(state, ActionQueue(jnp.zeros((n_drones, self.n, size), state.action.dtype)))
 
     def before_step(self, state: EnvState, action: Array) -> tuple[EnvState, Array]:
-        """Return the state with the action queued, and the action that arrives. (n_drones, k)"""
         queue = self.recall(state).actions
         longer = jnp.concatenate([queue, action[:, None]], axis=1)
         return self.remember(state, ActionQueue(longer[:, 1:])), longer[:, 0]

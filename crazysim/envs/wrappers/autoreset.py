@@ -12,15 +12,9 @@ class AutoReset(Wrapper):
     """Begin a new episode where one is over; the outermost of all wrappers."""
 
     def __init__(self, env: Env, mode: AutoresetMode | str = AutoresetMode.same_step):
-        """Take the environment and the mode.
-
-        Raises:
-            ConfigError: If there is no such mode.
-        """
         super().__init__(env)
         self.mode = enum_member(AutoresetMode, "mode", mode)
 
     @property
     def reset_policy(self) -> ResetPolicy | None:
-        """Rule by which new episodes begin within a step."""
         return POLICIES[self.mode]

@@ -13,11 +13,6 @@ class Wrapper(Hooks, Env):
     """An environment around another one. Subclasses add to its phases by overriding hooks, written for one world."""
 
     def __init__(self, env: Env):
-        """Take the environment to wrap.
-
-        Raises:
-            ConfigError: If ``env`` resets automatically; the wrapper would not be called when an episode starts.
-        """
         if not isinstance(env, Env):
             raise ConfigError(f"expected an environment, got {env!r}")
         if env.reset_policy is not None:
@@ -31,11 +26,7 @@ class Wrapper(Hooks, Env):
         self.name = name if name not in others else next(x for k in numbers if (x := f"{name} {k}") not in others)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Refuse wrappers that step the environment themselves, which is compiled as a whole.
-
-        Raises:
-            ConfigError: If the class overrides reset, restart or step.
-        """
+        """Refuse wrappers that step the environment themselves, which is compiled as a whole."""
         super().__init_subclass__(**kwargs)
         own = {"reset", "restart", "step"} & set(vars(cls))
         if own:
@@ -46,10 +37,8 @@ class Wrapper(Hooks, Env):
 
     @property
     def base(self) -> DroneEnv:
-        """The environment inside all wrappers."""
         return self.env.base
 
     @property
     def wrappers(self) -> tuple[Hooks, ...]:
-        """Wrappers around it, the innermost first, this one last."""
         return (*self.env.wrappers, self)

@@ -15,9 +15,9 @@ from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs
 from crazysim.envs.statistics import RunningStats
 from crazysim.envs.wrappers.base import Wrapper
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, leaf
-from crazysim.tables import NOT_NEGATIVE, number
+from crazysim.tables import NOT_NEGATIVE, read_number
 
 
 class Observe(Wrapper):
@@ -27,54 +27,48 @@ class Observe(Wrapper):
     """
 
     def __init__(self, env: Env, fn: Callable[[Obs, SimData], Obs]):
-        """Take the environment and the function."""
         super().__init__(env)
         self.fn = fn
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with changed observations."""
         return state.replace(obs=self.fn(state.obs, state.data))
 
     def after_step(self, state: EnvState) -> EnvState:
-        """Return the state with changed observations."""
         return state.replace(obs=self.fn(state.obs, state.data))
 
 
 class ObservationNoise(Wrapper):
-    """Add normal noise to observations, independent in every step; the same seed and world give the same noise."""
+    """Add normal noise to observations, independent in every step; the same seed and world give the same noise.
+
+    ``std`` has the standard deviations by name of the observation, each in its unit.
+    """
 
     def __init__(self, env: Env, std: dict[str, float]):
-        """Take the environment, and the standard deviations by name of the observation, in its unit.
-
-        Raises:
-            ConfigError: If a deviation is negative or not finite; if there is no observation of that name, when the
-                environment is first reset.
-        """
         super().__init__(env)
         if not isinstance(std, Mapping):
-            raise ConfigError(f"expected std as a dict of numbers by name, got {shown(std)}. Use {{'pos': 0.01}}, say.")
-        self.std = {name: number(f"std of {name!r}", value, NOT_NEGATIVE) for name, value in std.items()}
+            raise ConfigError(
+                f"expected std as a dict of numbers by name, got {short_repr(std)}. Use {{'pos': 0.01}}, say."
+            )
+        self.std = {name: read_number(f"std of {name!r}", value, NOT_NEGATIVE) for name, value in std.items()}
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with noisy observations."""
-        return state.replace(obs=self._noisy(state.obs, state.data))
+        return state.replace(obs=self._add_noise(state.obs, state.data))
 
     def after_step(self, state: EnvState) -> EnvState:
-        """Return the state with noisy observations."""
-        return state.replace(obs=self._noisy(state.obs, state.data))
+        return state.replace(obs=self._add_noise(state.obs, state.data))
 
-    def _noisy(self, obs: Obs, data: SimData) -> Obs:
+    def _add_noise(self, obs: Obs, data: SimData) -> Obs:
         if missing := set(self.std) - set(obs):
             raise ConfigError(f"expected names of observations, {', '.join(obs)}, got {', '.join(sorted(missing))}")
         key = world_key(data, "observation noise")
         keys = jax.vmap(lambda drone: jax.random.fold_in(key, drone))(data.core.drone_id)
         noisy = dict(obs)
         for i, (name, std) in enumerate(sorted(self.std.items())):
-            noisy[name] = obs[name] + std * jax.vmap(lambda key, i=i, x=obs[name]: _normal(key, i, x))(keys)
+            noisy[name] = obs[name] + std * jax.vmap(lambda key, i=i, x=obs[name]: _draw_normal(key, i, x))(keys)
         return noisy
 
 
-def _normal(key: Array, number: int, like: Array) -> Array:
+def _draw_normal(key: Array, number: int, like: Array) -> Array:
     return normal(jax.random.fold_in(key, number), like.shape[1:], like.dtype)
 
 
@@ -88,36 +82,29 @@ class Normalize(Wrapper):
     batched = True
 
     def __init__(self, env: Env, stats: dict[str, RunningStats] | None = None):
-        """Take the environment, and fixed statistics; None to update them in every step."""
         super().__init__(env)
         self.stats = stats
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with normalised observations; only those of the first reset enter the statistics.
-
-        Raises:
-            ConfigError: If the fixed statistics are of other observations.
-        """
         if self.name in state.memory:
-            return self._normalized(state, self.recall(state))
+            return self._normalize(state, self.recall(state))
         stats = self.stats or {name: RunningStats.create(x.shape[-1]) for name, x in state.obs.items()}
         if missing := set(state.obs) ^ set(stats):
             raise ConfigError(
-                f"expected statistics of the observations {', '.join(sorted(state.obs))}, got those of "
+                f"expected statistics of the observations {', '.join(sorted(state.obs))}, got "
                 f"{', '.join(sorted(stats))}: {', '.join(sorted(missing))} is in one of them only"
             )
-        return self._updated(state, stats)
+        return self._update(state, stats)
 
     def after_step(self, state: EnvState) -> EnvState:
-        """Return the state with normalised observations, after they have entered the statistics."""
-        return self._updated(state, self.recall(state))
+        return self._update(state, self.recall(state))
 
-    def _updated(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
+    def _update(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
         if self.stats is None:
             stats = {name: stats[name].update(x) for name, x in state.obs.items()}
-        return self._normalized(state, stats)
+        return self._normalize(state, stats)
 
-    def _normalized(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
+    def _normalize(self, state: EnvState, stats: dict[str, RunningStats]) -> EnvState:
         return self.remember(state, stats, obs={name: stats[name].normalize(x) for name, x in state.obs.items()})
 
 
@@ -129,22 +116,19 @@ class Frames(PyTree):
 
 
 class FrameStack(Wrapper):
-    """Observe the last few observations, the oldest first, concatenated along the last axis."""
+    """Observe the last ``n`` observations, the oldest first, concatenated along the last axis."""
 
     def __init__(self, env: Env, n: int):
-        """Take the environment and the number of observations."""
         super().__init__(env)
         self.n = positive_integer("n", n)
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with the first observation repeated."""
-        return self._stacked(state, jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.obs))
+        return self._stack(state, jax.tree.map(lambda x: jnp.repeat(x[..., None, :], self.n, axis=-2), state.obs))
 
     def after_step(self, state: EnvState) -> EnvState:
-        """Return the state with the new observation in place of the oldest."""
         old = self.recall(state).obs
         frames = jax.tree.map(lambda x, y: jnp.concatenate([y[..., 1:, :], x[..., None, :]], axis=-2), state.obs, old)
-        return self._stacked(state, frames)
+        return self._stack(state, frames)
 
-    def _stacked(self, state: EnvState, frames: Obs) -> EnvState:
+    def _stack(self, state: EnvState, frames: Obs) -> EnvState:
         return self.remember(state, Frames(frames), obs=jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1), frames))

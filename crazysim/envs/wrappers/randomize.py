@@ -26,11 +26,6 @@ class RandomizeWith(Wrapper):
     """
 
     def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
-        """Take the environment, the function, and the names of the parameters that it changes.
-
-        Raises:
-            ConfigError: If the dynamics have no such parameter.
-        """
         super().__init__(env)
         params_now = env.sim.data.params
         known = {field.name: getattr(params_now, field.name) for field in dataclasses.fields(params_now)}
@@ -41,7 +36,6 @@ class RandomizeWith(Wrapper):
         self.fn, self.params = fn, tuple(params)
 
     def prepare(self, data: SimData) -> SimData:
-        """Return the data of all worlds with the named parameters repeated for every drone."""
         shape = data.states.pos.shape[:2]
         shared = [name for name in self.params if getattr(scopes(data.params), name) == "shared"]
         values = {name: getattr(data.params, name) for name in shared}
@@ -49,11 +43,6 @@ class RandomizeWith(Wrapper):
         return data.replace(params=data.params.replace(**repeated))
 
     def after_spawn(self, data: SimData) -> SimData:
-        """Return the data of an episode after the function.
-
-        Raises:
-            ConfigError: If the function changes what all worlds share.
-        """
         drawn = self.fn(data, episode_key(data, "randomize"))
         axes = Axes(data)
         leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(drawn), strict=True)

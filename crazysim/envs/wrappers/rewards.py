@@ -37,15 +37,13 @@ class EpisodeStatistics(Wrapper):
     """
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with sums of zero."""
-        return self._recorded(state, EpisodeSums(jnp.zeros_like(state.reward), jnp.zeros((), jnp.int32)))
+        return self._record(state, EpisodeSums(jnp.zeros_like(state.reward), jnp.zeros((), jnp.int32)))
 
     def after_step(self, state: EnvState) -> EnvState:
-        """Return the state with the step added, and the sums in its info where the episode ended."""
         before = self.recall(state)
-        return self._recorded(state, EpisodeSums(before.reward + state.reward, before.length + 1))
+        return self._record(state, EpisodeSums(before.reward + state.reward, before.length + 1))
 
-    def _recorded(self, state: EnvState, sums: EpisodeSums) -> EnvState:
+    def _record(self, state: EnvState, sums: EpisodeSums) -> EnvState:
         def where(over: Array, x: Array) -> Array:
             return jnp.where(over, x, jnp.zeros((), x.dtype))
 
@@ -59,18 +57,15 @@ class RewardTerms(Wrapper):
     """Record the terms of the reward by name: ``info["reward near"]`` and so on. (n_drones,) each"""
 
     def __init__(self, env: Env):
-        """Take the environment."""
         super().__init__(env)
         self.batched = env.task.batched
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state with terms of zero."""
         shapes = jax.eval_shape(self.task.rewards, state.data, state.action, state.action)
         terms = {f"reward {name}": jnp.zeros(x.shape, state.reward.dtype) for name, x in shapes.items()}
         return self.remember(state, LastAction(state.action), info=state.info | terms)
 
     def after_step(self, state: EnvState) -> EnvState:
-        """Return the state with the terms of the step; zero in worlds that are not finite."""
         terms = self.task.rewards(state.data, state.action, self.recall(state).action)
         lost, dtype = state.data.core.nonfinite, state.reward.dtype
         info = {f"reward {k}": jnp.where(lost, jnp.zeros((), dtype), jnp.asarray(x, dtype)) for k, x in terms.items()}

@@ -20,7 +20,7 @@ from crazysim.lab.live.loop import Live
 from crazysim.lab.live.picture import PictureSource
 from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
-from crazysim.media.access import LOCAL, Access, guarded_server
+from crazysim.media.access import LOOPBACK_ADDRESSES, Access, guarded_server
 from crazysim.media.web import FOV, free_port, import_viser
 from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
@@ -112,7 +112,7 @@ class Browser(Viewer[Live]):
         worlds = world_indices(sim, range(min(sim.n_worlds, MAX_WORLDS)) if self._worlds is None else self._worlds)
         access = self._access
         access.port = _require_free(access.host, access.port)
-        if access.host not in LOCAL:
+        if access.host not in LOOPBACK_ADDRESSES:
             log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
                         "watch and command the simulation", access.host, access.port)  # fmt: skip
         sim.scene.compile_if_edited()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from crazysim.closing import Closing
 from crazysim.errors import ConfigError
 from crazysim.lab.live.server import DRONE_PORT, STREAM_PORT, connect
 from crazysim.lab.show_files.show_trajectory import format_trajectory
+from crazysim.storage import Closing
 from crazysim.trajectories import Trajectory
 
 

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.closing import Closing
 from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 from crazysim.lab.live.history import History, Snapshot
@@ -27,6 +26,7 @@ from crazysim.lab.live.staging import StagedCommands, compile_step
 from crazysim.lab.live.viewer import Viewer
 from crazysim.lab.live.viewers import Viewers
 from crazysim.sim.sim import Sim
+from crazysim.storage import Closing
 
 SLICE = 0.01
 """Longest sleep, s: the time after which a click or a key is noticed."""

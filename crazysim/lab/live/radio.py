@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.drones import load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, not_installed
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.swarm import DroneState
+from crazysim.storage import Closing
 
 LOG = {
     "pos": ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),

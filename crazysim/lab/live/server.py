@@ -14,10 +14,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from crazysim.closing import Closing
 from crazysim.errors import ConfigError
 from crazysim.lab.live.commands import Command, command_of
 from crazysim.lab.live.framing import Frames, FramingError, Message, Request, ShowFile
+from crazysim.storage import Closing
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
 """Ports of the lab's test server, for commands to single drones and for the stream of all."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import ZipReader, reading, write_file
 from crazysim.trajectories.files import checks
 
@@ -74,7 +74,7 @@ class Archive:
             reference = checks.text(value["$ref"], f"{place}, $ref", 1000)
             name, _, fragment = reference.partition("#")
             if fragment.strip("/"):
-                checks.refuse("a reference to a whole file, such as ./cues.json#", shown(reference), place)
+                checks.refuse("a reference to a whole file, such as ./cues.json#", short_repr(reference), place)
             name = str(PurePosixPath(name))
             value, place = self.json(name), f"{self.place}: {name}"
         return checks.refuse(f"a chain of at most {MAX_CHAIN} references", "a longer one", place)

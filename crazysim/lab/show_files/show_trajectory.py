@@ -7,7 +7,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.trajectories.bezier import control_points, power_of, significant_degree
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split
@@ -40,7 +40,7 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
     checks.version_one(value, place)
     encoding = value.get("type", ENCODINGS[0])
     if encoding not in ENCODINGS:
-        checks.refuse(f"type {' or '.join(ENCODINGS)}", shown(encoding), place)
+        checks.refuse(f"type {' or '.join(ENCODINGS)}", short_repr(encoding), place)
     points = checks.sequence(value.get("points"), checks.MAX_POINTS, f"{place}, points")
     if not points:
         checks.refuse("at least one point", "none", place)
@@ -54,7 +54,7 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
     for i, point in enumerate(points):
         at = f"{place}, point {i}"
         if not _is_point(point):
-            checks.refuse("[time, [x, y, z], [control points]]", shown(point), at)
+            checks.refuse("[time, [x, y, z], [control points]]", short_repr(point), at)
         times.append(checks.number(point[0], at, 0.0, checks.MAX_TIME))
         end = checks.numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, at)
         inner = checks.sequence(point[2], MAX_DEGREE - 1, f"{at}, control points") if len(point) > 2 else []

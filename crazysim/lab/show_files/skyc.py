@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.show_files.archive import Archive, write_archive
 from crazysim.lab.show_files.led import MAX_REPEATED, decode_lights, encode_lights
 from crazysim.lab.show_files.lights import Lights
@@ -79,11 +79,11 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
         _bound(len(found) * len(lights[-1].times), f"{drone['at']}, lights")
     names = [drone["name"] for drone in found]
     if len(set(names)) < len(names):
-        checks.refuse("different names of the drones", f"{shown(sorted(names))}", swarm_at)
+        checks.refuse("different names of the drones", f"{short_repr(sorted(names))}", swarm_at)
     environment = show.get("environment") or {}
     kind = checks.record(environment, f"{at}, environment").get("type", "outdoor")
     if kind not in ("indoor", "outdoor"):
-        checks.refuse("environment indoor or outdoor", shown(kind), at)
+        checks.refuse("environment indoor or outdoor", short_repr(kind), at)
     return Show(
         names=tuple(names),
         trajectories=Trajectory.stack(trajectories),
@@ -139,7 +139,7 @@ def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
     changes = []
     for i, entry in enumerate(checks.sequence(value, checks.MAX_POINTS, place) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
-            checks.refuse("[time, name, value]", shown(entry), f"{place}, entry {i}")
+            checks.refuse("[time, name, value]", short_repr(entry), f"{place}, entry {i}")
         at = f"{place}, entry {i}"
         time = checks.number(entry[0], at, 0.0, checks.MAX_TIME)
         changes.append(ParameterChange(time, checks.text(entry[1], at), checks.number(entry[2], at)))
@@ -198,7 +198,7 @@ def parse_colors(value: object, place: str) -> Lights:
     for i, entry in enumerate(entries):
         at = f"{place}, entry {i}"
         if not isinstance(entry, list) or len(entry) != 2:
-            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", shown(entry), at)
+            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", short_repr(entry), at)
         first, second = entry
         if isinstance(first, str):
             channels: Any = [_integer(x, at) for x in first.split(",")[:4]]
@@ -209,7 +209,7 @@ def parse_colors(value: object, place: str) -> Lights:
             times.append(checks.number(first, at, 0.0, checks.MAX_TIME))
         colors.append(checks.numbers(channels, [3], 255.0, at) / 255)
         if colors[-1].min() < 0:
-            checks.refuse("colours from 0 to 255", shown(channels), at)
+            checks.refuse("colours from 0 to 255", short_repr(channels), at)
     if not entries:
         return Lights.constant((0.0, 0.0, 0.0))
     checks.ascending(np.array(times), 0.0, place)
@@ -221,7 +221,7 @@ def parse_colors(value: object, place: str) -> Lights:
 def _integer(text: str, place: str) -> int:
     text = text.strip()
     if not (text.isascii() and text.isdigit() and len(text) <= 3):
-        checks.refuse("colours as 'red, green, blue', 0 to 255", shown(text), place)
+        checks.refuse("colours as 'red, green, blue', 0 to 255", short_repr(text), place)
     return int(text)
 
 

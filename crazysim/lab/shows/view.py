@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.shows.flight import ShowFlight
 from crazysim.lab.shows.show_report import collisions
 from crazysim.media import Film, Flight, View, flight_of, web
-from crazysim.media.flight_recorder import put
+from crazysim.media.flight_recorder import show_flight_at
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material, draw_label, draw_points
 
@@ -80,12 +80,12 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
     sim, recorded, camera = flight.sim, media_flight(flight), view_of(flight, **view)
     data = sim.data
     try:
-        put(sim, recorded, 0.0)
+        show_flight_at(sim, recorded, 0.0)
         camera.show(sim)
         start = time.perf_counter()  # opening the window can take longer than a short show
         while sim.viewer.has_window and (now := speed * (time.perf_counter() - start)) < flight.duration:
             shown = time.perf_counter()
-            put(sim, recorded, now)
+            show_flight_at(sim, recorded, now)
             camera.show(sim)
             time.sleep(max(shown + 1 / MAX_FPS - time.perf_counter(), 0.0))
     finally:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim.errors import ConfigError
 from crazysim.rotation import safe_clip
 from crazysim.storage import read_text
-from crazysim.tables import ANY, LARGEST, POSITIVE, numbers
+from crazysim.tables import ANY_NUMBER, MAX_NUMBER, POSITIVE, read_numbers
 
 LARGEST_FUSED = 400_000
 """Most numbers of a table that a fused kernel reads; compiling the step takes 8 µs for each."""
@@ -48,7 +48,7 @@ class Grid(NamedTuple):
             ConfigError: If a shape or a number is invalid.
         """
         values, origin, spacing = (
-            numbers(f"{what} of {name}", getattr(self, what), POSITIVE if what == "spacing" else ANY)
+            read_numbers(f"{what} of {name}", getattr(self, what), POSITIVE if what == "spacing" else ANY_NUMBER)
             for what in ("values", "origin", "spacing")
         )
         core = () if k is None else (k,)
@@ -143,7 +143,7 @@ def load_wind_grid(path: str | Path) -> Grid:
         raise ConfigError(
             f"expected numbers in the columns of {str(path)!r}, got: {error}. Correct or remove that row."
         ) from error
-    if not np.all(np.abs(table) <= LARGEST):
+    if not np.all(np.abs(table) <= MAX_NUMBER):
         raise ConfigError(
             f"expected finite numbers in {str(path)!r}, got NaN, infinity or a larger one. Fill the gaps."
         )

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, parameter, per_drone
 from crazysim.core.random import drone_key, uniform
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
 from crazysim.plugins.effects.latency import LatencyData
 from crazysim.plugins.effects.moving_air import Air, has_drag, require_drag, require_rotors, with_moving_air
@@ -113,7 +113,7 @@ class Randomize(Plugin):
         super().__post_init__()
         if not isinstance(self.optional, (list, tuple)) or not all(name in RANGES for name in self.optional):
             raise ConfigError(
-                f"expected optional as a list of {', '.join(RANGES)}, got {shown(self.optional)}. Use "
+                f"expected optional as a list of {', '.join(RANGES)}, got {short_repr(self.optional)}. Use "
                 f"optional=('wind',), say."
             )
 

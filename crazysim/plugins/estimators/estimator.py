@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
 from crazysim.core.stage import Stage, as_stages
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -46,7 +46,7 @@ class Estimator(Plugin):
         super().__post_init__()
         if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
             example = f"{type(self).__name__}([IMU(), MotionCapture()])"
-            raise ConfigError(f"expected sensors as a list, got {shown(self.sensors)}. Use {example}, say.")
+            raise ConfigError(f"expected sensors as a list, got {short_repr(self.sensors)}. Use {example}, say.")
 
     @classmethod
     def default(cls) -> Estimator:

@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
 from crazysim.tables import LENGTH, as_numbers
 
@@ -98,7 +98,7 @@ def shape_of(size: ArrayLike) -> Shape:
     if lengths.shape not in ((), (3,)) or not np.all((lengths >= LENGTH.low) & (lengths <= LENGTH.high)):
         raise ConfigError(
             f"expected size as a positive radius, or as three positive lengths of a box, {LENGTH.text}, got "
-            f"{shown(size)}. Use size=0.05 or size=(0.1, 0.1, 0.05)."
+            f"{short_repr(size)}. Use size=0.05 or size=(0.1, 0.1, 0.05)."
         )
     kind = "box" if lengths.ndim else "sphere"
     return Shape(kind, tuple((lengths / 2).tolist()) if kind == "box" else (float(lengths),))

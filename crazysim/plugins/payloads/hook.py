@@ -15,7 +15,7 @@ from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
 from crazysim.core.settings import as_mask, color, setting
 from crazysim.core.stage import Stage
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
 from crazysim.plugins.effects.ground import ground_height
 from crazysim.plugins.payloads.body import Collider, Colliding, LoadBody, rest_height
@@ -201,7 +201,7 @@ class Hook(Colliding, Plugin):
         if flags.dtype != bool or not fits:
             raise ConfigError(
                 f"expected grip as True or False, or a bool for each drone {load.grip.shape} = (n_worlds, n_drones), "
-                f"got {shown(grip)}"
+                f"got {short_repr(grip)}"
             )
         return self.write(data, load.replace(grip=jnp.broadcast_to(flags, load.grip.shape)))
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
-from crazysim.tables import POSITIVE, numbers
+from crazysim.tables import POSITIVE, read_numbers
 
 CENTIMETRE = 0.01
 """Edge of a voxel of AIMotionLab's tables, m."""
@@ -43,7 +43,7 @@ class JetTable(NamedTuple):
         Raises:
             ConfigError: If a shape or a number is invalid.
         """
-        speeds = numbers("speeds", self.speeds, POSITIVE)
+        speeds = read_numbers("speeds", self.speeds, POSITIVE)
         if speeds.ndim != 1 or np.any(np.diff(speeds) <= 0):
             raise ConfigError(f"expected positive rotor speeds in ascending order, rad/s, got {self.speeds!r}")
         if self.pressure is None and self.velocity is None:
@@ -55,7 +55,7 @@ class JetTable(NamedTuple):
             value = getattr(self, name)
             if value is None:
                 continue
-            value = numbers(name, value)
+            value = read_numbers(name, value)
             if value.ndim != 4 + len(core) or len(value) != len(speeds) or value.shape[4:] != core:
                 shape = f"({len(speeds)}, n_x, n_y, n_z{', 3' if core else ''})"
                 raise ConfigError(f"expected {name} of shape {shape} for {len(speeds)} speeds, got {value.shape}")
@@ -65,7 +65,7 @@ class JetTable(NamedTuple):
                 f"expected pressure and velocity on the same grid, got {found['pressure'].shape} and "
                 f"{found['velocity'].shape}. Use two RotorJet with a name each for two grids."
             )
-        origin, spacing = numbers("origin", self.origin), numbers("spacing", self.spacing, POSITIVE)
+        origin, spacing = read_numbers("origin", self.origin), read_numbers("spacing", self.spacing, POSITIVE)
         if origin.shape != (3,) or spacing.shape not in ((), (3,)):
             raise ConfigError(
                 f"expected an origin of shape (3,) and a spacing of shape () or (3,), m, got "

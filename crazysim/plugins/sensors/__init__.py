@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from crazysim.lazy import lazy
+from crazysim.startup import lazy
 
 if TYPE_CHECKING:
     from crazysim.plugins.sensors.barometer import Barometer

@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, parameter
 from crazysim.core.random import normal
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
@@ -60,8 +60,8 @@ class Magnetometer(Sensor):
         field = np.asarray(self.field)
         if field.dtype.kind in "iuf" and np.any(np.abs(field) > STRONGEST):
             raise ConfigError(
-                f"expected field in tesla, of at most {STRONGEST} T along an axis, got {shown(self.field)}. Use 20e-6 "
-                f"for 20 microtesla, 1e-4 for one gauss."
+                f"expected field in tesla, of at most {STRONGEST} T along an axis, got {short_repr(self.field)}. "
+                f"Use 20e-6 for 20 microtesla, 1e-4 for one gauss."
             )
         errors, quat = self.errors.record(sim, "errors"), mounting(sim, self.rpy)
         return self.filled(sim, MagnetometerData, errors=errors, quat=quat)

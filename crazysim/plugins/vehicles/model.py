@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.tables import (
+    COORDINATE,
     INERTIA,
-    LARGEST,
     LENGTH,
+    LENGTH_OR_ZERO,
     MASS,
-    MAYBE_LENGTH,
+    MAX_NUMBER,
     NOT_NEGATIVE,
-    PLACE,
+    NOT_NEGATIVE_OR_INF,
     POSITIVE,
-    UNLIMITED,
     Key,
     Layout,
     Range,
     check_numbers,
-    extended,
+    extend_bases,
     read_source,
 )
 
@@ -34,9 +34,9 @@ GUIDE = "docs/guides/vehicles.md"
 DYNAMICS = ("single_track", "kinematic")
 """Names of the dynamics of vehicles."""
 
-_SIZE, _MAYBE_SIZE = Key(((),), LENGTH), Key(((),), MAYBE_LENGTH)
-_POSITIVE, _NOT_NEGATIVE, _UNLIMITED = (Key(((),), found) for found in (POSITIVE, NOT_NEGATIVE, UNLIMITED))
-_DRIVE = Key(((3,),), Range("a positive gain, then damping and friction of at least zero", (1 / LARGEST, 0.0, 0.0)))
+_SIZE, _MAYBE_SIZE = Key(((),), LENGTH), Key(((),), LENGTH_OR_ZERO)
+_POSITIVE, _NOT_NEGATIVE, _UNLIMITED = (Key(((),), found) for found in (POSITIVE, NOT_NEGATIVE, NOT_NEGATIVE_OR_INF))
+_DRIVE = Key(((3,),), Range("a positive gain, then damping and friction of at least zero", (1 / MAX_NUMBER, 0.0, 0.0)))
 
 KEYS: dict[str, Key] = {
     "rigid_body.mass": Key(((),), MASS),
@@ -71,7 +71,7 @@ KEYS: dict[str, Key] = {
     "trailer.wheel_width": _SIZE,
     "trailer.mass": Key(((),), MASS),
     "trailer.deck": Key(((3,),), LENGTH),
-    "trailer.deck_centre": Key(((3,),), PLACE),
+    "trailer.deck_centre": Key(((3,),), COORDINATE),
     "shape.length": _SIZE,
     "shape.width": _SIZE,
     "shape.height": _SIZE,
@@ -152,7 +152,7 @@ def _load(source: Any, bases: tuple[str, ...]) -> VehicleModel:
     """Return the vehicle model of a source, which is the base of others."""
     if isinstance(source, VehicleModel):
         return source
-    bases = extended(bases, source)
+    bases = extend_bases(bases, source)
     stem, origin, tables = read_source(source, "vehicle", "a VehicleModel", FOLDER, vehicle_names(), GUIDE)
     name = str(tables.get("name", stem))
     base = _load(tables["base"], bases) if "base" in tables else None
@@ -172,7 +172,7 @@ def _check(vehicle: VehicleModel) -> None:
     name, numbers = vehicle.name, vehicle.numbers
     if vehicle.dynamics not in DYNAMICS:
         raise ConfigError(
-            f"vehicle {name!r}: expected model as one of {', '.join(DYNAMICS)}, got {shown(vehicle.dynamics)}"
+            f"vehicle {name!r}: expected model as one of {', '.join(DYNAMICS)}, got {short_repr(vehicle.dynamics)}"
         )
     tyres = ("tyres.front", "tyres.rear") if vehicle.dynamics == "single_track" else ()
     trailer = tuple(key for key in KEYS if key.startswith("trailer.")) if vehicle.has_trailer else ()

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 
 MAX_FILE = 256 * 2**20
 """Largest file that is read, bytes."""
@@ -52,14 +52,14 @@ def parse_json(content: bytes | str, place: str) -> Any:
 def record(value: object, place: str) -> dict[str, Any]:
     """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
-        refuse("an object {...}", shown(value), place)
+        refuse("an object {...}", short_repr(value), place)
     return value
 
 
 def sequence(value: object, n_max: int, place: str) -> list[Any]:
     """Return a value that must be a JSON array of at most some entries."""
     if not isinstance(value, list):
-        refuse("an array [...]", shown(value), place)
+        refuse("an array [...]", short_repr(value), place)
     if len(value) > n_max:
         refuse(f"at most {n_max} entries", str(len(value)), place)
     return value
@@ -69,20 +69,24 @@ def version_one(value: dict[str, Any], place: str) -> None:
     """Check that an object has version 1."""
     version = value.get("version")
     if version != 1 or isinstance(version, bool):
-        refuse("version 1", shown(version), place)
+        refuse("version 1", short_repr(version), place)
 
 
 def number(value: object, place: str, low: float = -np.inf, high: float = np.inf) -> float:
     """Return a value that must be a finite number in a range."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
-        refuse("a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}", shown(value), place)
+        refuse(
+            "a number" if np.isinf([low, high]).any() else f"a number from {low:g} to {high:g}",
+            short_repr(value),
+            place,
+        )
     return float(value)
 
 
 def text(value: object, place: str, n_max: int = 200) -> str:
     """Return a value that must be a string of at most some characters."""
     if not isinstance(value, str) or len(value) > n_max:
-        refuse(f"a text of at most {n_max} characters", shown(value), place)
+        refuse(f"a text of at most {n_max} characters", short_repr(value), place)
     return value
 
 
@@ -91,7 +95,7 @@ def numbers(value: object, lengths: Sequence[int], bound: float, place: str) -> 
     if isinstance(value, tuple):
         value = list(value)
     if not isinstance(value, list) or len(value) not in lengths:
-        refuse(f"an array of {' or '.join(map(str, lengths))} numbers", shown(value), place)
+        refuse(f"an array of {' or '.join(map(str, lengths))} numbers", short_repr(value), place)
     return np.array([number(x, place, -bound, bound) for x in value])
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import read_text, write_file
 from crazysim.trajectories.files import checks
 from crazysim.trajectories.files.polynomials import of_rows, rows_of
@@ -49,7 +49,7 @@ def _table(lines: list[str], place: str) -> NDArray:
         except ValueError:
             if not rows and any(cell[:1].isalpha() for cell in cells):
                 continue  # the header
-            checks.refuse("numbers", shown(line), f"{place}, line {i}")
+            checks.refuse("numbers", short_repr(line), f"{place}, line {i}")
         if len(row) not in (4, 5, 25, 33) or (rows and len(row) != len(rows[0])):
             expected = f"{len(rows[0])} columns, as before" if rows else "4, 5, 25 or 33 columns"
             checks.refuse(expected, str(len(row)), f"{place}, line {i}")

@@ -194,13 +194,13 @@ def test_part_of_a_show_and_wrong_settings():
 
 def test_film_has_the_colours_of_the_lights(flight, tmp_path, opengl):
     from crazysim.lab.shows.view import media_flight, view_of
-    from crazysim.media.flight_recorder import put
+    from crazysim.media.flight_recorder import show_flight_at
 
     view = view_of(flight, width=320, height=240, text=None)
     data = flight.sim.data
     images = []
     for now in (0.3, 1.95):  # not while a collision is marked
-        put(flight.sim, media_flight(flight), now)
+        show_flight_at(flight.sim, media_flight(flight), now)
         images.append(view.render(flight.sim).astype(int))
     flight.sim.data = data
     reddish = [int(((x[..., 0] > 150) & (x[..., 1:].max(-1) < 90)).sum()) for x in images]
@@ -209,7 +209,7 @@ def test_film_has_the_colours_of_the_lights(flight, tmp_path, opengl):
     assert bluish[1] > bluish[0]
     flight.sim.close()
     assert film(flight, tmp_path / "show.mp4", fps=2, width=320, height=240) == 5
-    put(flight.sim, media_flight(flight), 1.95)
+    show_flight_at(flight.sim, media_flight(flight), 1.95)
     night = view.render(flight.sim).astype(int)
     flight.sim.data = data
     assert np.median(night) < 0.5 * np.median(images[1])  # the scene is dark, the lights are not

@@ -11,10 +11,10 @@ import selectors
 import socket
 import threading
 
-from crazysim.closing import Closing
 from crazysim.errors import ConfigError
 from crazysim.lab.live.crtp.device import CrtpDevice
 from crazysim.lab.live.swarm import Swarm
+from crazysim.storage import Closing
 
 PORT = 19850
 """First port; cflib scans ten from here on."""

@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from crazysim.closing import Closing
 from crazysim.errors import ConfigError
 from crazysim.lab.live.mocap.frames import Frame
 from crazysim.lab.live.mocap.source import MocapSource, Poll
 from crazysim.media.journal import Journal, read_journal
-from crazysim.storage import reading
+from crazysim.storage import Closing, reading
 
 NAMES, POLLED = b"NAME", b"POLL"
 """Kinds of chunks: names of bodies that were not seen before, and a poll."""

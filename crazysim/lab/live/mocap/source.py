@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crazysim.closing import Closing
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.mocap.frames import Convention, Frame
 from crazysim.lab.live.paths import paths_of
+from crazysim.storage import Closing
 from crazysim.trajectories import Trajectory
 
 log = logging.getLogger(__name__)

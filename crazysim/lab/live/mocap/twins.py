@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.closing import Closing
 from crazysim.core.settings import check_settings, setting
 from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError, UnknownNameError
@@ -26,7 +25,8 @@ from crazysim.lab.live.mocap.source_events import Reports
 from crazysim.lab.live.mocap.tracker import Rules, Tracker
 from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
-from crazysim.tables import numbers
+from crazysim.storage import Closing
+from crazysim.tables import read_numbers
 
 NOWHERE = (0.0, 0.0, -100.0)
 """Position of an object before its first pose, world frame, m: below every floor."""
@@ -68,7 +68,7 @@ class Twin:
         check_settings(self)
         is_row = isinstance(self.fixed, Sequence) and not isinstance(self.fixed, str)
         angles = [0.0 if x is None else x for x in self.fixed] if is_row else self.fixed
-        numbers("fixed of Twin", angles, shapes=((3,),), remedy="Use None for angles that are measured.")
+        read_numbers("fixed of Twin", angles, shapes=((3,),), remedy="Use None for angles that are measured.")
 
     @staticmethod
     def drone(airframe: str = "crazyflie", **settings: Any) -> Twin:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.core.settings import check_flag
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
 from crazysim.lab.live.sitl.measured import TURN, ZURICH, Measured, Origin, as_origin, frd
-from crazysim.tables import bounds, numbers
+from crazysim.tables import range_between, read_numbers
 
 PORTS = (9002, 9003, 9004)
 """Ports of the motors, which Betaflight sends, and of the state and the remote control, which it receives."""
@@ -66,7 +66,7 @@ class Betaflight(FirmwareLink):
         self._start: tuple[float, float] | None = None
         if not isinstance(ports, (tuple, list)) or len(ports) != len(PORTS):
             raise ConfigError(
-                f"expected ports of the motors, the state and the remote control, got {shown(ports)}. Use {PORTS}."
+                f"expected ports of the motors, the state and the remote control, got {short_repr(ports)}. Use {PORTS}."
             )
         motors, self._state, self._rc = ports
         for port in (self._state, self._rc):
@@ -117,9 +117,9 @@ class Betaflight(FirmwareLink):
 
 def _pulses(channels: ArrayLike) -> NDArray[np.int64]:
     """Return the pulses of a packet of the remote control, us. (16,)"""
-    pulses = numbers("channels", channels, bounds(0, LARGEST_PULSE), ((N_CHANNELS,),))
+    pulses = read_numbers("channels", channels, range_between(0, LARGEST_PULSE), ((N_CHANNELS,),))
     if np.any(pulses % 1):
-        raise ConfigError(f"expected channels as whole numbers, us, got {shown(pulses.tolist())}. Round them.")
+        raise ConfigError(f"expected channels as whole numbers, us, got {short_repr(pulses.tolist())}. Round them.")
     return pulses.astype(np.int64)
 
 

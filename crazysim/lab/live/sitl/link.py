@@ -11,20 +11,20 @@ from typing import ClassVar
 
 from numpy.typing import NDArray
 
-from crazysim.closing import Closing
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.measured import Measured
-from crazysim.tables import POSITIVE, bounds, number, numbers
+from crazysim.storage import Closing
+from crazysim.tables import POSITIVE, range_between, read_number, read_numbers
 
 ROUNDING = 1e-6
 """Tolerance of times for the rounding of sums of periods, s."""
-LARGEST = 65535
+MAX_NUMBER = 65535
 """Longest datagram, bytes."""
 LAST_PORT = 65535
 """Largest number of a port."""
 DRAINING = 0.1
 """Longest time for reading the packets that are there once the time to wait is over, s, however fast others arrive."""
-TIMEOUT = bounds(high=1e6, positive=True)
+TIMEOUT = range_between(high=1e6, positive=True)
 """Range of a time to wait, s."""
 
 
@@ -68,7 +68,7 @@ class Rate:
         Raises:
             ConfigError: If the rate is not positive.
         """
-        self._period, self._next = 1 / number(name, freq, POSITIVE), 0.0
+        self._period, self._next = 1 / read_number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
         """Return True if it is due at a simulated time, s, and schedule the next one."""
@@ -90,8 +90,8 @@ def check_address(host: str, port: int, least: int = 0) -> None:
         ConfigError: If the host is not text, or the port is not a whole number up to 65535.
     """
     if not isinstance(host, str):
-        raise ConfigError(f"expected host as text, got {shown(host)}. Use '127.0.0.1'.")
-    numbers("port", port, bounds(least, LAST_PORT), ((),), whole=True)
+        raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
+    read_numbers("port", port, range_between(least, LAST_PORT), ((),), whole=True)
 
 
 class Datagrams(Closing):
@@ -136,7 +136,7 @@ class Datagrams(Closing):
         while now < end:
             self._socket.settimeout(max(deadline - now, 0.0) if found is None else 0.0)
             try:
-                packet, sender = self._socket.recvfrom(LARGEST)
+                packet, sender = self._socket.recvfrom(MAX_NUMBER)
             except (TimeoutError, BlockingIOError):
                 break
             except ConnectionRefusedError:  # of a packet that was sent to a program that does not listen

@@ -10,12 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.core.airframes import as_airframes
 from crazysim.core.settings import check_flag, dividing_rate
 from crazysim.drones import Airframe
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.pace import Pace, Speed
 from crazysim.lab.live.sitl.link import ROUNDING, TIMEOUT, FirmwareLink
@@ -24,7 +23,8 @@ from crazysim.lab.live.staging import compile_step
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.sim import Sim
-from crazysim.tables import NOT_NEGATIVE, number
+from crazysim.storage import Closing
+from crazysim.tables import NOT_NEGATIVE, read_number
 
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field where there is no ``Magnetometer``, world frame, T: about that of central Europe."""
@@ -69,7 +69,7 @@ class SoftwareInTheLoop(Closing):
         Raises:
             ConfigError: If the level, the links, the rate, the timeout or the rotors of an airframe do not fit.
         """
-        self.sim, self.timeout, self.motors = sim, number("timeout", timeout, TIMEOUT), motors
+        self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT), motors
         self.links = _as_links(links)
         freq = sim.freq if freq is None else dividing_rate("freq", freq, sim.freq)
         if sim.control != Control.rotor_vel:
@@ -111,7 +111,7 @@ class SoftwareInTheLoop(Closing):
         Raises:
             ConfigError: If the time or the speed is out of range, or a firmware does not answer in time.
         """
-        seconds = number("seconds", seconds, NOT_NEGATIVE)
+        seconds = read_number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
         if not self._compiled:  # a firmware with a clock of its own does not wait
@@ -231,7 +231,9 @@ def _as_links(links: object) -> tuple[FirmwareLink, ...]:
     """
     found = (links,) if isinstance(links, FirmwareLink) else links
     if not isinstance(found, Sequence) or not all(isinstance(link, FirmwareLink) for link in found):
-        raise ConfigError(f"expected a link to firmware or a list of them, got {shown(links)}. Use ArduPilot(), say.")
+        raise ConfigError(
+            f"expected a link to firmware or a list of them, got {short_repr(links)}. Use ArduPilot(), say."
+        )
     if len(set(map(id, found))) < len(found):
         raise ConfigError(
             f"expected a link of its own for each of {len(found)} drones, got one twice. Make one for each, with other "

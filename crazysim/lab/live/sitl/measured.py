@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.core.settings import check_settings, setting
-from crazysim.errors import ConfigError, shown
+from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE
 from crazysim.plugins.sensors.sensor import Sensor
 
@@ -102,7 +102,7 @@ def as_origin(origin: object) -> Origin:
         ConfigError: If it is something else.
     """
     if not isinstance(origin, Origin):
-        raise ConfigError(f"expected an Origin, got {shown(origin)}. Use Origin(latitude, longitude, altitude).")
+        raise ConfigError(f"expected an Origin, got {short_repr(origin)}. Use Origin(latitude, longitude, altitude).")
     return origin
 
 

@@ -14,7 +14,7 @@ from crazysim.lab.live.sitl.link import DRAINING, TIMEOUT, FirmwareLink, check_a
 from crazysim.lab.live.sitl.measured import ZURICH, Measured, Origin, as_origin, frd, ned, quat_ned
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
-from crazysim.tables import number
+from crazysim.tables import read_number
 
 PORT = 4560
 """Port at which the first instance of PX4 looks for a simulation."""
@@ -70,7 +70,7 @@ class Px4(FirmwareLink):
         self._mavlink: Any = common
         check_address(host, port)
         self.origin = as_origin(origin)
-        self.connect_timeout = number("connect_timeout", connect_timeout, TIMEOUT)
+        self.connect_timeout = read_number("connect_timeout", connect_timeout, TIMEOUT)
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

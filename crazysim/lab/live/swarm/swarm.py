@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from crazysim.closing import Closing
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.stage import vmap_drones, vmap_worlds
@@ -31,6 +30,7 @@ from crazysim.lab.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
 from crazysim.plugins.estimators import Estimator
 from crazysim.sim.sim import Sim
+from crazysim.storage import Closing
 
 
 class Swarm(Closing):

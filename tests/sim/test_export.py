@@ -10,7 +10,7 @@ from crazysim import Battery, Downwash, Sim
 from crazysim.core import functional as F
 from crazysim.core.pipeline import append_fn, insert_fn_before
 from crazysim.core.stage import Axes, stage
-from crazysim.export import STATES, to_casadi
+from crazysim.sim.export import STATES, to_casadi
 
 pytestmark = pytest.mark.usefixtures("casadi", "x64")
 

@@ -1,4 +1,6 @@
-"""Variables of the environment that JAX and MuJoCo read when they are imported, so set before.
+"""The import of crazysim: variables of the environment, JAX and MuJoCo, and names that are imported at their first use.
+
+JAX and MuJoCo read variables of the environment when they are imported, so these are set before.
 
 XLA logs an error of 3,000 characters for each CPU program that it loads from a persistent cache: the options
 ``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are no features of any CPU. What
@@ -15,6 +17,11 @@ import importlib
 import os
 import sys
 import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+__version__ = "0.2.0"
+"""The version of the package; ``pyproject.toml`` says the same."""
 
 refused: dict[str, str] = {}
 """Variables that could not be used, with the user's values."""
@@ -80,6 +87,22 @@ def import_required() -> None:
                 print(f"crazysim: {text}", file=sys.stderr)
                 sys.exit(2)
             raise ImportError(text, name=name) from error
+
+
+def lazy(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return a ``__getattr__`` for a package that imports some of its names at their first use.
+
+    Args:
+        module: Name of the package, ``__name__``.
+        names: Module that holds each name.
+    """
+
+    def import_name(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(names[name]), name)
+
+    return import_name
 
 
 set_variables()

@@ -1,4 +1,4 @@
-"""Figure eights around poles in many worlds, with figures, a plot and a film."""
+"""The flight of ``crazysim demo``: figure eights around poles in many worlds, with figures, a plot and a film."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from jax import Array
 
 from crazysim.core import functional as F
 from crazysim.core.data import SimData
-from crazysim.demos.common import FPS, counted, frames_of
 from crazysim.dynamics import first_principles
 from crazysim.eager import jit_unless_traced
 from crazysim.errors import RenderError, not_installed
@@ -27,9 +26,11 @@ from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material
 from crazysim.storage import write_figure
 
+FPS = 25
+"""Rate of frames, Hz."""
 PERIOD = 5.0
 """Period of the figure eight, s."""
-SETTLED = 2.0
+SETTLING_TIME = 2.0
 """Start of the interval in which the tracking error is measured, s."""
 WIDTH, DEPTH = 1.4, 0.7
 """Amplitudes of the figure eight along x and y, m."""
@@ -37,7 +38,7 @@ POLE_RADIUS = 0.03
 """Radius of a pole, m."""
 
 
-def run(
+def fly(
     n_worlds: int = 1024,
     n_drones: int = 4,
     seconds: float = 10.0,
@@ -54,48 +55,54 @@ def run(
         device: Device of the simulation, such as ``"cpu"``.
         out: Folder of the files.
         film: True to write a film.
-
-    Raises:
-        ValueError: If the flight is shorter than one frame.
     """
-    n_frames = frames_of(seconds)
+    if seconds < 1 / FPS:
+        raise ValueError(f"expected --seconds of at least {1 / FPS}, got {seconds}; use a longer flight")
+    n_frames = round(seconds * FPS)
     sim = build(n_worlds, n_drones, device)
     fly_frame = build_fly_frame(sim)
     engine = sim.explain().splitlines()[0]
-    fleet = f"{counted(n_worlds, 'world')} of {counted(n_drones, 'drone')}"
+    fleet = f"{count_text(n_worlds, 'world')} of {count_text(n_drones, 'drone')}"
     print(f"{fleet}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 
     begin = perf_counter()
-    fly = fly_frame.lower(sim.data).compile()
+    compiled_frame = fly_frame.lower(sim.data).compile()
     compile_s = perf_counter() - begin
     begin = perf_counter()
-    touches(sim)
+    find_touches(sim)
     contacts_compile_s = perf_counter() - begin
 
     recorder = Recorder(sim, worlds=[0])
-    errors, touching = [], []
+    errors, touched = [], []
     step_s = contacts_s = 0.0
     for _ in progress_bar(range(n_frames), "flying"):
         begin = perf_counter()
-        data, error = jax.block_until_ready(fly(sim.data))
+        data, error = jax.block_until_ready(compiled_frame(sim.data))
         step_s += perf_counter() - begin
         sim.data = data
         begin = perf_counter()
-        touching.append(touches(sim))
+        touched.append(find_touches(sim))
         contacts_s += perf_counter() - begin
         recorder.add()
         errors.append(np.asarray(error))
 
     n_steps = n_frames * (sim.freq // FPS)
-    report(np.concatenate(errors), np.stack(touching), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames)
+    print_report(
+        np.concatenate(errors), np.stack(touched), n_steps * n_worlds * n_drones, step_s, contacts_s / n_frames
+    )
     print(f"compile time      {compile_s:.2f} s for the flight, {contacts_compile_s:.2f} s for contacts")
     out.mkdir(parents=True, exist_ok=True)
     flight = recorder.flight()
     flight.save(out / "flight.npz")
     print(f"wrote {out / 'flight.npz'}")
-    plot(sim, flight.pos[:, 0], np.concatenate(errors), out / "tracks.png")
+    plot_tracks(sim, flight.pos[:, 0], np.concatenate(errors), out / "tracks.png")
     if film:
-        record(sim, flight, out / "flight.mp4")
+        film_flight(sim, flight, out / "flight.mp4")
+
+
+def count_text(n: int, noun: str) -> str:
+    """Return a number with a noun in singular or plural, such as "1 world" or "1,024 worlds"."""
+    return f"{n:,} {noun}{'s' * (n != 1)}"
 
 
 def build(n_worlds: int, n_drones: int, device: str) -> Sim:
@@ -105,7 +112,7 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     places = offset + [[-0.6 * WIDTH, 0, 0], [0.6 * WIDTH, 0, 0]]
     sim.scene.add("pole", count=2, pos=places, height=1.7, radius=POLE_RADIUS)
 
-    start = reference(device_array(np.zeros((n_worlds, 1))), n_drones)
+    start = figure_eight_setpoints(device_array(np.zeros((n_worlds, 1))), n_drones)
     rotor_vel = jnp.broadcast_to(first_principles.hover_rotor_vel(sim.data.params), (n_worlds, n_drones, 4))
     states = sim.data.states.replace(pos=start[..., :3], vel=start[..., 3:6], rotor_vel=rotor_vel)
     sim.data = sim.data.replace(states=states)
@@ -113,13 +120,13 @@ def build(n_worlds: int, n_drones: int, device: str) -> Sim:
     return sim
 
 
-def touches(sim: Sim) -> np.ndarray:
+def find_touches(sim: Sim) -> np.ndarray:
     """Return True where a drone touches a pole. (n_worlds, n_drones, n_poles)"""
     return np.asarray(sim.contact_report(floor=False, drones=False).objects)
 
 
 @jit_unless_traced("n_drones")
-def reference(time: Array, n_drones: int) -> Array:
+def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
     """Return the setpoint of every drone: figure eights offset by a quarter of a period and by 0.25 m in height.
 
     Args:
@@ -148,7 +155,7 @@ def reference(time: Array, n_drones: int) -> Array:
 
 
 @jit_unless_traced("n_drones")
-def feedforward(time: Array, n_drones: int) -> Array:
+def jerk_feedforward(time: Array, n_drones: int) -> Array:
     """Return the jerk of every drone's setpoint, with zero snap and yaw rates, without which a turn lags behind.
 
     Args:
@@ -174,37 +181,37 @@ def build_fly_frame(sim: Sim) -> Callable[[SimData], tuple[SimData, Array]]:
 
     def tick(data: SimData, _: None) -> tuple[SimData, Array]:
         time, n_drones = data.core.steps / data.core.freq, data.core.n_drones
-        setpoint = reference(time, n_drones)
+        setpoint = figure_eight_setpoints(time, n_drones)
         error = jnp.linalg.norm(data.states.pos - setpoint[..., :3], axis=-1)
-        data = F.state_control(data, setpoint, feedforward=feedforward(time, n_drones))
+        data = F.state_control(data, setpoint, feedforward=jerk_feedforward(time, n_drones))
         return step(data, per_tick), error
 
     return jax.jit(lambda data: jax.lax.scan(tick, data, length=sim.control_freq // FPS))
 
 
-def report(errors: np.ndarray, touching: np.ndarray, n_steps: int, step_s: float, contact_s: float) -> None:
+def print_report(errors: np.ndarray, touched: np.ndarray, n_steps: int, step_s: float, contact_s: float) -> None:
     """Print step rate, tracking error and contacts of the flight.
 
     Args:
         errors: Distances from the setpoint, m. (n_ticks, n_worlds, n_drones)
-        touching: True where a drone touches a pole. (n_frames, n_worlds, n_drones, n_poles)
+        touched: True where a drone touches a pole. (n_frames, n_worlds, n_drones, n_poles)
         n_steps: Number of physics steps of all drones.
         step_s: Time of all steps, s.
         contact_s: Time of one contact query, s.
     """
-    first = round(SETTLED * FPS * len(errors) / len(touching))
+    first = round(SETTLING_TIME * FPS * len(errors) / len(touched))
     settled = 100 * (errors[first:] if first < len(errors) else errors)
-    began = touching[1:] & ~touching[:-1]
+    began = touched[1:] & ~touched[:-1]
     print(f"steps per second  {n_steps / step_s / 1e6:.1f} M ({n_steps / 1e6:.1f} M drone steps in {step_s:.1f} s)")
     print(f"tracking error    {settled.mean():.1f} cm mean, {np.percentile(settled, 95):.1f} cm 95th percentile")
-    n_begun, n_worlds = int(began.sum() + touching[0].sum()), int(touching.any((0, 2, 3)).sum())
+    n_begun, n_worlds = int(began.sum() + touched[0].sum()), int(touched.any((0, 2, 3)).sum())
     print(
-        f"contacts          {n_begun:,} begun, in {n_worlds:,} of {counted(touching.shape[1], 'world')}; "
+        f"contacts          {n_begun:,} begun, in {n_worlds:,} of {count_text(touched.shape[1], 'world')}; "
         f"{1e3 * contact_s:.1f} ms a query"
     )
 
 
-def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
+def plot_tracks(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     """Plot the tracks of world 0, and the tracking error of all worlds over time."""
     try:
         import matplotlib
@@ -215,7 +222,7 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
         print(f"no plot: {not_installed('plots need', 'matplotlib', 'demo')}")
         return
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    setpoint = np.asarray(reference(jnp.linspace(0, PERIOD, 200)[:, None], 1))[:, 0]
+    setpoint = np.asarray(figure_eight_setpoints(jnp.linspace(0, PERIOD, 200)[:, None], 1))[:, 0]
     left.plot(setpoint[:, 0], setpoint[:, 1], "--", color="0.6", label="setpoint")
     for i in range(tracks.shape[1]):
         left.plot(tracks[:, i, 0], tracks[:, i, 1], color=COLORS[i % 4], label=f"drone {i}")
@@ -234,7 +241,7 @@ def plot(sim: Sim, tracks: np.ndarray, errors: np.ndarray, path: Path) -> None:
     print(f"wrote {path}")
 
 
-def record(sim: Sim, flight: Flight, path: Path) -> None:
+def film_flight(sim: Sim, flight: Flight, path: Path) -> None:
     """Film world 0; print one line and return if this machine cannot render."""
     for i in range(sim.n_drones):
         change_material(sim, "led_top", [i], rgba=COLORS[i % 4], emission=1.0)

@@ -18,44 +18,43 @@ from crazysim.pytree import has_members, leaf_indices, map_batched, n_batch_axes
 from crazysim.sim.sim import Sim
 
 
-class Resets:
+class EpisodeReset:
     """Resets of data at the start of an episode, by the default data and the pipeline that a simulation has now."""
 
     def __init__(self, sim: Sim):
-        """Take the default data and the reset pipeline of a simulation."""
-        self._default = default = compact(sim.default_data)
+        self._default = default = deduplicate(sim.default_data)
         first, *others = sim.reset_pipeline.items()
         names = [name for name, fn in others if not isinstance(fn, Stage)]
         names += [] if first[1] is reset else [first[0]]
-        self.foreign = "batched" in jax.tree.leaves(scopes(sim.default_data))
+        self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
         """True if a record in ``data.plugins`` is of another library, which is not divided among worlds."""
-        self.batched_pipeline = bool(names) or self.foreign
-        """True if ``data`` takes all worlds at once."""
-        self.batched: str | None = None
+        self.takes_all_worlds = bool(names) or self.has_foreign_record
+        """True if ``reset_data`` takes all worlds at once."""
+        self.why_batched: str | None = None
         """Reason why new episodes are computed in all worlds and then selected; None where each world begins alone."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
         if names:
-            self.batched = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
+            self.why_batched = f"{', '.join(map(repr, names))} of the reset pipeline takes all worlds at once"
         elif any(n_batch_axes(kind) == 2 and x.shape[0] > 1 and i != world_id for kind, x, i in rows):
-            self.batched = "episodes begin from different data in different worlds"
-        self.data = _reset_all(sim) if self.batched_pipeline else _reset_world([fn for _, fn in others])
-        """``data(data, default)``: data of one world after a reset, or of all worlds if ``batched_pipeline``."""
+            self.why_batched = "episodes begin from different data in different worlds"
+        self.reset_data = _reset_all(sim) if self.takes_all_worlds else _reset_world([fn for _, fn in others])
+        """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``takes_all_worlds``."""
 
-    def default_of(self, data: SimData) -> SimData:
-        """Return the data of all worlds that an episode begins from; seed and numbers are those of the data given."""
+    def default_for(self, data: SimData) -> SimData:
+        """Return the data of all worlds that an episode begins from, with the seed and the numbers of ``data``."""
         n_worlds, n_drones = data.states.pos.shape[:2]
-        return with_own(self.default_data(n_worlds, n_drones), data)
+        return copy_seed_and_ids(self.broadcast_default(n_worlds, n_drones), data)
 
-    def default_of_world(self, data: SimData) -> SimData:
-        """Return the data of one world that an episode begins from, where worlds do not differ in that."""
+    def default_for_world(self, data: SimData) -> SimData:
+        """Return the data of one world that an episode begins from, if it is the same in all worlds."""
 
-        def one(scope: str, x: Array) -> Array:
+        def first_world(scope: str, x: Array) -> Array:
             return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
 
-        return with_own(jax.tree.map(one, scopes(self._default), self._default), data)
+        return copy_seed_and_ids(jax.tree.map(first_world, scopes(self._default), self._default), data)
 
-    def default_data(self, n_worlds: int, n_drones: int) -> SimData:
+    def broadcast_default(self, n_worlds: int, n_drones: int) -> SimData:
         """Return the default data with all worlds and drones."""
         shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
 
@@ -88,10 +87,10 @@ _AXES = {"drone": (0, 1), "world": (0,)}
 """Axes of worlds and drones by scope; members of other populations are stored one by one."""
 
 
-def compact(data: SimData) -> SimData:
-    """Return the data with one world and drone in place of all where they are alike, as arrays of the host."""
+def deduplicate(data: SimData) -> SimData:
+    """Return the data as host arrays, with one world and drone where all are equal."""
 
-    def one(scope: str, x: Array) -> Array | np.ndarray:
+    def deduplicate_leaf(scope: str, x: Array) -> Array | np.ndarray:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             return x
         host = np.asarray(x)
@@ -101,10 +100,10 @@ def compact(data: SimData) -> SimData:
                 host = first
         return host
 
-    return jax.tree.map(one, scopes(data), data)
+    return jax.tree.map(deduplicate_leaf, scopes(data), data)
 
 
-def with_own(default: SimData, data: SimData) -> SimData:
+def copy_seed_and_ids(default: SimData, data: SimData) -> SimData:
     """Return the default data with the seed, numbers of worlds, drones and members of the data."""
     own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
     members = {

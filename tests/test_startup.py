@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from crazysim import surroundings
+from crazysim import startup
 
 VARIABLES = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
 PROGRAM = """
@@ -35,7 +35,7 @@ def test_images_need_no_setting_without_a_screen():
 def test_a_screen_or_a_choice_is_kept(bare, variable):
     bare.setenv(variable, "osmesa")
     before = dict(os.environ)
-    surroundings.set_variables()
+    startup.set_variables()
     assert dict(os.environ) == before
 
 
@@ -43,15 +43,15 @@ def test_without_egl_nothing_is_chosen(bare):
     def missing(name):
         raise OSError(name)
 
-    bare.setattr(surroundings.ctypes, "CDLL", missing)
-    surroundings.set_variables()
+    bare.setattr(startup.ctypes, "CDLL", missing)
+    startup.set_variables()
     assert "MUJOCO_GL" not in os.environ
 
 
 def test_the_log_of_xla_is_quiet_unless_chosen(monkeypatch):
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
-    surroundings.set_variables()
+    startup.set_variables()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
-    surroundings.set_variables()
+    startup.set_variables()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"
