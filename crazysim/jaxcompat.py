@@ -95,7 +95,7 @@ __all__ = [
 ]
 
 FALLBACKS = os.environ.get("CRAZYSIM_JAX_FALLBACKS") == "1"
-"""Whether public functions of JAX are used wherever they can replace others, as listed above."""
+"""True to use public functions of JAX wherever they can replace others, as listed above."""
 
 
 # Jaxprs ---------------------------------------------------------------------------------------------------------

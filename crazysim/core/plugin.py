@@ -186,7 +186,7 @@ class Plugin:
     """Influences are applied in ascending order, and by name within the same order. Negative: replaces commands that
     the others limit."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
-    """Whether ``constrain`` is written for the data of one drone or of one world."""
+    """Scope that ``constrain`` is written for: the data of one drone, or of one world."""
     begins_before: ClassVar[str | None] = None
     """Name of the stage of an episode's first step in front of which ``begin_episode`` is called, if it uses what that
     step has computed so far; None to call it at resets, and in front of all stages in worlds that were not reset."""
