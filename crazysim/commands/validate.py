@@ -57,12 +57,12 @@ def _draw(chosen: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[
     """Write the pictures, and return their paths relative to the page by the names of the sections."""
     pictures = {}
     for section in chosen:
-        own = [row for row in rows if row.section == section.name]
-        if not any(row.series for row in own):
+        section_rows = [row for row in rows if row.section == section.name]
+        if not any(row.series for row in section_rows):
             continue
         pictures[section.name] = f"{PICTURES}/validation_{section.name}.png"
         try:
-            draw(section, own, folder / pictures[section.name])
+            draw(section, section_rows, folder / pictures[section.name])
         except ImportError as error:
             print(f"no pictures: {error}")
             return {}

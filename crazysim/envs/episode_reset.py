@@ -105,13 +105,13 @@ def deduplicate(data: SimData) -> SimData:
 
 def copy_seed_and_ids(default: SimData, data: SimData) -> SimData:
     """Return the default data with the seed, numbers of worlds, drones and members of the data."""
-    own = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
+    core_fields = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
     members = {
         name: default.plugins[name].replace(member_id=record.member_id)
         for name, record in populations(data).items()
         if name in default.plugins
     }
-    return default.replace(core=default.core.replace(**own), plugins=default.plugins | members)
+    return default.replace(core=default.core.replace(**core_fields), plugins=default.plugins | members)
 
 
 def reset_world(data: SimData, default: SimData) -> SimData:

@@ -49,8 +49,8 @@ def episode_key(data: SimData, name: str) -> Array:
     world, episode = core.world_id.astype(jnp.uint32), core.episode.astype(jnp.uint32)
     first = _mix(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
     second = _mix(seed[1] + first)
-    own = _mix(_mix(first + world * STRIDE) ^ (second + episode * STRIDE))
-    return jax.random.wrap_key_data(jnp.stack([own, _mix(own ^ second)], axis=-1), impl="threefry2x32")
+    mixed = _mix(_mix(first + world * STRIDE) ^ (second + episode * STRIDE))
+    return jax.random.wrap_key_data(jnp.stack([mixed, _mix(mixed ^ second)], axis=-1), impl="threefry2x32")
 
 
 def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:

@@ -120,14 +120,14 @@ def make(
             )
     settings = {"control": entry.control, "n_drones": entry.n_drones}
     settings |= {k: v for k, v in options.items() if k in SIM_OPTIONS}
-    own = {k: v for k, v in options.items() if k in entry.options}
-    task = entry.task(**own) if isinstance(task, str) else dataclasses.replace(task, **own)
+    task_options = {k: v for k, v in options.items() if k in entry.options}
+    task = entry.task(**task_options) if isinstance(task, str) else dataclasses.replace(task, **task_options)
     plugins = [*plugin_list("effects", effects), *plugin_list("sensors", sensors)]
     if randomize is not None:
         if randomize not in RANDOMIZATIONS:
             raise ConfigError(
                 f"expected randomize as one of {', '.join(map(repr, RANDOMIZATIONS))}, got {short_repr(randomize)}. "
-                f"Use effects=[Randomize(...)] for ranges of your own."
+                f"Use effects=[Randomize(...)] for ranges of your task_options."
             )
         plugins.append(RANDOMIZATIONS[randomize]())
     sim = Sim(n_worlds=n_worlds, **settings)
@@ -205,8 +205,8 @@ def _check_class(task: object) -> type[Task]:
     if not inspect.isclass(task) or not issubclass(task, Task) or task is Task:
         raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
     fields = {f.name for f in dataclasses.fields(task)}
-    own = inspect.get_annotations(task).items()
-    if others := [name for name, kind in own if name not in fields and "ClassVar" not in str(kind)]:
+    annotations = inspect.get_annotations(task).items()
+    if others := [name for name, kind in annotations if name not in fields and "ClassVar" not in str(kind)]:
         raise ConfigError(
             f"expected {', '.join(others)} as a setting of a dataclass, got the class {task.__name__} without the "
             f"decorator. Write @dataclass(frozen=True, kw_only=True) above it."

@@ -155,9 +155,9 @@ class TrainConfig:
         known = {} if resumed is None else resumed.options
         if isinstance(task, Task):
             fields = [f for f in dataclasses.fields(task) if f.init]
-            own = {f.name: getattr(task, f.name) for f in fields}
-            usual = {f.name: known.get(f.name, f.default) for f in fields}
-            options = {k: x for k, x in own.items() if not _is_same_setting(x, usual[k])} | dict(options or {})
+            values = {f.name: getattr(task, f.name) for f in fields}
+            defaults = {f.name: known.get(f.name, f.default) for f in fields}
+            options = {k: x for k, x in values.items() if not _is_same_setting(x, defaults[k])} | dict(options or {})
             task = next((name for name, one in TASKS.items() if one is entry), None) or reference_of(entry.task)
         elif is_reference(task):
             task = absolute_reference(task) if split_reference(task)[1] else reference_of(entry.task)

@@ -136,12 +136,12 @@ class Avoid(Task):
         @stage("drone")
         def check(data: SimData) -> SimData:
             """Disable a drone that touches something or leaves the arena, and note one that reaches its goal."""
-            own, pos = crossing_of(data), data.states.pos
+            record, pos = crossing_of(data), data.states.pos
             left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
-            disabled = own.disabled | (~own.reached & (left | contacts(data).any))
-            offset = pos - own.goal
-            reached = own.reached | (~disabled & (rotation.dot(offset, offset)[0] < self.tolerance**2))
-            return with_record(data, own.replace(disabled=disabled, reached=reached))
+            disabled = record.disabled | (~record.reached & (left | contacts(data).any))
+            offset = pos - record.goal
+            reached = record.reached | (~disabled & (rotation.dot(offset, offset)[0] < self.tolerance**2))
+            return with_record(data, record.replace(disabled=disabled, reached=reached))
 
         record = Crossing(zero, no, no, no, zero[..., 0], tuple(handles))
         install_rules(sim, record, check, collisions=True)
@@ -162,19 +162,19 @@ class Avoid(Task):
         angle = jnp.pi * stands[:, 3:] / 2
         pos = jnp.concatenate([flat, hangs[:, None]], axis=-1)
         quat = jnp.concatenate([0 * angle, 0 * angle, jnp.sin(angle), jnp.cos(angle)], axis=-1)
-        first, own = 0, crossing_of(data)
-        for handle in own.handles:
+        first, record = 0, crossing_of(data)
+        for handle in record.handles:
             some = slice(first, first + len(handle))
             data, first = handle.set_pose(data, pos[some], quat[some]), some.stop
         offset, aim, rpy, vel = jnp.split(2 * x["drones"] - 1, 4, axis=-1)
         goals = field.goals.astype(dtype)
         start = goals * np.array([-1, 1, 1], dtype) + JITTER * offset
         data = flying(data, start, rotation.from_rpy(0.1 * rpy), 0.1 * vel)
-        return with_record(data, own.replace(goal=goals + JITTER * aim))
+        return with_record(data, record.replace(goal=goals + JITTER * aim))
 
     def before_step(self, data: SimData) -> SimData:
-        own = crossing_of(data)
-        return with_record(data, own.replace(out_before=own.out, remaining_way_before=self.error(data)))
+        record = crossing_of(data)
+        return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
 
     def nearest_ways(self, data: SimData) -> Array:
         """Return the ways to the nearest points of the nearest obstacles, m. (n_drones, n_seen, 3)"""
@@ -207,19 +207,19 @@ class Avoid(Task):
         return obs
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        own = crossing_of(data)
+        record = crossing_of(data)
         gap = rotation.safe_norm(self.nearest_ways(data)[..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
         paid = {
-            "progress": 2.0 * (own.remaining_way_before - self.error(data)),
+            "progress": 2.0 * (record.remaining_way_before - self.error(data)),
             "closeness": -0.05 * jnp.exp(-10 * gap),
             "haste": -0.1 * jnp.maximum(speed - CRUISE_SPEED, 0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "reached": 10.0 * own.reached,
-            "disabled": -10.0 * own.disabled,
+            "reached": 10.0 * record.reached,
+            "disabled": -10.0 * record.disabled,
         }
-        return terms.only_where(~own.out_before, paid)
+        return terms.only_where(~record.out_before, paid)
 
     def terminated(self, data: SimData) -> Array:
         return jnp.all(crossing_of(data).out)

@@ -62,11 +62,11 @@ class BringLoad(Task):
             data: Simulation.
             crashed: True where the drone crashes in this step. (...)
         """
-        own = delivery_of(data)
-        crashed = own.crashed | crashed
-        steps = jnp.where(self.at_goal(data) & ~crashed, own.steps_there + 1, 0)
-        delivered = own.delivered | (steps >= round(self.hold * data.core.freq))
-        return own.replace(crashed=crashed, steps_there=steps, delivered=delivered)
+        record = delivery_of(data)
+        crashed = record.crashed | crashed
+        steps = jnp.where(self.at_goal(data) & ~crashed, record.steps_there + 1, 0)
+        delivered = record.delivered | (steps >= round(self.hold * data.core.freq))
+        return record.replace(crashed=crashed, steps_there=steps, delivered=delivered)
 
     def before_step(self, data: SimData) -> SimData:
         return with_record(data, delivery_of(data).replace(remaining_way_before=self.remaining_way(data)))
@@ -84,8 +84,8 @@ class BringLoad(Task):
         return rotation.safe_norm(delivery_of(data).goal - load_pos(data))[..., 0]
 
     def info(self, data: SimData) -> dict[str, Array]:
-        own = delivery_of(data)
-        return {"delivered": own.delivered, "crashed": own.crashed}
+        record = delivery_of(data)
+        return {"delivered": record.delivered, "crashed": record.crashed}
 
     def target(self, data: SimData) -> Array:
         return delivery_of(data).goal

@@ -144,27 +144,27 @@ class Deliver(BringLoad):
         ``difference_to_load_vel``, m/s, from the hook to the ring; ``difference_to_goal``, from the ring to its goal,
         m; and ``taken``, 1 once the hook has taken the load.
         """
-        s, load, own = data.states, data.plugins["load"], delivery_of(data)
+        s, load, record = data.states, data.plugins["load"], delivery_of(data)
         return state_of(data) | {
             "hook_pos": load.tip_pos - s.pos,
             "hook_vel": load.tip_vel - s.vel,
             "difference_to_load": load.pos - load.tip_pos,
             "difference_to_load_vel": load.vel - load.tip_vel,
-            "difference_to_goal": own.goal - load.pos,
-            "taken": own.taken[..., None].astype(s.pos.dtype),
+            "difference_to_goal": record.goal - load.pos,
+            "taken": record.taken[..., None].astype(s.pos.dtype),
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        own, load, to_go = delivery_of(data), data.plugins["load"], self.remaining_way(data)
+        record, load, to_go = delivery_of(data), data.plugins["load"], self.remaining_way(data)
         apart = rotation.safe_norm(load.pos - load.tip_pos)[..., 0]
         drift = rotation.safe_norm(load.vel - load.tip_vel)[..., 0]
         return {
-            "progress": 5.0 * (own.remaining_way_before - to_go),
-            "meeting": jnp.where(own.taken, 1.0, 0.1 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
-            "proximity": 2.0 * own.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
+            "progress": 5.0 * (record.remaining_way_before - to_go),
+            "meeting": jnp.where(record.taken, 1.0, 0.1 * jnp.exp(-4 * apart) * (1 + jnp.exp(-2 * drift))),
+            "proximity": 2.0 * record.taken * terms.proximity(self.error(data), coarse=1.5, fine=10.0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -5.0 * own.crashed,
+            "crash": -5.0 * record.crashed,
         }
 
     def info(self, data: SimData) -> dict[str, Array]:

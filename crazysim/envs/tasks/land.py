@@ -136,8 +136,8 @@ def pad_of(data: SimData, steps: Array) -> tuple[Array, Array]:
     Returns:
         (..., 3) each
     """
-    own = landing_of(data)
-    angle = own.phase + own.rate * (steps / data.core.freq)
+    record = landing_of(data)
+    angle = record.phase + record.rate * (steps / data.core.freq)
     out = jnp.concatenate([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
     along = jnp.concatenate([-jnp.sin(angle), jnp.cos(angle), 0 * angle], axis=-1)
-    return middle_of(data) + own.circle * out, own.circle * own.rate * along
+    return middle_of(data) + record.circle * out, record.circle * record.rate * along

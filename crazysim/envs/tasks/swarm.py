@@ -81,13 +81,13 @@ class Swarm(Task):
         @stage("drone")
         def keep_closest(data: SimData) -> SimData:
             """Keep the smallest separation from another drone."""
-            own, place = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
+            record, place = swarm_of(data), data.states.pos / np.array(SEPARATION, data.states.pos.dtype)
 
             def square(other: Array, is_self: Array) -> Array:
                 return jnp.where(is_self, jnp.inf, jnp.sum((place - other) ** 2))
 
             nearest = rotation.safe_sqrt(reduce_over_others(square, place, "min"))
-            return with_record(data, own.replace(closest=jnp.minimum(own.closest, nearest)))
+            return with_record(data, record.replace(closest=jnp.minimum(record.closest, nearest)))
 
         pos = sim.data.states.pos
         zero, far = (

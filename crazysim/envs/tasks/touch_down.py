@@ -84,7 +84,7 @@ class TouchDown(Task):
 
         @stage(scope)
         def touch(data: SimData) -> SimData:
-            own, s, report = landing_of(data), data.states, contacts(data)
+            record, s, report = landing_of(data), data.states, contacts(data)
             pos, vel = self.target_motion(data, ahead=1)
             if report.objects is None or report.floor is None:
                 raise TypeError("expected contacts with objects and floor, got None")
@@ -98,14 +98,16 @@ class TouchDown(Task):
             )
             good = on_place & (offset[..., 2] > 0) & within & soft & ~elsewhere
             bad = (on_place & ~good) | elsewhere | self.has_left_arena(data)
-            new = own.replace(landed=own.landed | (good & ~own.crashed), crashed=own.crashed | (bad & ~own.landed))
+            new = record.replace(
+                landed=record.landed | (good & ~record.crashed), crashed=record.crashed | (bad & ~record.landed)
+            )
             return with_record(data, new)
 
         return touch
 
     def before_step(self, data: SimData) -> SimData:
-        own = landing_of(data)
-        return with_record(data, own.replace(out_before=own.out, remaining_way_before=self.error(data)))
+        record = landing_of(data)
+        return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
 
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state, and the way to its place, m, and the place's relative velocity, m/s."""
@@ -116,17 +118,17 @@ class TouchDown(Task):
         }
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
-        own, d = landing_of(data), self.error(data)
+        record, d = landing_of(data), self.error(data)
         drift = rotation.safe_norm(self.target_motion(data)[1] - data.states.vel)[..., 0]
         paid = {
-            "progress": self.progress * (own.remaining_way_before - d),
+            "progress": self.progress * (record.remaining_way_before - d),
             "speed": -0.1 * drift * jnp.exp(-4 * d),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "landed": 10.0 * own.landed,
-            "crashed": -self.crash * own.crashed,
+            "landed": 10.0 * record.landed,
+            "crashed": -self.crash * record.crashed,
         }
-        return terms.only_where(~own.out_before, paid)
+        return terms.only_where(~record.out_before, paid)
 
     def terminated(self, data: SimData) -> Array:
         return jnp.all(landing_of(data).out)

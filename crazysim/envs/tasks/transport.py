@@ -104,18 +104,18 @@ class Transport(BringLoad):
 
     def spawn(self, data: SimData, key: Array) -> SimData:
         """Return drones in flight with swinging loads before the gates, and goals behind them."""
-        n_drones, own = data.core.n_drones, delivery_of(data)
+        n_drones, record = data.core.n_drones, delivery_of(data)
         x = draw(key, n_drones, start=3, goal=3, gate=3, turn=1, rpy=3, vel=3, swing=2, swing_rate=2)
         lane = jnp.asarray(lanes(n_drones), data.states.pos.dtype)
         quat = rotation.from_rpy(scale_symmetric(x["rpy"], 0.1))
         data = flying(data, lane + scale_to(x["start"], *np.array(START)), quat, scale_symmetric(x["vel"], 0.3))
         yaw = scale_symmetric(x["turn"], TURN)
         turned = rotation.from_rpy(jnp.concatenate([0 * yaw, 0 * yaw, yaw], axis=-1))
-        data = own.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE)), turned)
+        data = record.gates.set_pose(data, lane + scale_to(x["gate"], *np.array(GATE)), turned)
         data = self.hang(
             data, scale_symmetric(x["swing"], self.swing), scale_symmetric(x["swing_rate"], 1.5 * self.swing)
         )
-        return with_record(data, own.replace(goal=lane + scale_to(x["goal"], *np.array(GOAL))))
+        return with_record(data, record.replace(goal=lane + scale_to(x["goal"], *np.array(GOAL))))
 
     def hang(self, data: SimData, angle: Array, rate: Array) -> SimData:
         """Return the data with loads on taut links.
@@ -184,16 +184,16 @@ class Transport(BringLoad):
         The approach reaches far, so that waiting before the gate pays less than passing it; proximity rewards rest at
         the goal.
         """
-        own, to_go = delivery_of(data), self.remaining_way(data)
+        record, to_go = delivery_of(data), self.remaining_way(data)
         rate = direction(data)[1]
         return {
-            "progress": 5.0 * (own.remaining_way_before - to_go),
+            "progress": 5.0 * (record.remaining_way_before - to_go),
             "approach": 0.5 * jnp.exp(-to_go),
             "proximity": terms.proximity(self.error(data), coarse=5.0),
             "swing": -0.01 * rotation.dot(rate, rate)[..., 0],
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
-            "crash": -10.0 * own.crashed,
+            "crash": -10.0 * record.crashed,
         }
 
     def info(self, data: SimData) -> dict[str, Array]:
