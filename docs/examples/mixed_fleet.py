@@ -12,7 +12,7 @@ from crazysim import Cars, Follow, Sim, SlungLoad, Terrain
 from crazysim.control import LoadLQR
 from crazysim.envs import flying
 from crazysim.media import Film, View
-from crazysim.plugins.vehicles import PathLQR
+from crazysim.plugins import vehicles
 from crazysim.trajectories import figure_eight, lissajous
 
 FPS, DRONES, CARS = 25, ("cf21B_500", "cf21B_500", "bumblebee"), ("cars", "towing")
@@ -50,7 +50,12 @@ def build(n_worlds):
     share = np.arange(n_worlds) / n_worlds
     for number, (name, path) in enumerate(zip(CARS, (ellipse(*INNER), ellipse(*OUTER)), strict=True)):
         time = share * float(path.duration)
-        settings = {"path": path, "controller": PathLQR(), "start": -time[:, None], "trailer": name == "towing"}
+        settings = {
+            "path": path,
+            "controller": vehicles.PathLQR(),
+            "start": -time[:, None],
+            "trailer": name == "towing",
+        }
         cars = sim.add(Cars([f"Fleet1Tenth_{number}"], name=name, **settings))
         car = cars.read(sim.data)
         body_vel = np.array(car.body_vel)
