@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, dataclass_transform
 
 import jax
@@ -84,7 +84,7 @@ class PyTree:
     if not TYPE_CHECKING:  # a type checker would take any name for a field
 
         def __getattr__(self, name: str) -> Any:
-            """Return a field of a record from ``lazy`` when it is first read."""
+            """Return a field of a record from ``lazy_record`` when it is first read."""
             own = self.__dict__
             template = own.get(_TEMPLATE)
             if template is None or name not in template.__dict__:
@@ -97,10 +97,10 @@ class PyTree:
 
 
 _TEMPLATE, _READ = "_template", "_read"
-"""Attributes of a record from ``lazy``."""
+"""Attributes of a record from ``lazy_record``."""
 
 
-def lazy(template: T, read: Callable[[Any], Any]) -> T:
+def lazy_record(template: T, read: Callable[[Any], Any]) -> T:
     """Return the record whose leaves are ``read(x)`` for the leaves of a template, each made when it is first read.
 
     It behaves like any other record: JAX, ``replace`` and ``copy`` read all fields. To list its fields, use
@@ -120,7 +120,7 @@ def lazy(template: T, read: Callable[[Any], Any]) -> T:
 
 def _lazy_child(x: Any, read: Callable[[Any], Any]) -> Any:
     if isinstance(x, PyTree):
-        return lazy(x, read)
+        return lazy_record(x, read)
     if isinstance(x, dict):
         return {k: _lazy_child(v, read) for k, v in x.items()}
     if x is None or isinstance(x, int):  # the most common cases; JAX takes some time to say so
@@ -186,6 +186,14 @@ def leaf_indices(tree: Any) -> Any:
     """
     treedef = jax.tree.structure(tree)
     return treedef.unflatten(range(treedef.num_leaves))
+
+
+def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence[T]) -> list[T]:
+    """Return a list of leaves with other values at some indices."""
+    out = list(leaves)
+    for i, value in zip(indices, values, strict=True):
+        out[i] = value
+    return out
 
 
 def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
@@ -330,7 +338,7 @@ def select_worlds(mask: Array | None, new: Array, old: Array) -> Array:
     return jnp.where(mask, new, old)
 
 
-def floating() -> Any:
+def float_dtype() -> Any:
     """Return the floating dtype of JAX in its current configuration: float32 or float64."""
     return np.float64 if jax.config.jax_enable_x64 else np.float32  # type: ignore[attr-defined]
 
@@ -340,7 +348,7 @@ def as_parameter(value: Any) -> Any:
 
     It is a NumPy array, which needs no compilation; the simulation moves it to its device with the other data.
     """
-    return np.atleast_1d(np.asarray(value, floating()))
+    return np.atleast_1d(np.asarray(value, float_dtype()))
 
 
 def device_array(value: Any, dtype: Any = None) -> jax.Array:
@@ -348,9 +356,9 @@ def device_array(value: Any, dtype: Any = None) -> jax.Array:
 
     It compiles nothing, where ``jnp.asarray`` compiles a program for each shape.
     """
-    return jax.device_put(np.array(value, dtype or floating()))
+    return jax.device_put(np.array(value, dtype or float_dtype()))
 
 
 def host_array(value: Any, *shape: int, dtype: Any = None) -> Any:
     """Return a value broadcast to a shape as a NumPy array, of floating dtype by default; it needs no compilation."""
-    return np.array(np.broadcast_to(value, shape), dtype or floating())
+    return np.array(np.broadcast_to(value, shape), dtype or float_dtype())

@@ -14,7 +14,7 @@ from crazysim.control.protocol import controller_chain
 from crazysim.core.airframes import Airframes, as_airframes, create_per_drone, n_rotors_of
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, host_array, leaf, scopes, static
+from crazysim.pytree import PyTree, float_dtype, host_array, leaf, scopes, static
 
 
 class ControllerData(PyTree):
@@ -53,7 +53,7 @@ class ControllerData(PyTree):
                 )
 
         def of_all(x: np.ndarray, like: np.ndarray) -> np.ndarray:
-            dtype = floating() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
+            dtype = float_dtype() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
             core = np.shape(x)[np.ndim(x) - np.ndim(like) :]  # it may have rows of drones, and more rotors
             return host_array(x, n_worlds, n_drones, *core, dtype=dtype)
 
@@ -169,8 +169,8 @@ def require_same_controllers(controls: SimControls, like: SimControls, name: str
         return
     if [_layout(controller) for controller in given] != [_layout(controller) for controller in needed]:
         raise ConfigError(
-            f"expected data of controller {name!r} with {', then '.join(map(_described, needed)) or 'no records'}, got "
-            f"{', then '.join(map(_described, given)) or 'no records'}. Use data of this simulation, or of one with "
+            f"expected data of controller {name!r} with {', then '.join(map(_describe, needed)) or 'no records'}, got "
+            f"{', then '.join(map(_describe, given)) or 'no records'}. Use data of this simulation, or of one with "
             f"the same settings."
         )
 
@@ -185,16 +185,16 @@ def _layout(controller: ControllerData) -> tuple[object, list[tuple[int, ...]]]:
     return jax.tree.structure(controller), [np.shape(x) for x in jax.tree.leaves(controller.memory)]
 
 
-def _described(controller: ControllerData) -> str:
+def _describe(controller: ControllerData) -> str:
     shapes = [np.shape(x) for x in jax.tree.leaves(controller.memory)]
-    memory, params = _kind(controller.memory), _kind(controller.params)
+    memory, params = _type_name(controller.memory), _type_name(controller.params)
     return f"memory {memory} of shapes {shapes}, parameters {params} and freq={controller.freq}"
 
 
-def _kind(record: object) -> str:
+def _type_name(record: object) -> str:
     """Return the name of a record's type, with the types of the controllers in it."""
     name, members = type(record).__name__, getattr(record, "controllers", ())
-    return f"{name}({', '.join(map(_kind, members))})" if members else name
+    return f"{name}({', '.join(map(_type_name, members))})" if members else name
 
 
 class SimControls(PyTree):

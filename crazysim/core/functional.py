@@ -75,7 +75,7 @@ def check_setpoint(
     """
     given = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
-        controls = _joined(data, given)
+        controls = _join_setpoint(data, given)
     elif given:
         raise ConfigError(
             f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(given)}. Write them "
@@ -93,18 +93,18 @@ def check_setpoint(
     return command, _as_command(data, "feedforward", shape, FEEDFORWARD_FIELDS, feedforward, check_finite)
 
 
-def _joined(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:
+def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:
     """Return the setpoint of some parts, on the host if all of them are. (n_worlds, n_drones, 16)"""
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
     counts = data.states.pos.shape[:2]
-    given = {name: _part(name, x, counts if name == "yaw" else (*counts, 3)) for name, x in parts.items()}
+    given = {name: _check_part(name, x, counts if name == "yaw" else (*counts, 3)) for name, x in parts.items()}
     if any(isinstance(x, jax.Array) for x in given.values()):
         return _device_setpoint(counts, data.states.pos.dtype, given)
     return _setpoint(np, counts, float, given)
 
 
-def _part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:
+def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:
     """Return a part of a setpoint as an array that broadcasts to a shape."""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value)

@@ -26,7 +26,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
     without effect, or count in the derivative as a state that the drone does not have.
     """
     where = f"influence of plugin {plugin.name!r} ({type(plugin).__name__})"
-    after = _called(where, plugin.influence, data)
+    after = _call_method(where, plugin.influence, data)
     if not isinstance(after, SimData):
         raise ConfigError(f"expected {where} to return SimData, got {type(after).__name__}. Use 'return data'.")
     paths, treedef = jax.tree_util.tree_flatten_with_path(data)
@@ -57,7 +57,7 @@ def apply_influence(plugin: Plugin, data: SimData) -> SimData:
 def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     """Return the rates of the plugin's own states, checked."""
     where = f"derivative of plugin {plugin.name!r} ({type(plugin).__name__})"
-    rates = _called(where, plugin.derivative, data, plugin.scope)
+    rates = _call_method(where, plugin.derivative, data, plugin.scope)
     if not isinstance(rates, Mapping):
         raise ConfigError(
             f"expected {where} to return a dict of fields of its record to rates, got {type(rates).__name__}. Use "
@@ -88,10 +88,10 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
 def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
     """Return the derivative under the constraint of a plugin; its errors carry a note with plugin and method."""
     where = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
-    return _called(where, lambda seen: plugin.constrain(seen, deriv, dt), data, plugin.coupling)
+    return _call_method(where, lambda seen: plugin.constrain(seen, deriv, dt), data, plugin.coupling)
 
 
-def _called(where: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
+def _call_method(where: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:
     """Return the result of a plugin's method; its errors carry a note with plugin and method."""
     try:
         return method(data)

@@ -87,7 +87,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     return structure.unflatten(found)
 
 
-def _outside(*args: object, **params: object) -> NoReturn:
+def _refuse_outside(*args: object, **params: object) -> NoReturn:
     raise ConfigError(
         "expected reduce_over_others in a function of one drone that a stage applies to all drones of a world, got a "
         "call outside of one. Use it in stage('drone') or in the influence of a plugin."
@@ -140,6 +140,6 @@ def _of_all(
     return jax.lax.map(in_turn, (numbers, each), batch_size=max(1, MAX_PAIRS // n))
 
 
-reduce_over_others_p = batched_primitive("reduce_over_others", _results, _batched, _outside)
+reduce_over_others_p = batched_primitive("reduce_over_others", _results, _batched, _refuse_outside)
 """The reduction as a primitive: its operands are the values that the function captures, then the published ones.
 ``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_own`` is the number of captured values."""

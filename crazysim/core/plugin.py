@@ -165,7 +165,7 @@ def check_parameter(
     return device_array(np.broadcast_to(array, core) if is_shared else array, dtype)
 
 
-def per_drone(sim: Simulation, value: ArrayLike, *core: int) -> Array:
+def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
     """Return a number for every drone, of the states' type. (n_worlds, n_drones, *core)"""
     shape = (*sim.data.states.pos.shape[:2], *core)
     return device_array(np.broadcast_to(value, shape), sim.data.states.pos.dtype)
@@ -260,7 +260,7 @@ class Plugin:
             if values.get(name) is not None:
                 continue
             if scope == "drone" and core is not None:
-                values.setdefault(name, per_drone(sim, 0.0, *core))
+                values.setdefault(name, drone_array(sim, 0.0, *core))
             elif scope == "parameter" and name in settings:
                 value, core = getattr(self, name), core or sim.data.states.rotor_vel.shape[-1:]
                 dtype, per_axis = settings[name].dtype, settings[name].per_axis

@@ -24,7 +24,7 @@ from crazysim.core.plugin import Placement, Plugin, Simulation
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import RESERVED_SCOPES, Stage, tick
 from crazysim.errors import ConfigError
-from crazysim.pytree import Members, PyTree, floating
+from crazysim.pytree import Members, PyTree, float_dtype
 
 MAX_MEMBERS = 100_000
 """Most members of a population in a world."""
@@ -257,7 +257,7 @@ def _of_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tupl
     is_integer = array.dtype.kind in "iu" and hasattr(
         value, "dtype"
     )  # numbers of Python may be written without a point
-    dtype = np.int32 if is_integer else floating() if array.dtype.kind in "iuf" else array.dtype
+    dtype = np.int32 if is_integer else float_dtype() if array.dtype.kind in "iuf" else array.dtype
     n_core = metadata["core_ndim"]
     core = array.shape[max(array.ndim - n_core, 0) :] if array.ndim >= n_core else None
     batch = array.shape[: array.ndim - n_core] if core is not None else ()

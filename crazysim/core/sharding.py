@@ -11,9 +11,8 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from crazysim.core.data import SimData
-from crazysim.core.stage import replace_leaves
 from crazysim.errors import ConfigError
-from crazysim.pytree import n_batch_axes, scopes
+from crazysim.pytree import n_batch_axes, replace_leaves, scopes
 
 T = TypeVar("T")
 

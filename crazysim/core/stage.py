@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, TypeVar
 
 import jax
@@ -12,7 +12,16 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.others import MEMBER_AXIS
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, has_members, leaf_indices, n_batch_axes, n_world_axes, scopes, select_worlds
+from crazysim.pytree import (
+    PyTree,
+    has_members,
+    leaf_indices,
+    n_batch_axes,
+    n_world_axes,
+    replace_leaves,
+    scopes,
+    select_worlds,
+)
 
 T = TypeVar("T")
 
@@ -211,14 +220,6 @@ class Axes:
         if scope != "batch" and own != "batched":
             taken = n_batch_axes(own) if own == scope else n_world_axes(own)
         return jax.ShapeDtypeStruct(jnp.shape(x)[taken:], x.dtype)
-
-
-def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence[T]) -> list[T]:
-    """Return a list of leaves with other values at some indices."""
-    out = list(leaves)
-    for i, value in zip(indices, values, strict=True):
-        out[i] = value
-    return out
 
 
 def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:

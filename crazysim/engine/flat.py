@@ -28,12 +28,12 @@ class PackCache:
     def __call__(self, arrays: list[Any]) -> Array:
         """Return the arrays as one."""
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
-            return _concatenated(arrays)
+            return _concatenate(arrays)
         before, packed = self._last
-        if packed is None or not _same(arrays, before):
+        if packed is None or not _are_same(arrays, before):
             with jax.ensure_compile_time_eval():  # inside a user's trace too: a cached value must be an array
-                packed = _joined(arrays) if packed is None and _on_one_cpu(arrays) else _compiled(arrays)
-            self._last = _fixed(arrays), packed
+                packed = _pack_arrays(arrays) if packed is None and _on_one_cpu(arrays) else _compiled(arrays)
+            self._last = _without_numpy(arrays), packed
         return packed
 
 
@@ -43,17 +43,17 @@ def _on_one_cpu(arrays: list[Any]) -> bool:
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
 
 
-def _joined(arrays: list[Any]) -> Array:
+def _pack_arrays(arrays: list[Any]) -> Array:
     """Return arrays of one device as one there, committed if one of them is."""
     committed = next((x.sharding for x in arrays if isinstance(x, jax.Array) and x.committed), None)
     return jax.device_put(np.concatenate([np.ravel(x) for x in arrays]), committed)
 
 
-def _concatenated(arrays: list[Any]) -> Array:
+def _concatenate(arrays: list[Any]) -> Array:
     return jnp.concatenate([x.ravel() for x in arrays])
 
 
-_compiled = jax.jit(_concatenated)
+_compiled = jax.jit(_concatenate)
 
 
 class ZerosCache:
@@ -73,7 +73,7 @@ class ZerosCache:
         indices = self._indices(data, leaves, treedef)
         arrays = [leaves[i] for i in indices]
         before, zeros = self._last
-        if _same(arrays, before):
+        if _are_same(arrays, before):
             return zeros
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return ()
@@ -81,7 +81,7 @@ class ZerosCache:
             (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(indices, arrays, strict=True)
         ]
         zeros = tuple([(i, some) for i, some in found if some])
-        self._last = _fixed(arrays), zeros
+        self._last = _without_numpy(arrays), zeros
         return zeros
 
     def _indices(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
@@ -98,15 +98,15 @@ class ZerosCache:
         return self._shared[key]
 
 
-def _fixed(arrays: list[Any]) -> list[Any]:
+def _without_numpy(arrays: list[Any]) -> list[Any]:
     """Return the arrays, with None for NumPy arrays, which never count as equal because their owner may change them."""
     return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 
-def _same(some: Sequence[Any], others: Sequence[Any]) -> bool:
+def _are_same(some: Sequence[Any], others: Sequence[Any]) -> bool:
     """Return whether two lists hold the very same arrays."""
-    return len(some) == len(others) and all(map(_is, some, others))
+    return len(some) == len(others) and all(map(_is_same, some, others))
 
 
-def _is(a: Any, b: Any) -> bool:
+def _is_same(a: Any, b: Any) -> bool:
     return a is b

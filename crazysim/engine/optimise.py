@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from crazysim.engine.ir import dump, listing
 from crazysim.engine.ir.program import Program
 from crazysim.engine.ir.verify import verify
-from crazysim.engine.passes.layout import as_rows, pack_shared
+from crazysim.engine.passes.layout import pack_rows, pack_shared
 from crazysim.engine.passes.schedule import fuse, hoist, join_ticks
 
 Pass = Callable[[Program], Program]
@@ -28,8 +28,8 @@ def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = N
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]
     if rows is not None:
-        stored = functools.partial(as_rows, select=rows)
-        passes.append(functools.update_wrapper(stored, as_rows))
+        stored = functools.partial(pack_rows, select=rows)
+        passes.append(functools.update_wrapper(stored, pack_rows))
     return apply(program, passes)
 
 

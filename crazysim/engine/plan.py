@@ -25,7 +25,7 @@ from jax.sharding import PartitionSpec
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
-from crazysim.core.stage import Stage, replace_leaves
+from crazysim.core.stage import Stage
 from crazysim.core.stages import watched_records
 from crazysim.engine.backends import Build, Run, fused, interpret, kernel, lanes, plain
 from crazysim.engine.errors import LimitError, UnsupportedError, report_unsupported
@@ -36,9 +36,9 @@ from crazysim.engine.lowering.relative import on_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.lowering.tracing import Tracer
 from crazysim.engine.optimise import optimise
-from crazysim.engine.passes.layout import PackedRows, rows_of
+from crazysim.engine.passes.layout import PackedRows, packed_rows
 from crazysim.errors import ConfigError
-from crazysim.pytree import leaf_indices, n_batch_axes, scopes
+from crazysim.pytree import leaf_indices, n_batch_axes, replace_leaves, scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
 """Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
@@ -158,7 +158,7 @@ class Planner(NamedTuple):
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
         lowered = [
-            lower_stages(g.stages, data, known, _watched, population=g.population, tracer=tracer) for g in groups
+            lower_stages(g.stages, data, known, _watched_leaves, population=g.population, tracer=tracer) for g in groups
         ]
         one_kernel = self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered] == [True]
         select = None
@@ -185,7 +185,7 @@ class Planner(NamedTuple):
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
         runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
         inputs = {i for program in programs for i in _inputs(program)}
-        run, written = _together(groups, programs, runs)
+        run, written = _join_runs(groups, programs, runs)
         plan = self._wrap(engine, why, data, programs, inputs, written, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
@@ -232,7 +232,7 @@ class Planner(NamedTuple):
         written = (*written, *flags)
         main = programs[0] if programs else None
         packed = main.packed if main is not None else ()
-        rows = tuple(rows_of(main)) if main is not None else ()
+        rows = tuple(packed_rows(main)) if main is not None else ()
 
         def advance(values: list[Any], n_steps: int | Array) -> list[Any]:
             leaves = replace_leaves([None] * n_leaves, inputs, values)
@@ -241,7 +241,7 @@ class Planner(NamedTuple):
 
         if programs and self.location.mesh is not None:
             advance = self._over_mesh(advance, data, inputs, written)
-        plan = Plan(engine, why, programs, self.location, inputs, packed, rows, written, numbers, *_jitted(advance))
+        plan = Plan(engine, why, programs, self.location, inputs, packed, rows, written, numbers, *_jit_step(advance))
         direct = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
         return dataclasses.replace(plan, direct=_results_on_device(advance)) if direct else plan
 
@@ -295,7 +295,7 @@ class Planner(NamedTuple):
         return ""
 
 
-def _jitted(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _jit_step(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return the function compiled for any number of steps, and for a Python number."""
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
@@ -311,7 +311,9 @@ def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
     return direct
 
 
-def _together(groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]) -> tuple[Run, tuple[int, ...]]:
+def _join_runs(
+    groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]
+) -> tuple[Run, tuple[int, ...]]:
     """Return one function that runs independent programs, and the leaves that it writes."""
     runs = [on_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
@@ -331,7 +333,7 @@ def _together(groups: Sequence[Group], programs: Sequence[Program], runs: Sequen
     return run_all, tuple(written)
 
 
-def _watched(data: SimData) -> list[Any]:
+def _watched_leaves(data: SimData) -> list[Any]:
     """Return the leaves whose NaN and infinities flag a world: states and commands."""
     return jax.tree.leaves(watched_records(data))
 

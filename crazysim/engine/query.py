@@ -11,12 +11,12 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.core.sharding import Location
-from crazysim.core.stage import Axes, Stage, replace_leaves
+from crazysim.core.stage import Axes, Stage
 from crazysim.engine.backends import fused
 from crazysim.engine.lowering.relative import on_data_leaves
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
-from crazysim.pytree import PyTree, leaf
+from crazysim.pytree import PyTree, leaf, replace_leaves
 
 RECORD_NAME = "results"
 """Name of the results in ``data.plugins`` while the kernel runs."""

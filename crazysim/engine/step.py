@@ -18,7 +18,7 @@ from crazysim.core.data import MAX_STEPS, SimData
 from crazysim.core.functional import put_command, staged_fields, staged_leaves
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.sharding import WORLD_AXIS, Location, location_of
-from crazysim.core.stage import Axes, Stage, as_stages, replace_leaves
+from crazysim.core.stage import Axes, Stage, as_stages
 from crazysim.engine.backends import fused
 from crazysim.engine.flat import PackCache, ZerosCache
 from crazysim.engine.host_call import HostLeaves
@@ -26,7 +26,7 @@ from crazysim.engine.ir.program import Program, Zeros
 from crazysim.engine.lowering.relative import view_leaves
 from crazysim.engine.plan import ENGINES, Plan, Planner, SeparateLeaves
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import check_axes, lazy
+from crazysim.pytree import check_axes, lazy_record, replace_leaves
 
 
 class FlatData:
@@ -49,7 +49,7 @@ class FlatData:
         record = self._record
         if record is None:
             # Without a reference to this object, so that no cycle keeps arrays in memory.
-            record = self._record = lazy(self.plan.numbers, functools.partial(_leaf, self.leaves, self.plan))
+            record = self._record = lazy_record(self.plan.numbers, functools.partial(_leaf, self.leaves, self.plan))
         return record
 
     def replace(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from crazysim import jaxcompat
 from crazysim.cache import keep_programs
-from crazysim.core.stage import replace_leaves
 from crazysim.engine.step import FlatData
 from crazysim.envs.env import Env
 from crazysim.envs.state import NAME, OUTPUTS, EnvState
 from crazysim.envs.task_check import require_finite_start
 from crazysim.errors import ConfigError
+from crazysim.pytree import replace_leaves
 
 Output = Callable[[EnvState], Any]
 """State after a step to the tree of arrays that a call returns."""

@@ -21,7 +21,7 @@ from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.eager import is_traced
 from crazysim.engine import Step
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf, n_batch_axes, scopes
+from crazysim.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
 
 Cost = Callable[[SimState, Setpoint, Array], Array]
@@ -157,7 +157,7 @@ class MPPI:
         self.period = self.substeps / freq
         """Time from one command to the next, s."""
         self.hover, self.low, self.high, default = _command_range(sim)
-        self.noise = default if noise is None else np.asarray(noise, floating())
+        self.noise = default if noise is None else np.asarray(noise, float_dtype())
         if self.noise.shape != self.hover.shape or not np.all((self.noise >= 0) & np.isfinite(self.noise)):
             raise ConfigError(f"expected noise as {len(self.hover)} finite numbers of at least zero, got {noise!r}")
         pipeline = {
@@ -173,7 +173,7 @@ class MPPI:
     def init(self, n_worlds: int, n_drones: int) -> MPPIMemory:
         """Return the memory before the first command: plans that hover."""
         shape = (n_worlds, n_drones, self.knots, len(self.hover))
-        return MPPIMemory(jnp.asarray(np.broadcast_to(self.hover, shape), floating()), jnp.int32(0))
+        return MPPIMemory(jnp.asarray(np.broadcast_to(self.hover, shape), float_dtype()), jnp.int32(0))
 
     @property
     def engine(self) -> str:
@@ -322,4 +322,4 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
             ((0.7, 0.7, np.pi), (0.1, 0.1, 0.05)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
         )
         rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, spread]]
-    return tuple(np.asarray(row, floating()) for row in rows)  # type: ignore[return-value]
+    return tuple(np.asarray(row, float_dtype()) for row in rows)  # type: ignore[return-value]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from crazysim.control.setpoint import Setpoint
 from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError, short_repr
-from crazysim.pytree import PyTree, floating, leaf
+from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.trajectories.interpolation import unit_coefficients
 
 COUNTED = 16
@@ -65,18 +65,18 @@ class Trajectory(PyTree):
                 f"expected finite coefficients, at least one for each axis, got shape {c.shape}. Check the input for "
                 "NaN."
             )
-        ends = np.cumsum(lengths).astype(floating())
+        ends = np.cumsum(lengths).astype(float_dtype())
         steps = np.diff(ends, prepend=0.0)
         if not np.all(np.isfinite(ends)) or not np.all(lengths > 0) or not np.all(steps > 0):
             k = int(np.argmin(np.where(np.isfinite(steps), steps, -np.inf)))
             raise ConfigError(
-                f"expected finite, positive durations that add up to ascending times in {np.dtype(floating()).name}, "
+                f"expected finite, positive durations that add up to ascending times in {ends.dtype.name}, "
                 f"got {lengths[k]!r} s for piece {k}. Merge pieces that are too short."
             )
         if c.shape[1] == 3:
             c = np.concatenate([c, np.zeros_like(c[:, :1])], axis=1)
         c = c * lengths[:, None, None] ** np.arange(c.shape[2])
-        return Trajectory(ends, c.astype(floating()), np.bool_(repeats))  # type: ignore[arg-type]
+        return Trajectory(ends, c.astype(float_dtype()), np.bool_(repeats))  # type: ignore[arg-type]
 
     @property
     def n_pieces(self) -> int:

@@ -12,8 +12,8 @@ from crazysim import ConfigError, Latency, Sim, load_airframe, make
 from crazysim.control import INDI, PID, Control, Controller, LoadLQR, Mellinger, Setpoint
 from crazysim.core import functional as F
 from crazysim.core.sharding import world_mesh
-from crazysim.core.stage import as_stages, replace_leaves
-from crazysim.pytree import PyTree, as_parameter, leaf
+from crazysim.core.stage import as_stages
+from crazysim.pytree import PyTree, as_parameter, leaf, replace_leaves
 
 WORLDS, DRONES = 3, 2
 

@@ -44,7 +44,7 @@ from crazysim import Sim
 from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.engine import Step
 from crazysim.engine.backends import fused
-from crazysim.engine.backends.source import require
+from crazysim.engine.backends.source import require_block_source
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.pytree import PyTree, leaf
@@ -260,7 +260,7 @@ class Fuzzer:
         if "fused" in self.engines:
             try:
                 for segment in program.fused_segments:
-                    require(segment.block)
+                    require_block_source(segment.block)
             except UnsupportedError as error:
                 (no_source,) = [case for k, case in enumerate(cases) if f"p{k}" == error.stage]
                 self.counts["without source"] += 1

@@ -24,7 +24,7 @@ def cache(tmp_path, monkeypatch):
     """JAX's compilation cache, and no folder that was refused or swept before."""
     monkeypatch.setattr("crazysim.jaxcompat.cache_folder", lambda: str(tmp_path))
     kernel_cache._refuse.cache_clear()
-    kernel_cache._swept.cache_clear()
+    kernel_cache._sweep_once.cache_clear()
     return tmp_path
 
 
@@ -163,7 +163,7 @@ def test_no_process_is_asked_for_on_windows(monkeypatch):
     with monkeypatch.context() as faked:
         faked.setattr(kernel_cache.os, "kill", None)
         faked.setattr(kernel_cache.os, "name", "nt")
-        found = [kernel_cache._abandoned(name, age * kernel_cache.ABANDONED_AFTER) for age in (0.9, 1.1)]
+        found = [kernel_cache._is_abandoned(name, age * kernel_cache.ABANDONED_AFTER) for age in (0.9, 1.1)]
     assert found == [False, True]
 
 

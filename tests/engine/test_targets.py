@@ -158,7 +158,7 @@ def test_casadi_computes_what_the_interpreter_does_or_refuses():
         params = (("y", 3),) if name == "integer_pow" else ()
         block = builder.finish([builder.add(name, args, result.replace("float32", "float64"), params)])
         try:
-            symbolic.require(block)
+            symbolic.require_casadi(block)
         except UnsupportedError as error:
             refused.add((name, error.stage))
             continue
@@ -181,4 +181,4 @@ def test_kernels_refuse_types_that_they_do_not_have():
     builder = Builder(stage="mine")
     x = builder.input(np.int64)
     with pytest.raises(UnsupportedError, match=r"no numbers of type int64 \(stage 'mine', jax"):
-        source.require(builder.finish([builder.add("add", (x, x), np.int64)]))
+        source.require_block_source(builder.finish([builder.add("add", (x, x), np.int64)]))

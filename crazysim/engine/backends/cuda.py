@@ -87,7 +87,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
         kernel = few if n_lanes < RESIDENT_LANES else many
         n_blocks, memory = -(-n_lanes // kernel.lanes), []
         if kernel.kept:
-            n_blocks, count, memory = _with_memory(kernel, n_lanes, int(count[0]))
+            n_blocks, count, memory = _plan_memory(kernel, n_lanes, int(count[0]))
         grid = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1}
         block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
         run = jax.ffi.ffi_call(PTX_TARGET, [*outputs, *memory], input_output_aliases=kernel.aliases())
@@ -108,7 +108,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
     return launch
 
 
-def _with_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
+def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
     """Return the number of blocks of a kernel that stores states, its numbers of steps, and the memory that it needs.
 
     Where that would exceed ``MAX_GRADIENT_MEMORY_BYTES``, fewer blocks each compute several blocks of lanes in turn.

@@ -17,9 +17,9 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.cache import announce
-from crazysim.core.stage import replace_leaves
 from crazysim.engine.backends import Run, lanes
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
+from crazysim.pytree import replace_leaves
 
 CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
 """A ``Run`` whose number of steps is an array."""
@@ -51,8 +51,8 @@ def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels 
                 some = tangent_p.bind(*fixed, *given, case=case, n_fixed=len(fixed))
                 found = dict(zip(kernels.floats, some, strict=True))
                 numbers = kernels.program.written
-                rest = [found[i] if i in found else _float0(x) for i, x in zip(numbers, written, strict=True)]
-                return (written, flagged), (rest, _float0(flagged))
+                rest = [found[i] if i in found else _float0_zeros(x) for i, x in zip(numbers, written, strict=True)]
+                return (written, flagged), (rest, _float0_zeros(flagged))
 
             if kernels is not None:
                 announce("compiling a derivative of the steps on lanes", "10 to 40 s")
@@ -69,7 +69,7 @@ def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels 
     return steps
 
 
-def _float0(x: Any) -> np.ndarray:
+def _float0_zeros(x: Any) -> np.ndarray:
     """Return the tangent of an array that is not of floats."""
     return np.zeros(x.shape, jax.dtypes.float0)
 

@@ -19,7 +19,7 @@ from jax import Array
 
 from crazysim import jaxcompat
 from crazysim.core.sharding import Location
-from crazysim.core.stage import PHASES, Phase, replace_leaves
+from crazysim.core.stage import PHASES, Phase
 from crazysim.engine.backends import Run, cuda, kernel, lanes, native
 from crazysim.engine.backends.derivative_kernels import DerivativeKernels
 from crazysim.engine.backends.derivatives import CountedRun, make_differentiable
@@ -27,8 +27,9 @@ from crazysim.engine.backends.native import Launch
 from crazysim.engine.backends.platforms import TARGETS, compile_kernel, describe_kernel
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.program import Program
-from crazysim.engine.passes.layout import rows_of
+from crazysim.engine.passes.layout import packed_rows
 from crazysim.errors import ConfigError
+from crazysim.pytree import replace_leaves
 
 
 class Kernels:
@@ -119,7 +120,7 @@ def build(program: Program, location: Location, in_leaves: Program | None = None
     Args:
         program: The program.
         location: Devices to compile it for.
-        in_leaves: The same program before ``as_rows``, whose derivatives it gets, since rows have no derivative in a
+        in_leaves: The same program before ``pack_rows``, whose derivatives it gets, since rows have no derivative in a
             kernel; None for a program without rows.
 
     Raises:
@@ -196,7 +197,7 @@ def _on_leaves(program: Program, in_leaves: Program, location: Location) -> Run:
 
     def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         built[:] = built or [build(in_leaves, location)]
-        every, given = rows_of(program), list(leaves)
+        every, given = packed_rows(program), list(leaves)
         for rows in every:
             for i in rows.members:
                 given[i] = rows.unpack(leaves[rows.leaf], i)

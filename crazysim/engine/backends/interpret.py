@@ -18,12 +18,12 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.sharding import Location
-from crazysim.core.stage import replace_leaves
 from crazysim.engine.backends import Run, lanes, subnormals
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Operation, Value
 from crazysim.engine.ir.program import Program
 from crazysim.jaxcompat import is_key
+from crazysim.pytree import replace_leaves
 
 Observer = Callable[[Operation, Sequence[np.ndarray]], None]
 """Gets every operation with its results."""

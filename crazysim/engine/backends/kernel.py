@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from crazysim.core.stage import Phase
 from crazysim.engine.backends.exchange import exchange_for
 from crazysim.engine.backends.frame import Kernel, make_kernel
-from crazysim.engine.backends.source import TYPE_NAMES, Writer, require, type_name
+from crazysim.engine.backends.source import TYPE_NAMES, Writer, require_block_source, type_name
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
@@ -179,8 +179,8 @@ class Body:
 def require_source(program: Program) -> None:
     """Check that a program has source."""
     for segment in program.fused_segments:
-        require(segment.hoisted)
-        require(segment.block)
+        require_block_source(segment.hoisted)
+        require_block_source(segment.block)
         for i in {*segment.read, *segment.written}:
             leaf = program.leaves[i]
             if leaf.number not in TYPE_NAMES:

@@ -58,7 +58,7 @@ def folder() -> Path:
             if reason := distrust(shared):
                 _refuse(shared, reason)
             elif os.access(shared, os.W_OK | os.R_OK):
-                _swept(shared)
+                _sweep_once(shared)
                 return shared
     return temporary()
 
@@ -73,7 +73,7 @@ def _refuse(shared: Path, reason: str) -> None:
 
 
 @functools.cache
-def _swept(shared: Path) -> None:
+def _sweep_once(shared: Path) -> None:
     """Remove the remains in a folder, once."""
     sweep(shared, "*.tmp")
 
@@ -124,7 +124,7 @@ def sweep(cache_folder: Path, pattern: str) -> None:
     for path in cache_folder.glob(pattern):
         with contextlib.suppress(OSError):
             status = path.lstat()
-            if not _abandoned(path.name, time.time() - status.st_mtime) or distrust(path):
+            if not _is_abandoned(path.name, time.time() - status.st_mtime) or distrust(path):
                 continue
             if stat.S_ISDIR(status.st_mode):
                 shutil.rmtree(path, ignore_errors=True)
@@ -132,7 +132,7 @@ def sweep(cache_folder: Path, pattern: str) -> None:
                 path.unlink()
 
 
-def _abandoned(name: str, age: float) -> bool:
+def _is_abandoned(name: str, age: float) -> bool:
     """Return True if no process needs a file or folder any more.
 
     Args:

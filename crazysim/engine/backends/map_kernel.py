@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from crazysim.engine.backends.frame import Kernel, make_kernel
 from crazysim.engine.backends.kernel import write_results
-from crazysim.engine.backends.source import Writer, require, type_name
+from crazysim.engine.backends.source import Writer, require_block_source, type_name
 from crazysim.engine.ir.blocks import Block
 
 
@@ -15,7 +15,7 @@ def write_map(block: Block, target: str) -> Kernel:
         block: The function: its inputs are the index and the tables, its outputs single numbers.
         target: ``"cuda"`` or ``"host"``.
     """
-    require(block)
+    require_block_source(block)
     writer, tables = Writer(), block.inputs[1:]
     inputs, outputs = ([type_name(x.dtype) for x in some] for some in (tables, block.outputs))
     pointers = [f"const {kind}* __restrict__ p{k}" for k, kind in enumerate(inputs)]

@@ -14,10 +14,10 @@ from crazysim.cache import keep_programs
 from crazysim.core.data import SimData
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import PHASES, Axes, Phase, Stage, replace_leaves
+from crazysim.core.stage import PHASES, Axes, Phase, Stage
 from crazysim.core.stages import nonfinite_worlds
 from crazysim.engine.backends import Run
-from crazysim.pytree import leaf_flags
+from crazysim.pytree import leaf_flags, replace_leaves
 
 
 def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:

@@ -89,11 +89,11 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     if len(each) == 1 and each[0].scope == "drone":
         read = set(each[0].reads)
     carried = tuple(sorted(read & changing))
-    used = {slot for s in (*(back[s] for s in each), *each[:-1]) for slot in _used(extended, s)}
+    used = {slot for s in (*(back[s] for s in each), *each[:-1]) for slot in _used_slots(extended, s)}
     return ReverseProgram(extended, n, perturbed, back, back_hoisted, carried, frozenset(used.intersection(carried)))
 
 
-def _used(program: Program, s: Segment) -> list[Slot]:
+def _used_slots(program: Program, s: Segment) -> list[Slot]:
     """Return the slots of the inputs that a segment uses."""
     used, slots = s.block.uses(), program.per_drone(s, s.reads)
     return [slot for x, slot in zip(s.block.inputs, slots, strict=False) if x in used]

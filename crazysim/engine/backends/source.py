@@ -24,7 +24,7 @@ TYPE_NAMES = {np.dtype(name): short for name, short in
 """Types of numbers, and what they are called in the source."""
 
 
-def require(block: Block) -> None:
+def require_block_source(block: Block) -> None:
     """Check that there is source for all operations and types of a block.
 
     Raises:
@@ -76,7 +76,7 @@ class Writer(LineWriter):
         self.fours = dict.fromkeys(_fours(block), "")
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
-                self._over_others(op, depth, _live(block, position))
+                self._over_others(op, depth, _live_values(block, position))
                 self.shared.clear()  # what is kept for behind the loop is kept for each lane
             else:
                 self._operation(op, depth)
@@ -248,7 +248,7 @@ class Writer(LineWriter):
             self.line(f"{name}_{k} = {f};" if same else f"{name}_{k} = {type_name(x.dtype)}_lanes({f});", depth)
 
 
-def _live(block: Block, position: int) -> list[tuple[Value, str]]:
+def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
     """Return the values of a block that are computed before an operation, and used in its blocks or after it."""
     before = [x for op in block.operations[:position] for x in op.results if not x.size]
     used = dataclasses.replace(block, operations=block.operations[position + 1 :]).uses()

@@ -211,7 +211,7 @@ def _prune(block: Block, needed: set[Value]) -> Block:
         if op.name == "barrier":
             kept.append(op)
         elif not needed.isdisjoint(op.results):
-            op = _narrowed(op, needed) if op.name == "when" else op
+            op = _drop_results(op, needed) if op.name == "when" else op
             needed.update(x for x in op.args if isinstance(x, Value))
             if op.blocks:
                 blocks = tuple([_prune(inner, needed) for inner in op.blocks])
@@ -221,7 +221,7 @@ def _prune(block: Block, needed: set[Value]) -> Block:
     return dataclasses.replace(block, operations=tuple(kept[::-1]))
 
 
-def _narrowed(op: Operation, needed: Collection[Value]) -> Operation:
+def _drop_results(op: Operation, needed: Collection[Value]) -> Operation:
     """Return a ``when`` without the results that are not needed."""
     (mask, *old), (block,) = op.args, op.blocks
     kept = [k for k, x in enumerate(op.results) if x in needed]
@@ -272,13 +272,13 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
             else:
                 (values[old],) = builder.add_many(op.name, args, (old.dtype,), op.params)
         else:
-            blocks = tuple([_inlined(builder, inner, values) for inner in op.blocks])
+            blocks = tuple([_inline_block(builder, inner, values) for inner in op.blocks])
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)
             values.update(zip(op.results, results, strict=True))
     return [mapped(x) for x in block.outputs]
 
 
-def _inlined(outer: Builder, block: Block, values: dict[Value, Element]) -> Block:
+def _inline_block(outer: Builder, block: Block, values: dict[Value, Element]) -> Block:
     builder = Builder(outer)
     inside = values | {x: builder.input(x.dtype) for x in block.inputs}
     return builder.finish(inline(builder, block, inside))

@@ -63,11 +63,11 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
 def active_values(block: Block, wanted: Collection[Value]) -> set[Value]:
     """Return the values of a block and of its inner blocks that depend differentiably on some of its inputs."""
     found = set(wanted)
-    _spread(block, found)
+    _propagate(block, found)
     return found
 
 
-def _spread(block: Block, found: set[Value]) -> None:
+def _propagate(block: Block, found: set[Value]) -> None:
     for op in block.operations:
         if op.name == "over_others":
             (body,) = op.blocks
@@ -81,7 +81,7 @@ def _spread(block: Block, found: set[Value]) -> None:
                 found.update(x for x in op.results if x.dtype.kind == "f")
             continue
         for inner in op.blocks:
-            _spread(inner, found)
+            _propagate(inner, found)
         sources = (*op.args, *(x for inner in op.blocks for x in inner.outputs))
         if any(isinstance(x, Value) and x in found for x in sources):
             found.update(x for x in op.results if x.dtype.kind == "f")

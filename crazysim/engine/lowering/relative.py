@@ -69,17 +69,17 @@ class RelativeStage(Stage):
 
 def view_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
     """Return leaves, with leaves of other populations reshaped to leaves of the world. (n_worlds, 1, n_members, ...)"""
-    return [_reshaped(x, (x.shape[0], 1, *x.shape[1:])) if i in views and x is not None else x
+    return [_reshape(x, (x.shape[0], 1, *x.shape[1:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
 
 
 def restore_leaves(views: Collection[int], leaves: Sequence[Any]) -> list[Any]:
     """Undo ``view_leaves``. (n_worlds, n_members, ...)"""
-    return [_reshaped(x, (x.shape[0], *x.shape[2:])) if i in views and x is not None else x
+    return [_reshape(x, (x.shape[0], *x.shape[2:])) if i in views and x is not None else x
             for i, x in enumerate(leaves)]  # fmt: skip
 
 
-def _reshaped(x: Any, shape: tuple[int, ...]) -> Any:
+def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
     return jax.ShapeDtypeStruct(shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x.reshape(shape)
 
 

@@ -15,20 +15,20 @@ INDEX_REDUCTION_OF = {"min": "argmin", "max": "argmax"}
 
 def add_selections(block: Block) -> Block:
     """Return a block with two loops for each such number: one finds the drone that has it, one adds its number."""
-    if not any(map(_selects, block.operations)):
+    if not any(map(_selecting_results, block.operations)):
         return block
     builder = Builder()
     values: dict[Value, Element] = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     for op in block.operations:
         builder.stage = op.stage
         inline(builder, Block((), (op,), ()), values)
-        if some := _selects(op):
-            values.update(zip([op.results[k] for k in some], _selected(builder, op, some, values), strict=True))
+        if some := _selecting_results(op):
+            values.update(zip([op.results[k] for k in some], _select_own(builder, op, some, values), strict=True))
     outputs = [values.get(x, x) if isinstance(x, Value) else x for x in block.outputs]
     return Block(tuple([values[x] for x in block.inputs]), tuple(builder.operations), tuple(outputs))
 
 
-def _selects(op: Operation) -> list[int]:
+def _selecting_results(op: Operation) -> list[int]:
     """Return the results of an operation that are the smallest or largest of floats."""
     if op.name != "over_others":
         return []
@@ -36,7 +36,7 @@ def _selects(op: Operation) -> list[int]:
     return [k for k, (name, x) in enumerate(pairs) if name in INDEX_REDUCTION_OF and x.dtype.kind == "f"]
 
 
-def _selected(builder: Builder, op: Operation, some: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
+def _select_own(builder: Builder, op: Operation, some: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
     (body,) = op.blocks
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     dtypes, n_members = [op.results[k].dtype for k in some], ("n_members", op.param("n_members"))

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.core.stage import replace_leaves
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.algebra import known_zero
@@ -23,6 +22,7 @@ from crazysim.engine.ir.program import Leaf, Program, Segment, Slot
 from crazysim.engine.lowering.activity import apply_operation, changed_slots, without_check
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
+from crazysim.pytree import replace_leaves
 
 Values = dict[Value, Element]
 
@@ -145,12 +145,12 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
         slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
-        given = [*(_mapped(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+        given = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
         _record(op.results, inline(builder, slope, dict(zip(slope.inputs, given, strict=True))), tangents)
-    return [_mapped(x, values) for x in block.outputs]
+    return [_map_element(x, values) for x in block.outputs]
 
 
-def _mapped(x: Element, values: Values) -> Element:
+def _map_element(x: Element, values: Values) -> Element:
     return values.get(x, x) if isinstance(x, Value) else x
 
 
@@ -183,7 +183,7 @@ def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     after = [_tangent(x, moving) for x in block.outputs]
     before = [_tangent(x, tangents) for x in old]
     some = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
-    args = [_mapped(mask, values), *(_mapped(x, values) for x in old), *(before[k] for k in some)]
+    args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(before[k] for k in some)]
     inside = inner.finish([*outputs, *(after[k] for k in some)])
     results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inside,))
     values.update(zip(op.results, results, strict=False))
@@ -193,7 +193,7 @@ def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
 def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
     """Compute the derivative that the function has of its own."""
     (block,) = op.blocks
-    args = [_mapped(x, values) for x in op.args]
+    args = [_map_element(x, values) for x in op.args]
     found = inline(builder, block, values | dict(zip(block.inputs, args, strict=True)))
     values.update(zip(op.results, found, strict=True))
     if not any(isinstance(x, Value) and x in tangents for x in op.args):
@@ -216,7 +216,7 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     moving = tangents | {x: inner.input(x.dtype) for x in body.inputs if x.dtype.kind == "f"}
     outputs = _push(inner, body, inside, moving)
     blocks = [inner.finish([*outputs, *_tangents_of(body.outputs, moving)])]
-    args = [*(_mapped(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+    args = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
     for block in test:
         inner = Builder(builder)
         inside = values | {x: inner.input(x.dtype) for x in block.inputs}
@@ -241,7 +241,7 @@ def _over_others(builder: Builder, op: Operation, values: Values, tangents: Valu
     names = op.param("reduce")
     some = [k for k, x in enumerate(body.outputs) if names[k] == "add" and isinstance(_tangent(x, moving), Value)]
     block = inner.finish([*outputs, *(moving[body.outputs[k]] for k in some)])
-    args = [*(_mapped(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
+    args = [*(_map_element(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
     dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in some]
     params = (("reduce", (*names, *("add" for _ in some))), ("n_members", op.param("n_members")))
     results = builder.add_many("over_others", args, dtypes, params, (block,))

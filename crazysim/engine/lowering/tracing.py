@@ -42,7 +42,7 @@ class TracedStage:
         when = jax.make_jaxpr(condition)(self.avals) if stage.when is not None else None
         if when is not None and not when.jaxpr.outvars:  # it acts at every step
             when = None
-        used = _used(fn) | (_used(when) if when is not None else set())
+        used = _used_inputs(fn) | (_used_inputs(when) if when is not None else set())
         self.used = sorted(used)
         """Leaves that it reads: the inputs of ``fn`` and ``when``."""
         self.fn = jaxcompat.select_inputs(fn, self.used)
@@ -95,7 +95,7 @@ def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -
     return traced
 
 
-def _used(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:
+def _used_inputs(jaxpr: jaxcompat.ClosedJaxpr) -> set[int]:
     inner = jaxpr.jaxpr
     used = {v for eqn in inner.eqns for v in eqn.invars if not isinstance(v, jaxcompat.Literal)}
     used |= {v for v in inner.outvars if not isinstance(v, jaxcompat.Literal)}

@@ -14,13 +14,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from crazysim.core.stage import replace_leaves
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 from crazysim.engine.lowering.activity import active_values, apply_operation
 from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.selections import add_selections
+from crazysim.pytree import replace_leaves
 
 MAX_UNROLLED = 4096
 """Most operations of a loop that is unrolled for its derivative."""
@@ -41,7 +41,7 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
         cotangents of ``wanted``.
     """
     indices = [block.inputs.index(x) for x in wanted]
-    block = _unrolled(add_selections(block))
+    block = _unroll_loops(add_selections(block))
     wanted = [block.inputs[k] for k in indices]
     on_path = active_values(block, wanted)
     builder = Builder()
@@ -56,7 +56,7 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
             if isinstance(x, Value) and x in on_path:
                 _accumulate(builder, cotangents, x, ct)
     for k, part in reversed(list(enumerate(parts))):
-        here = values if k == len(parts) - 1 else _again(builder, part, k, values, on_path)
+        here = values if k == len(parts) - 1 else _recompute(builder, part, k, values, on_path)
         _pull(builder, part, here, on_path, cotangents)
     return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
 
@@ -74,7 +74,7 @@ def _parts(block: Block) -> list[Block]:
     ]
 
 
-def _again(
+def _recompute(
     builder: Builder, part: Block, number: int, values: dict[Value, Element], on_path: set[Value]
 ) -> dict[Value, Element]:
     """Compute a part of a block once more from what it uses, and return the elements that its values are then.
@@ -176,7 +176,7 @@ def _custom_jvp(
     builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents
 ) -> None:
     """Transpose the derivative that the function has of its own."""
-    slope = _transposed_slope(op.param("slope")())
+    slope = _transpose_slope(op.param("slope")())
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, found, strict=True)
              if x.dtype.kind == "f"]  # fmt: skip
@@ -188,7 +188,7 @@ def _custom_jvp(
 
 
 @functools.lru_cache(maxsize=256)
-def _transposed_slope(slope: Block) -> Block:
+def _transpose_slope(slope: Block) -> Block:
     tangents = slope.inputs[len(slope.inputs) // 2 :]
     return transpose_block(slope, [x for x in tangents if x.dtype.kind == "f"])
 
@@ -246,7 +246,7 @@ Rule = Callable[[Builder, Operation, dict, set[Value], Found, Cotangents], None]
 STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
 
 
-def _unrolled(block: Block) -> Block:
+def _unroll_loops(block: Block) -> Block:
     """Return a block whose loops of a fixed length are unrolled; the carries of their turns are needed backwards.
 
     Loops of integers and bools alone have no derivative, and stay.

@@ -30,11 +30,11 @@ def pack_shared(program: Program) -> Program:
         starts[i] = size
         size += leaves[i].size
     packed = Leaf(PACKED_LEAF_NAME, "shared", (size,), leaves[0].dtype)
-    moved = _moved(program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot)
+    moved = _move_slots(program, lambda slot: (len(leaves), starts[slot[0]] + slot[1]) if slot[0] in starts else slot)
     return dataclasses.replace(moved, leaves=(*leaves, packed), packed=tuple(shared))
 
 
-def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
+def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
     """Store leaves of drones and worlds as rows of one leaf for each type, behind the others.
 
     A row is one number of all drones, which follow each other there as a kernel's lanes do.
@@ -66,14 +66,14 @@ def as_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Progr
         drone, k = divmod(k, program.leaves[leaf].size)
         return new, drone * n_rows + first + k
 
-    return dataclasses.replace(_moved(program, move), leaves=tuple(leaves))
+    return dataclasses.replace(_move_slots(program, move), leaves=tuple(leaves))
 
 
 class PackedRows(NamedTuple):
     """A leaf of rows, and the leaves whose numbers are its rows; arrays are as the program takes them."""
 
     program: Program
-    """The program, after ``as_rows``."""
+    """The program, after ``pack_rows``."""
     leaf: int
     """Number of the leaf of rows."""
 
@@ -100,12 +100,12 @@ class PackedRows(NamedTuple):
         return x[:, :1] if like.scope == "world" else x
 
 
-def rows_of(program: Program) -> list[PackedRows]:
+def packed_rows(program: Program) -> list[PackedRows]:
     """Return the leaves of rows of a program."""
     return [PackedRows(program, i) for i, leaf in enumerate(program.leaves) if leaf.rows_of]
 
 
-def _moved(program: Program, move: Callable[[Slot], Slot]) -> Program:
+def _move_slots(program: Program, move: Callable[[Slot], Slot]) -> Program:
     """Return a program whose numbers are elsewhere."""
 
     def segment(s: Segment) -> Segment:

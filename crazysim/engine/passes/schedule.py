@@ -34,11 +34,11 @@ def fuse(program: Program) -> Program:
     for _, some in kinds:
         run = list(some)
         joined = [s for s in run if isinstance(s, Segment)]
-        segments += [_joined(joined)] if joined else run
+        segments += [_join_segments(joined)] if joined else run
     return dataclasses.replace(program, segments=tuple(segments))
 
 
-def _joined(segments: list[Segment]) -> Segment:
+def _join_segments(segments: list[Segment]) -> Segment:
     builder = Builder()
     before: dict[Slot, Value] = {}
     now: dict[Slot, Element] = {}
@@ -65,24 +65,24 @@ def join_ticks(program: Program) -> Program:
     What one stage writes and the next reads is then not selected between old and new first, and a constant stays one.
     """
     segments = [
-        dataclasses.replace(s, block=_with_joined_ticks(s.block)) if isinstance(s, Segment) else s
+        dataclasses.replace(s, block=_join_block_ticks(s.block)) if isinstance(s, Segment) else s
         for s in program.segments
     ]
     return dataclasses.replace(program, segments=tuple(segments))
 
 
-def _with_joined_ticks(block: Block) -> Block:
+def _join_block_ticks(block: Block) -> Block:
     operations: list[Operation] = []
     for op in block.operations:
         last = next((i for i in reversed(range(len(operations))) if operations[i].name != "barrier"), None)
         if last is not None and op.name == operations[last].name == "when" and op.args[0] is operations[last].args[0]:
-            operations[last:] = [_joined_ticks(operations[last], op)]
+            operations[last:] = [_join_two_ticks(operations[last], op)]
         else:
             operations.append(op)
     return dataclasses.replace(block, operations=tuple(operations))
 
 
-def _joined_ticks(first: Operation, second: Operation) -> Operation:
+def _join_two_ticks(first: Operation, second: Operation) -> Operation:
     """Return one ``when`` that does what two under the same condition do."""
     builder = Builder(stage=first.stage)
     new = inline(builder, first.blocks[0], {})
@@ -109,13 +109,13 @@ def separate(program: Program) -> Program:
     return dataclasses.replace(
         program,
         segments=tuple([
-            dataclasses.replace(s, block=_separated(s.block)) if isinstance(s, Segment) else s
+            dataclasses.replace(s, block=_separate_block(s.block)) if isinstance(s, Segment) else s
             for s in program.segments
         ]),
     )  # fmt: skip
 
 
-def _separated(block: Block) -> Block:
+def _separate_block(block: Block) -> Block:
     operations: list[Operation] = []
     for k, op in enumerate(block.operations):
         if k and k % BARRIER_INTERVAL == 0 and op.name != "barrier":
@@ -133,13 +133,13 @@ def hoist(program: Program) -> Program:
     return dataclasses.replace(
         program,
         segments=tuple([
-            _hoisted(s, changing) if isinstance(s, Segment) and (s.scope, s.phase) == ("drone", "each") else s
+            _hoist_segment(s, changing) if isinstance(s, Segment) and (s.scope, s.phase) == ("drone", "each") else s
             for s in program.segments
         ]),
     )  # fmt: skip
 
 
-def _hoisted(segment: Segment, changing: set[Slot]) -> Segment:
+def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     block, slots = segment.block, dict(zip(segment.block.inputs, segment.reads, strict=True))
     fixed = {x for x, slot in slots.items() if slot not in changing}
     worth: set[Value] = set()

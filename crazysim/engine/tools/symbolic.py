@@ -35,14 +35,14 @@ def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, E
     Raises:
         UnsupportedError: If CasADi has no form for an operation; the error names the stage.
     """
-    require(segment.hoisted)
-    require(segment.block)
+    require_casadi(segment.hoisted)
+    require_casadi(segment.block)
     hoisted = run(segment.hoisted, [number(slot) for slot in segment.hoisted_reads])
     outputs = run(segment.block, [*(number(slot) for slot in segment.reads), *hoisted])
     return dict(zip(segment.writes, outputs, strict=True))
 
 
-def require(block: Block) -> None:
+def require_casadi(block: Block) -> None:
     """Check that CasADi has a form for all operations of a block."""
     refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
     if refused:

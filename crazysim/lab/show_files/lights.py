@@ -11,7 +11,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf
+from crazysim.pytree import PyTree, float_dtype, leaf
 
 
 class Lights(PyTree):
@@ -52,7 +52,7 @@ class Lights(PyTree):
         if not (np.all((a >= 0) & (a <= 1)) and np.all((b >= 0) & (b <= 1))):
             raise ConfigError("expected colours from 0 to 1; divide colours from 0 to 255 by 255")
         b[-1] = a[-1]
-        return Lights(*(x.astype(floating()) for x in (t, a, b)))  # type: ignore[arg-type]
+        return Lights(*(x.astype(float_dtype()) for x in (t, a, b)))  # type: ignore[arg-type]
 
     @staticmethod
     def constant(color: ArrayLike = (1.0, 1.0, 1.0)) -> Lights:

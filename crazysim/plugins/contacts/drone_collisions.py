@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage, vmap_worlds
 from crazysim.errors import ConfigError
@@ -70,7 +70,7 @@ class DroneCollisions(Plugin):
         return DroneCollisionsData(
             friction=device_array([self.friction]),
             restitution=device_array([self.restitution]),
-            impulse=per_drone(sim, 0.0, 3),
+            impulse=drone_array(sim, 0.0, 3),
             press=device_array(np.zeros((sim.n_worlds, 1, n_contacts))),
             drag=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )

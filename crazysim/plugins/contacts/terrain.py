@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
 from crazysim.core.settings import as_rgba, color, setting
 from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR_HEIGHT, stop_below
@@ -64,7 +64,7 @@ class Terrain(Plugin):
             heights=device_array(heights, dtype),
             middle=device_array(pos, dtype),
             half=device_array(size / 2, dtype),
-            below=per_drone(sim, 0.0, 1),
+            below=drone_array(sim, 0.0, 1),
             floor=self.floor,
         )
         _put(sim.scene, self, heights, size, pos)

@@ -10,7 +10,15 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData, controls_of
-from crazysim.core.plugin import Placement, Plugin, Simulation, airframe_numbers, check_parameter, parameter, per_drone
+from crazysim.core.plugin import (
+    Placement,
+    Plugin,
+    Simulation,
+    airframe_numbers,
+    check_parameter,
+    drone_array,
+    parameter,
+)
 from crazysim.core.stage import stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
 from crazysim.eager import jit_unless_traced
@@ -98,7 +106,7 @@ class Battery(Plugin):
         if full_speed_voltage is None:
             known = airframe_numbers(sim, lambda a: a.full_thrust_voltage or 0.0)
             full_speed_voltage = np.where(known[..., None] > 0, known[..., None], NOMINAL_VOLTAGE * np.asarray(cells))
-        charge = per_drone(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0), 1)
+        charge = drone_array(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0), 1)
         return self.filled(
             sim,
             BatteryData,

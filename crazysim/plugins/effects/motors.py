@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData, controls_of
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import stage
@@ -53,7 +53,7 @@ class MotorFailure(Plugin):
         require_rotors(sim, "motor failure")
         n = sim.data.states.rotor_vel.shape[-1]
         effectiveness = check_parameter(sim, "effectiveness", self.effectiveness, (n,))
-        return self.filled(sim, MotorFailureData, effectiveness=per_drone(sim, effectiveness, n))
+        return self.filled(sim, MotorFailureData, effectiveness=drone_array(sim, effectiveness, n))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that makes rotors fail, if any can."""

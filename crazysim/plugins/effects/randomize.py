@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Plugin, Simulation, parameter, per_drone
+from crazysim.core.plugin import Plugin, Simulation, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
@@ -166,9 +166,9 @@ class Randomize(Plugin):
         record = settings.filled(
             sim,
             RandomizeData,
-            factors=per_drone(sim, 1.0, len(FACTORS)),
-            thrust_factors=per_drone(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
-            air_vel=per_drone(sim, 0.0, 3) if blows else None,
+            factors=drone_array(sim, 1.0, len(FACTORS)),
+            thrust_factors=drone_array(sim, 1.0, sim.data.states.rotor_vel.shape[-1]),
+            air_vel=drone_array(sim, 0.0, 3) if blows else None,
         )
         for name in RANGES:
             limits, given = getattr(record, name), getattr(self, name)

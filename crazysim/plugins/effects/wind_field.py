@@ -9,7 +9,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
 from crazysim.core.random import uniform, world_key
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
@@ -84,7 +84,7 @@ class WindField(Plugin):
             field=device_array(grid.values, dtype),
             origin=device_array(grid.origin, dtype),
             spacing=device_array(grid.spacing, dtype),
-            shift=None if self.spread is None else per_drone(sim, 0.0, 3),
+            shift=None if self.spread is None else drone_array(sim, 0.0, 3),
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

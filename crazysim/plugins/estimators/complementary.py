@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.control import Control
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, parameter, per_drone
+from crazysim.core.plugin import Simulation, drone_array, parameter
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import Stage
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
@@ -98,7 +98,7 @@ class Complementary(Estimator):
                 f"expected control at the level 'attitude' or below with {self.name!r}, which estimates no position, "
                 f"got 'state'. Use estimator=\"kalman\"."
             )
-        return self.filled(sim, ComplementaryData, quat=per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4))
+        return self.filled(sim, ComplementaryData, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
         """Return the stages of the filter by name, in their order."""

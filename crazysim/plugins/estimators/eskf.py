@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, per_drone
+from crazysim.core.plugin import Simulation, drone_array
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, tick
 from crazysim.plugins.estimators import error_state, inertial_path, updates
@@ -87,10 +87,10 @@ class ESKF(ErrorStateFilter):
         """Return the filter before its first step."""
         self.check_sensors(sim)
         n = error_state.N_BIASED
-        level, still = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4), per_drone(sim, 0.0, 3)
-        cov = per_drone(sim, 0.0, n * (n + 1) // 2)
+        level, still = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
+        cov = drone_array(sim, 0.0, n * (n + 1) // 2)
         rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aids)
-        paths = per_drone(sim, inertial_path.START, rows, len(inertial_path.START)) if rows else None
+        paths = drone_array(sim, inertial_path.START, rows, len(inertial_path.START)) if rows else None
         return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still), paths=paths)
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Simulation, parameter, per_drone
+from crazysim.core.plugin import Simulation, drone_array, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
@@ -102,13 +102,13 @@ class Kalman(ErrorStateFilter):
         if unknown := self.deviations.keys() - DEVIATIONS.keys():
             raise ConfigError(f"expected deviations of {', '.join(DEVIATIONS)}, got {', '.join(map(repr, unknown))}")
         deviations = DEVIATIONS | dict(self.deviations)
-        level = per_drone(sim, (0.0, 0.0, 0.0, 1.0), 4)
-        still = per_drone(sim, 0.0, 3)
+        level = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4)
+        still = drone_array(sim, 0.0, 3)
         cov = np.diag(np.square(START))[np.triu_indices(error_state.N)]
         return self.record_of(
             sim,
             KalmanData,
-            Estimate(still, still, level, still, per_drone(sim, cov, *cov.shape), None, None),
+            Estimate(still, still, level, still, drone_array(sim, cov, *cov.shape), None, None),
             previous=level,
             deviations=device_array(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
         )

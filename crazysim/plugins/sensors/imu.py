@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Simulation, parameter, per_drone
+from crazysim.core.plugin import Placement, Simulation, drone_array, parameter
 from crazysim.core.random import normal, uniform
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
@@ -178,7 +178,7 @@ class IMU(Sensor):
             accel=self.accel.record(sim, "accel"),
             quat=mounting(sim, self.rpy),
             rotor_pos=rotor_positions(sim) if shakes else None,
-            phase=per_drone(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if shakes else None,
+            phase=drone_array(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if shakes else None,
         )
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:

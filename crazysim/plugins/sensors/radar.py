@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
 from crazysim.core.stage import Stage
 from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError
@@ -84,7 +84,7 @@ class Radar(Plugin):
             if value.shape not in ((), (len(pos),)):
                 raise ConfigError(f"expected {name} of shape () or ({len(pos)},) for each radar, got {value.shape}")
             found[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=device_array(pos, dtype), **found, exposure=per_drone(sim, 0.0, len(pos)))
+        return RadarData(pos=device_array(pos, dtype), **found, exposure=drone_array(sim, 0.0, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[Placement]:
         """Return the stage that counts the time within the lobes."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter, per_drone
+from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate, setting
 from crazysim.core.stage import Stage, tick
@@ -121,11 +121,11 @@ class Sensor(Plugin):
             transit = {
                 "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, longest),
                 "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, longest),
-                "queue": per_drone(sim, 0.0, rows, k),
+                "queue": drone_array(sim, 0.0, rows, k),
                 "due": device_array(np.full((*shape, rows), NEVER), np.int32),
             }
         return Samples(
-            value=per_drone(sim, 0.0, k),
+            value=drone_array(sim, 0.0, k),
             taken=device_array(np.full((*shape, 1), -1), np.int32),
             delay=transit.get("delay"),
             jitter=transit.get("jitter"),

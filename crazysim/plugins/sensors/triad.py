@@ -11,7 +11,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.core.plugin import Simulation, check_parameter, per_drone
+from crazysim.core.plugin import Simulation, check_parameter, drone_array
 from crazysim.core.settings import check_settings, setting
 from crazysim.plugins.sensors.sensor import correlated, quantise
 from crazysim.pytree import PyTree, leaf
@@ -152,13 +152,13 @@ class Triad:
             return None if value is None else check_parameter(sim, named, value, (n,), per_axis=True)
 
         mean = joined("bias", "scale", "misalignment")
-        each = per_drone(sim, mean, 9)
+        each = drone_array(sim, mean, 9)
         return TriadData(
             bias=each[..., :3],
             scale=each[..., 3:6],
             misalignment=each[..., 6:],
-            wander=per_drone(sim, 0.0, 3),
-            filtered=None if self.bandwidth is None else per_drone(sim, 0.0, 3),
+            wander=drone_array(sim, 0.0, 3),
+            filtered=None if self.bandwidth is None else drone_array(sim, 0.0, 3),
             noise=vector("noise"),
             random_walk=vector("random_walk"),
             instability=vector("instability"),

@@ -12,7 +12,7 @@ from jax import Array, lax
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.pytree import PyTree, floating, leaf
+from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.rotation import safe_clip
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.piece_table import PieceTable
@@ -263,7 +263,7 @@ class Path(PyTree):
             index: Number of the path.
             start: Time at which the vehicle is at the start of the path, s.
         """
-        point, arc = jax.device_get(_point_at_time(self, np.int32(index), np.asarray(-start, floating())))
+        point, arc = jax.device_get(_point_at_time(self, np.int32(index), np.asarray(-start, float_dtype())))
         x, y = np.asarray(point.tangent, float) * (-1 if np.asarray(self.speeds)[index, 0] < 0 else 1)
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
@@ -342,7 +342,7 @@ def _of_curve(
     speeds = np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], SLOWEST * rate.max())
     end = progress[-1, 0] / speed if speed is not None else times[-1]
     arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, end)
-    coefficients, length, spacing, speeds, progress, duration = (np.asarray(x, floating())[None] for x in arrays)
+    coefficients, length, spacing, speeds, progress, duration = (np.asarray(x, float_dtype())[None] for x in arrays)
     return Path(coefficients, length, spacing, np.array([closed]), speeds, progress, duration)  # type: ignore[arg-type]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.path import Path
-from crazysim.pytree import floating
+from crazysim.pytree import float_dtype
 
 GAP = 1.0
 """Distance between neighbours that start in a row, m."""
@@ -65,7 +65,7 @@ def numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None 
         )
     if not np.all(np.isfinite(array)):
         raise ConfigError(f"expected {name} to be finite, got {value!r}. Use a time in seconds, such as 0.0.")
-    array = array.astype(floating() if n is None else np.int32)
+    array = array.astype(float_dtype() if n is None else np.int32)
     return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
 
 
