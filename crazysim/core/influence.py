@@ -1,4 +1,4 @@
-"""Calls of plugins within the integration, with checks of what they return."""
+"""Calls of plugins within the integration, with checks of their results."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ class Axes:
         return [stage.scope]
 
     def shapes_of_one(self, leaves: list[Array], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
-        """Return what a stage is given, for each leaf of all worlds: its shape and type for one drone or world."""
+        """Return the shape and type of each leaf as a stage receives it, for one drone or world."""
         return [self.shape_of_one(i, x, scope) for i, x in enumerate(leaves)]
 
     def shape_of_one(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:

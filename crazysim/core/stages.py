@@ -82,14 +82,14 @@ def force_torque_controller(data: SimData) -> SimData:
 
 @_built_in("drone")
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
-    """Keep commanded rotor speeds within what the motors can do; zero or less is off."""
+    """Limit commanded rotor speeds to the range of the motors; zero or less is off."""
     rotor_vel = first_principles.saturate(controls_of(data).rotor_vel, data.params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 
 @_built_in("drone")
 def clip_thrust_cmd(data: SimData) -> SimData:
-    """Keep the commanded collective thrust within what the rotors can give; zero or less is off."""
+    """Limit the commanded collective thrust to the range of the rotors; zero or less is off."""
     ctrl = data.controls.attitude
     ctrl = ctrl.replace(cmd=fitted.saturate(ctrl.cmd, data.params))
     return data.replace(controls=data.controls.replace(attitude=ctrl))

@@ -1,4 +1,4 @@
-"""The errors of planning: what the engine does not support, and where."""
+"""Errors of planning, for stages that the engine does not support."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Value
 
 Read = Callable[[str], str]
-"""From the number of a drone in its world to the expression of what it published."""
+"""From the number of a drone in its world to the expression of its published number."""
 
 Published = Sequence[tuple[str, str]]
 """Types of numbers, as they are called in the source, and their expressions."""
@@ -128,7 +128,7 @@ class Registers(OneLane):
 
 
 class SharedMemory(OneLane):
-    """Threads of one block of a GPU, which read what the others wrote to the block's memory."""
+    """Threads of one block of a GPU, which exchange numbers through the block's memory."""
 
     def __init__(self, lanes: int):
         """Exchange numbers between so many lanes."""

@@ -57,7 +57,7 @@ class Kernel:
 
 
 def interval(n_steps: int, size: int, memory: int) -> int:
-    """Return how many steps a gradient goes back at once: all, if there is memory for what each begins with.
+    """Return how many steps a gradient goes back at once: all, if there is memory for the state before each.
 
     Otherwise it is the square root of their number: intervals keep their first numbers too, and this takes the least
     memory.

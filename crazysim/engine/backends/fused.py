@@ -62,7 +62,7 @@ class Kernels:
         return compile_kernel(kernel.write(self.program, TARGETS[location.platform]), location)
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
-        """Return shapes and types of what the kernel writes: leaves, and flags of drones if it checks."""
+        """Return shapes and types of the outputs of the kernel: leaves, and flags of drones if it checks."""
         flags = [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check else []
         return [*(lanes.shape_of(self.program, i, n_worlds) for i in self.outputs), *flags]
 
@@ -80,7 +80,7 @@ def _launch(platform: str, count: Array, *inputs: Array, kernels: Kernels, n_wor
 launch_p = jaxcompat.primitive_by_platform(
     "crazysim_kernel", _results, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
 )
-"""Call of a kernel: number of steps and its inputs, to what it writes."""
+"""Call of a kernel: from the number of steps and its inputs to its outputs."""
 
 
 def unavailable_reason(platform: str) -> str | None:
@@ -256,7 +256,7 @@ def _split(program: Program, location: Location) -> CountedRun:
 
 
 def _call(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any], Array]:
-    """Return what a kernel writes: leaves, and the worlds that are flagged."""
+    """Return the outputs of a kernel: leaves, and the worlds that are flagged."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, leaves)
     inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]

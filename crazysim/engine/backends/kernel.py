@@ -165,7 +165,7 @@ class Body:
         return written, dict.fromkeys([*read, *written, *checked, *self.stored])
 
     def _hoisted(self, segment: Segment) -> list[str]:
-        """Write what a segment computes once, and return the names of the results."""
+        """Write the hoisted block of a segment, and return the names of the results."""
         writer, keep = self.writer, self.exchange.keep
         outs = writer.block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
         kinds = [type_name(x.dtype) for x in segment.hoisted.outputs]

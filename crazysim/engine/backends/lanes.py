@@ -136,7 +136,7 @@ Constants = dict[int, Sequence[Any]]
 
 
 def prepare(program: Program, values: LeafValues) -> Constants:
-    """Run what comes before the first step, and compute what no step changes."""
+    """Run the segments before the first step, and the hoisted blocks."""
     run(program, values, "before", {})
     return {
         k: values.execute(s.hoisted, [values.get(slot) for slot in s.hoisted_reads], values.shape)

@@ -89,7 +89,7 @@ class HostLaunch:
         self._name, self._aliases, self._kept = target(kernel), kernel.aliases(), kernel.kept
 
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        """Return what the kernel writes."""
+        """Return the outputs of the kernel."""
         if self._kept:
             lanes_of_vector = VECTOR_BYTES // 4
             count = np.append(

@@ -38,7 +38,7 @@ class ReverseProgram:
     back: dict[Segment, Segment]
     """Segments of the backward pass, by the forward segment."""
     back_hoisted: dict[Segment, Segment]
-    """The same for what is computed once before the steps."""
+    """The same for hoisted blocks."""
     carried: tuple[Slot, ...]
     """Numbers that a step begins with, and that steps change."""
     read_back: frozenset[Slot]
@@ -161,7 +161,7 @@ def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Seq
 
 
 def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:
-    """Return the segment that takes the cotangents of hoisted numbers to what they were computed from."""
+    """Return the segment that passes the cotangents of hoisted numbers to the inputs of the hoisted block."""
     reads = s.hoisted_reads
     wanted = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
               if slot in found and x.dtype.kind == "f"]  # fmt: skip
@@ -296,7 +296,7 @@ def _write_back(
     names: dict[Slot, str],
     depth: int,
 ) -> None:
-    """Write what goes back through the segments of a phase, after what they compute ahead once more.
+    """Write the backward pass through the segments of a phase, after computing them again.
 
     Args:
         body: Takes the lines.

@@ -21,7 +21,7 @@ from crazysim.engine.ir.blocks import Block, Element, Operation, Value, is_const
 
 TYPE_NAMES = {np.dtype(name): short for name, short in
          {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}.items()}  # fmt: skip
-"""Types of numbers, and what they are called in the source."""
+"""Types of numbers, and their names in the source."""
 
 
 def require_block_source(block: Block) -> None:
@@ -180,7 +180,7 @@ class Writer(LineWriter):
         self.line("}", depth)
 
     def _over_others(self, op: Operation, depth: int, live: Sequence[tuple[Value, str]]) -> None:
-        """Write a loop over the drones of the world, which reads what they published."""
+        """Write a loop over the drones of the world, which reads their published numbers."""
         (body,) = op.blocks
         published = [(type_name(x.dtype), self.element(x)) for x in op.args]
         reads = self.exchange.publish(self, published, live, depth)
@@ -299,7 +299,7 @@ def _same(a: Element, b: Element) -> bool:
 
 
 def type_name(dtype: DTypeLike) -> str:
-    """Return what a type is called in the source."""
+    """Return the name of a type in the source."""
     dtype = np.dtype(dtype)
     if dtype not in TYPE_NAMES:
         raise UnsupportedError(f"kernels have no numbers of type {dtype.name}")

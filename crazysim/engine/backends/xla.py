@@ -58,7 +58,7 @@ def _last_uses(block: Block) -> dict[Value, int]:
 
 
 def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int]) -> None:
-    """Compute once what is used beyond this point: XLA's CPU backend repeats shared arithmetic for every result."""
+    """Compute once all values that are used later: XLA's CPU backend repeats shared arithmetic for every result."""
     results = [x for op in block.operations[:position] for x in op.results]
     live = [x for x in results if last_use.get(x, -1) > position and not x.size and np.ndim(env[x])]
     env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))

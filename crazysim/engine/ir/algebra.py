@@ -77,7 +77,7 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
 
 
 def _without_zero_terms(name: str, args: tuple[Element, ...], dtype: np.dtype) -> Element | None:
-    """Return what is left of an operation when a zero of a shared parameter takes its term with it."""
+    """Return an operation without a term that a zero of a shared parameter multiplies."""
     zeros = [is_known_zero(x) for x in args]
     match name:
         case "mul" | "neg" | "convert_element_type":

@@ -249,7 +249,7 @@ def substitute(block: Block, new: Mapping[Value, Element]) -> Block:
 
 
 def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
-    """Add a block's operations to a builder once more, simplified by what is known there, and return its outputs.
+    """Add a block's operations to a builder, simplified by the constants known there, and return its outputs.
 
     Args:
         builder: Takes the operations.

@@ -1,4 +1,4 @@
-"""The table of operations: what each one means, and what it is called, in every target.
+"""The table of operations: meaning and name of each one in every target.
 
 A program has no operation that is not here. One row says which numbers an operation takes, how NumPy computes it (for
 constants and for the interpreter), what it is in XLA, in C++ and CUDA, and in CasADi, and what it costs. A target

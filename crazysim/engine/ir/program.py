@@ -1,4 +1,4 @@
-"""Programs: what the stages of a step do to the numbers of one drone or one world, ready for an engine.
+"""Programs: the stages of a step as operations on the numbers of one drone or one world.
 
 A program is immutable. Stages are lowered to one (``lower_stages``), and passes make another of it (``passes``,
 ``layout``). ``listing.list_program`` shows it.
@@ -149,7 +149,7 @@ class Program:
     check: Segment | None = None
     """Segment that flags a drone whose watched numbers are not finite, after the last step."""
     scratch: frozenset[int] = frozenset()
-    """Leaves that only carry numbers from one stage to another: what is written there is not kept."""
+    """Leaves that only carry numbers from one stage to another; their values are not kept."""
     packed: tuple[int, ...] = ()
     """Shared leaves that one further leaf holds one after the other."""
     population: str = "drone"

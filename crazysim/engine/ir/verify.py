@@ -15,7 +15,7 @@ class VerificationError(AssertionError):
 
 
 def verify(program: Program) -> Program:
-    """Return a program unchanged, or say what is wrong with it.
+    """Return a program unchanged, or raise an error that says what is wrong with it.
 
     Values are defined once, before they are used; operands and results have the types that the table says; inputs and
     outputs fit the numbers they are; no slot is read or written twice; nothing hoisted depends on a step.
@@ -36,7 +36,7 @@ def verify(program: Program) -> Program:
 
 
 def verify_block(block: Block) -> Block:
-    """Return a block unchanged, or say what is wrong with it."""
+    """Return a block unchanged, or raise an error that says what is wrong with it."""
     _verify_block(block, set())
     return block
 

@@ -145,7 +145,7 @@ class Lowering:
 
 
 class TableRows:
-    """A table in memory with any number of rows, of which a function reads whole ones (``table_row``)."""
+    """A table in memory with any number of rows, which a function reads by whole rows (``table_row``)."""
 
     def __init__(self, builder: Builder, aval: Any):
         """Add the table as an input of a block.

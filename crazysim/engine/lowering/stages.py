@@ -78,7 +78,7 @@ def lower_stages(
 def _before_the_steps(
     segments: Sequence[Segment | UnfusedStage], stages: Sequence[Stage], clock: Any
 ) -> list[Segment | UnfusedStage]:
-    """Return the segments of a step, of which leading ones that begin an episode run before the first step of a call.
+    """Return the segments of a step. Leading segments that begin an episode run before the first step of a call.
 
     An episode begins nowhere else as long as one stage alone writes the ``clock``, the leaf of step counts. What such
     a stage writes is fixed in the steps, so that what follows from it can be computed once.
@@ -169,7 +169,7 @@ def _table(lowering: Lowering, elements: Elements) -> Value:
 def _guarded(
     lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
 ) -> list[Elements]:
-    """Return what the written leaves become of a stage that acts where a mask is true.
+    """Return the written leaves after a stage that acts where a mask is true.
 
     Drones whose stages act at different steps still publish values for each other, so that such a stage is computed
     at every step, and selected.

@@ -64,7 +64,7 @@ def _tangent_of(leaf: Leaf) -> Leaf:
 
 
 def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int]) -> Segment:
-    """Return a segment with the tangents of what it writes."""
+    """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
     wanted = [k for k, slot in enumerate(reads) if slot in found and s.block.inputs[k].dtype.kind == "f"]
     wanted = [k for k in wanted if not s.block.inputs[k].size]

@@ -77,7 +77,7 @@ def _parts(block: Block) -> list[Block]:
 def _recompute(
     builder: Builder, part: Block, number: int, values: dict[Value, Element], on_path: set[Value]
 ) -> dict[Value, Element]:
-    """Compute a part of a block once more from what it uses, and return the elements that its values are then.
+    """Compute a part of a block again from the values that it uses, and return the new elements by value.
 
     Otherwise all that is computed on the way ahead would take registers until the way back needs it. Reductions over
     other drones and loops are not computed again.

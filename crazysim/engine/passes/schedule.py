@@ -125,7 +125,7 @@ def _separate_block(block: Block) -> Block:
 
 
 def hoist(program: Program) -> Program:
-    """Move what no step changes, and is expensive, out of the loop over steps.
+    """Move expensive values that no step changes out of the loop over steps.
 
     A division by such a number becomes a product with its inverse, which is one rounding less exact.
     """

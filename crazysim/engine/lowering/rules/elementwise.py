@@ -179,7 +179,7 @@ def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
 
 @rule("reduce_precision")
 def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Round the mantissa to nearest even; what the exponent cannot hold becomes infinite, or a zero with its sign."""
+    """Round the mantissa to nearest even; overflow gives infinity, underflow a signed zero."""
     dtype, exponent, mantissa = eqn.outvars[0].aval.dtype, eqn.params["exponent_bits"], eqn.params["mantissa_bits"]
     if dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {dtype.name}")

@@ -248,7 +248,7 @@ def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
 
 
 def _combined(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elements:
-    """Return what a scatter writes where ``old`` was: ``new``, their sum and the like, or a function of ``old``."""
+    """Return the numbers that a scatter writes over ``old``: ``new``, their sum and the like, or a function of both."""
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new
