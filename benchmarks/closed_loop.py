@@ -13,7 +13,7 @@ import argparse
 import json
 from pathlib import Path
 
-from crazysim.lab.validate.closed_loop import compare, laboratory, read_flight
+from crazysim.lab.validate.closed_loop import compare, laboratory_estimator, read_flight
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
         raise SystemExit(
             f"expected .npz files with {' or '.join(args.names)} in their names in {args.folder}, got none"
         )
-    estimator = None if args.truth else laboratory(args.quat_deviation)
+    estimator = None if args.truth else laboratory_estimator(args.quat_deviation)
     for row in compare([read_flight(path) for path in paths], args.drone, estimator):
         numbers = {
             "logged_m": round(row.logged, 3),

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError, not_installed
-from crazysim.lab.identify.columns import Columns, plausible
-from crazysim.lab.identify.readers import Stream, at_equal_times
+from crazysim.lab.identify.columns import Columns, without_huge_numbers
+from crazysim.lab.identify.readers import Stream, resample
 from crazysim.storage import read_text
 
 XYZ, XYZW = "xyz", "xyzw"
@@ -103,7 +103,7 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
             streams[topic] = _stream(path.name, bag, topic, topics[topic], fields)
     if not names:
         streams = {topic: _turned(stream) for topic, stream in streams.items()}
-    return at_equal_times(path.name, streams, repairs, wanted if names else None)
+    return resample(path.name, streams, repairs, wanted if names else None)
 
 
 def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
@@ -176,7 +176,7 @@ def _stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) 
         raise ConfigError(f"{name}: expected messages of {topic}, got none. Record it while the drone flies.")
     columns: dict[str, NDArray] = {}
     for column, values in zip(fields, zip(*rows, strict=True), strict=True):
-        x = plausible(np.array(values, np.float64))
+        x = without_huge_numbers(np.array(values, np.float64))
         if column == "rpm":
             columns |= {f"rpm{k + 1}": np.abs(c) / RPM_TO_RAD_S for k, c in enumerate(x.T)}
         elif x.ndim == 1:

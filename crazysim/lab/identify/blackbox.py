@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.identify.columns import plausible
-from crazysim.lab.identify.delimited import number, rows_of
-from crazysim.lab.identify.readers import decimated
+from crazysim.lab.identify.columns import without_huge_numbers
+from crazysim.lab.identify.delimited import parse_number, split_rows
+from crazysim.lab.identify.readers import decimate
 
 POLES = 14
 """Magnetic poles of the motors where the file does not state ``motor_poles``: Betaflight's default."""
@@ -79,14 +79,14 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         )
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = [*file][start + 1 :]
-    cells = rows_of(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
+    cells = split_rows(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
     at = [keys.index(key) for key in wanted]
-    rows = [[number(row[k]) for k in at] for row in cells]
-    data = dict(zip(wanted, plausible(np.array(rows)).T, strict=True))
+    rows = [[parse_number(row[k]) for k in at] for row in cells]
+    data = dict(zip(wanted, without_huge_numbers(np.array(rows)).T, strict=True))
 
-    high = 10.0 if number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
+    high = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
     per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)
-    poles = number(settings.get("motor_poles", str(POLES)))
+    poles = parse_number(settings.get("motor_poles", str(POLES)))
     if not 2 <= poles < math.inf:
         raise ConfigError(f"{path.name}: expected motor_poles of at least 2, got {poles:g}. Correct it in the file.")
     table = {"t": data["time"] * {"s": 1.0, "ms": 1e-3}.get(unit["time"], 1e-6)}
@@ -100,4 +100,4 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         vector = np.stack([data[f"imuQuaternion[{k}]"] for k in range(3)]) / 32767
         scalar = np.sqrt(np.clip(1 - np.sum(vector**2, axis=0), 0, 1))
         table |= dict(zip(("qx", "qy", "qz", "qw"), [*vector, scalar], strict=True))
-    return decimated(table, repairs)
+    return decimate(table, repairs)

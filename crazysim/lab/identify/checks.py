@@ -25,14 +25,14 @@ RATIOS = (0.5, 2.0)
 benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
 """Units of positions, and with /s of velocities, in m."""
-DIVERGED = 10.0
+DIVERGED_ERROR = 10.0
 """Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
-TURNING = 0.01
+MIN_TURN_RATE = 0.01
 """Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
 (BMI088, 0.014 degrees/s over the root of Hz) gives 0.003 rad/s at 250 Hz."""
-STILL = 0.3
+MIN_SPAN = 0.3
 """Span of the position below which a fault is that of a drone at rest, whose estimator drifts, m."""
-PIECE = 2.0
+PIECE_DURATION = 2.0
 """Duration of the pieces that are left out where a rate has diverged, s."""
 
 
@@ -91,7 +91,7 @@ def check_motion(
     """
     keep = np.ones(len(t), bool)
     for pair, width in _rates(t, data, derived):
-        bad = _diverged(pair, round(PIECE / float(np.median(np.diff(t)))))
+        bad = _diverged_windows(pair, round(PIECE_DURATION / float(np.median(np.diff(t)))))
         if 0 < np.sum(bad) <= len(bad) / 2:
             keep[np.flatnonzero(bad)[:, None] + np.arange(width + 1)] = False
             repairs.append(f"dropped {np.sum(~keep)} samples without {pair.what}, which the others have")
@@ -102,10 +102,10 @@ def check_motion(
         return keep
     fault = laws[broken[0]].fault
     span = float(np.max(np.ptp(data["pos"], axis=0)))
-    if span < STILL:
+    if span < MIN_SPAN:
         raise ConfigError(
             f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
-            f"{STILL:g} m or more, or give metres_per_unit."
+            f"{MIN_SPAN:g} m or more, or give metres_per_unit."
         )
     remedy, least = "", len(broken)
     for words, changed in _alternatives(data, derived):
@@ -132,7 +132,7 @@ def check_turning(logs: Sequence[Log]) -> None:
         ConfigError: If none does.
     """
     rates = np.max([np.std(log.ang_vel[:, :2], axis=0) for log in logs], axis=0, initial=0.0)
-    if np.any(rates < TURNING):
+    if np.any(rates < MIN_TURN_RATE):
         raise ConfigError(
             f"expected a flight that turns about x and y, got body rates whose standard deviations are "
             f"{rates[0]:.2g} and {rates[1]:.2g} rad/s. Take a log of a flight with changes of direction."
@@ -207,13 +207,13 @@ def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[N
     return width, [(x[width:] - x[:-width]) * whole[:, None] for x in series]
 
 
-def _diverged(pair: Pair, size: int) -> NDArray:
+def _diverged_windows(pair: Pair, size: int) -> NDArray:
     """Return True for the windows of pieces in which the error exceeds ten times the motion. (n,)"""
     motion, error = (np.linalg.norm(x, axis=-1) for x in (pair.measured, pair.expected - pair.measured))
     typical, bad = max(float(np.median(motion)), pair.floor / 2), np.zeros(len(motion), bool)
     for k in range(0, len(motion), size):
         part = slice(k, k + size)
-        bad[part] = np.median(error[part]) > DIVERGED * max(typical, float(np.median(motion[part])))
+        bad[part] = np.median(error[part]) > DIVERGED_ERROR * max(typical, float(np.median(motion[part])))
     return bad
 
 

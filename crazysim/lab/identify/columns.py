@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 
-COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
+NAME_COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
 """Numbers of names of a field, the last of them if it is not left out."""
-ORDERS = {
+NAME_ORDERS = {
     "quat": "x, y, z, w, in this order",
     "rpy": "roll, pitch and yaw",
     "attitude_command": "roll, pitch, yaw and thrust",
@@ -70,10 +70,10 @@ class Columns:
 
     def __post_init__(self) -> None:
         """Check the numbers of names, and the factors."""
-        for key, counts in COUNTS.items():
+        for key, counts in NAME_COUNTS.items():
             names = getattr(self, key)
             if isinstance(names, str) or len(names) not in counts:
-                got, order = repr(names) if isinstance(names, str) else len(names), ORDERS.get(key, "x, y, z")
+                got, order = repr(names) if isinstance(names, str) else len(names), NAME_ORDERS.get(key, "x, y, z")
                 raise ConfigError(f"expected {counts[-1]} names of columns as {key}, got {got}. Give {order}.")
         for key, x in vars(self).items():
             if "_per_" in key and not (isinstance(x, Real) and math.isfinite(x) and x != 0):
@@ -83,7 +83,10 @@ class Columns:
     def names(self) -> list[str]:
         """Names of all columns but the time, without signs."""
         attitude = self.rpy or self.quat
-        return [plain(x) for x in (*self.pos, *attitude, *(x for key in OPTIONAL for x in getattr(self, key)))]
+        return [
+            unsigned_name(x)
+            for x in (*self.pos, *attitude, *(x for key in OPTIONAL_FIELDS for x in getattr(self, key)))
+        ]
 
 
 IDSIA = Columns(
@@ -94,7 +97,7 @@ IDSIA = Columns(
     rpm_per_unit=1 / 6,
 )
 """Columns of IDSIA's benchmark (arXiv 2512.14450), with motors of six pole pairs."""
-KNOWN = {
+KNOWN_COLUMNS = {
     "crazysim": Columns(),
     "idsia": IDSIA,
     "idsia_csv": replace(IDSIA, pos=("x_poses", "y_poses", "z_poses")),
@@ -109,29 +112,29 @@ KNOWN = {
 }
 """Columns of known logs: the default names, IDSIA's benchmark, also as its repository's ``.csv`` files name them, and
 NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
-LARGEST = 1e20
+MAX_NUMBER = 1e20
 """Largest number of a log; times in ns since 1970 are 2e18."""
-OPTIONAL = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
+OPTIONAL_FIELDS = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
 """Fields whose columns a log may lack."""
 
 
-def plain(name: str) -> str:
+def unsigned_name(name: str) -> str:
     """Return the name of a column without its sign."""
     return name.removeprefix("-")
 
 
-def stacked(name: str, table: Mapping[str, NDArray], names: Sequence[str], factor: float = 1.0) -> NDArray:
+def stack_columns(name: str, table: Mapping[str, NDArray], names: Sequence[str], factor: float = 1.0) -> NDArray:
     """Return columns side by side, with their signs, times a factor. (n, len(names))
 
     Raises:
         ConfigError: If columns are missing, are not numbers, or differ in length.
     """
-    if absent := [plain(x) for x in names if plain(x) not in table]:
+    if absent := [unsigned_name(x) for x in names if unsigned_name(x) not in table]:
         raise ConfigError(
             f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them in a Columns."
         )
-    columns = [_numbers(name, plain(x), table[plain(x)]) for x in names]
-    lengths = {plain(x): len(c) for x, c in zip(names, columns, strict=True)}
+    columns = [_numbers(name, unsigned_name(x), table[unsigned_name(x)]) for x in names]
+    lengths = {unsigned_name(x): len(c) for x, c in zip(names, columns, strict=True)}
     if len(set(lengths.values())) > 1:
         raise ConfigError(
             f"{name}: expected columns of equal length, got "
@@ -150,27 +153,27 @@ def _numbers(name: str, key: str, values: NDArray) -> NDArray:
             f"{name}: expected one number a sample in column {key}, got {got}. "
             "Convert it to numbers, or name another column."
         )
-    return plausible(x)
+    return without_huge_numbers(x)
 
 
-def plausible(x: NDArray) -> NDArray:
-    """Return numbers as float64, NaN in place of those above ``LARGEST``, whose squares and products would overflow."""
+def without_huge_numbers(x: NDArray) -> NDArray:
+    """Return numbers as float64, NaN in place of any above ``MAX_NUMBER``, whose squares and products would overflow."""
     with np.errstate(invalid="ignore"):  # bytes of a damaged log may be a signalling NaN
         x = x.astype(np.float64)
-    return np.where(np.abs(x) <= LARGEST, x, np.nan)
+    return np.where(np.abs(x) <= MAX_NUMBER, x, np.nan)
 
 
-def missing(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
+def missing_columns(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
     """Return the columns that a log lacks; those of default names are optional as a whole."""
     names = [columns.time, *columns.pos, *(columns.rpy or columns.quat)]
-    for key in OPTIONAL:
+    for key in OPTIONAL_FIELDS:
         given = getattr(columns, key)
-        if given != getattr(KNOWN["crazysim"], key) or any(plain(x) in table for x in given):
+        if given != getattr(KNOWN_COLUMNS["crazysim"], key) or any(unsigned_name(x) in table for x in given):
             names += given
-    return [plain(x) for x in names if plain(x) not in table]
+    return [unsigned_name(x) for x in names if unsigned_name(x) not in table]
 
 
-def numbered(table: Mapping[str, NDArray], columns: Columns) -> Columns:
+def with_rotor_count(table: Mapping[str, NDArray], columns: Columns) -> Columns:
     """Return the columns with as many rotors as a log has, such as ``rpm1`` to ``rpm6``, where their names are default.
 
     Logs of fewer rotors than four are left to the check for missing columns.
@@ -178,7 +181,7 @@ def numbered(table: Mapping[str, NDArray], columns: Columns) -> Columns:
     found = {}
     for key in ("rotor_vel", "command"):
         names = getattr(columns, key)
-        if names == getattr(KNOWN["crazysim"], key):
+        if names == getattr(KNOWN_COLUMNS["crazysim"], key):
             stem, n = names[0][:-1], len(names)
             while f"{stem}{n + 1}" in table:
                 n += 1

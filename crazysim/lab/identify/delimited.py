@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.identify.repairs import REPAIRABLE
+from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 
 MAX_COLUMNS = 10_000
 """Most columns of a file."""
@@ -41,18 +41,18 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
             f"{path.name}: expected names of columns in the first line, with commas between them, got {got}. "
             "Export the log with commas, decimal points and a header."
         )
-    if not any(math.isnan(number(x)) for x in names):
+    if not any(math.isnan(parse_number(x)) for x in names):
         raise ConfigError(
             f"{path.name}: expected names of columns in the first line, got numbers: {header.strip()[:40]}. "
             "Add a first line such as t,x,y,z,qx,qy,qz,qw."
         )
     if twice := sorted(x for x, n in Counter(names).items() if n > 1):
         raise ConfigError(f"{path.name}: expected columns of different names, got {twice[0][:60]!r} twice. Rename one.")
-    rows = rows_of(path.name, lines, len(names), 2, repairs, "Export the log again.")
+    rows = split_rows(path.name, lines, len(names), 2, repairs, "Export the log again.")
     return {key: _column(cells) for key, cells in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def rows_of(
+def split_rows(
     name: str, lines: Iterable[str], width: int, first: int, repairs: list[str], remedy: str
 ) -> list[list[str]]:
     """Return the cells of the rows that have as many as the header; a few others are dropped.
@@ -75,7 +75,7 @@ def rows_of(
             rows.append(cells)
         elif line.strip():
             damaged.append(f"{len(cells)} in line {at}")
-    if len(damaged) > REPAIRABLE * (len(rows) + len(damaged)) or not rows:
+    if len(damaged) > MAX_REPAIRED_SHARE * (len(rows) + len(damaged)) or not rows:
         raise ConfigError(
             f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and {len(damaged)} "
             f"others{f', the first with {damaged[0]}' if damaged else ''}. {remedy}"
@@ -85,7 +85,7 @@ def rows_of(
     return rows
 
 
-def number(text: str) -> float:
+def parse_number(text: str) -> float:
     """Return the number in a cell, NaN if it has none."""
     try:
         return float(text.strip().strip('"'))
@@ -98,7 +98,7 @@ def _column(cells: Sequence[str]) -> NDArray:
     try:
         return np.array(cells, np.float64)
     except ValueError:
-        values = np.array([number(x) for x in cells])
+        values = np.array([parse_number(x) for x in cells])
         return (
             values if 2 * np.sum(np.isfinite(values)) > len(values) else np.array([x.strip()[:MAX_TEXT] for x in cells])
         )

@@ -22,19 +22,27 @@ from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.motion import integral
 from crazysim.lab.identify.motors import motor_lag, with_speeds
 from crazysim.lab.identify.prediction import Model, windows
-from crazysim.lab.identify.rotation import BLOCK, FEWEST, SAMPLING, aligned, enlarged, fast_rotation, median
+from crazysim.lab.identify.rotation import (
+    BLOCK_DURATION,
+    MIN_BLOCKS,
+    SAMPLING_ERROR,
+    aligned,
+    deviation_factor,
+    fast_rotation,
+    weighted_median,
+)
 from crazysim.plugins.effects.residual import N_INPUTS, ResidualData
 from crazysim.rotation import rotate, rotate_inverse
 
-DURATION = 0.5
+WINDOW_DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
 SLOW_CORNER = 0.2
 """Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
 samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples, whose cause is unknown."""
-LARGEST = 10.0
+MAX_FACTOR = 10.0
 """Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
 checked, a thrust factor stays below 2.5 squared times that of the mass."""
-LEAST = {"rotor inertia": 0.0}
+MIN_FACTORS = {"rotor inertia": 0.0}
 """Factors that may be smaller: flights that hardly yaw do not show the inertia of the rotors."""
 
 
@@ -81,7 +89,7 @@ class Identification:
         for key in ("linear", "hidden", "output"):
             if (x := getattr(residual, key)) is not None:
                 changes[f"residual.{key}"] = np.asarray(x, np.float64)
-        airframe = load_airframe(_nested(self.base, self.airframe.name.removesuffix("_identified"), changes))
+        airframe = load_airframe(_nested_tables(self.base, self.airframe.name.removesuffix("_identified"), changes))
         return replace(self, airframe=airframe, model=Model.create(airframe), changes=changes)
 
     def describe(self) -> list[str]:
@@ -146,7 +154,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}")
     logs = [with_speeds(log, base) for log in logs]
     _check(logs, base)
-    windows(logs, DURATION, DURATION)
+    windows(logs, WINDOW_DURATION, WINDOW_DURATION)
     check_turning(logs)
     if base.n_rotors <= 4:
         _check_order(logs, base)
@@ -155,7 +163,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     fast = fast_rotation(logs, params, float(_forces(logs, params)[0][0]))
     logs = [aligned(log, delay) for log, delay in zip(logs, fast.delays, strict=True)]
     force, force_spread = _forces(logs, params)
-    force_spread[0] = math.hypot(force_spread[0], SAMPLING * force[0])
+    force_spread[0] = math.hypot(force_spread[0], SAMPLING_ERROR * force[0])
     torque, torque_spread = _torques(logs, params, float(force[0]), fast.values)
     late = [aligned(log, SLOW_CORNER * log.dt) for log in logs]
     torque_spread = np.hypot(torque_spread, _torques(late, params, float(force[0]), fast.values)[0] - torque)
@@ -171,21 +179,23 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     values = named(force, torque, fast.values)
     deviations = named(force_spread, torque_spread, fast.deviations)
     if wrong := [
-        f"{name} {values[name]:.3g}" for name in FACTORS if not LEAST.get(name, 1 / LARGEST) <= values[name] <= LARGEST
+        f"{name} {values[name]:.3g}"
+        for name in FACTORS
+        if not MIN_FACTORS.get(name, 1 / MAX_FACTOR) <= values[name] <= MAX_FACTOR
     ]:
         raise ConfigError(
-            f"expected factors from {1 / LARGEST:g} to {LARGEST:g}, got {', '.join(wrong)}, which no body that flies "
-            f"like {base.name!r} explains. Check its mass and the logs, add flights that turn and climb more, or start "
-            "from an airframe file nearer to the drone (--airframe)."
+            f"expected factors from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}, got {', '.join(wrong)}, which no body "
+            f"that flies like {base.name!r} explains. Check its mass and the logs, add flights that turn and climb "
+            "more, or start from an airframe file nearer to the drone (--airframe)."
         )
     changes = _changes(base, weight, values)
     rates = motor_lag(logs)
     if 2 * np.sum(np.isfinite(rates)) > rates.size:
         rates = rates[np.isfinite(rates)]
-        values["motor lag"], deviations["motor lag"] = median(rates, np.ones(len(rates)))
+        values["motor lag"], deviations["motor lag"] = weighted_median(rates, np.ones(len(rates)))
         changes["rotors.lag"] = np.array([values["motor lag"], 0.0, values["motor lag"], 0.0])
     try:
-        identified = load_airframe(_nested(str(airframe), base.name, changes))
+        identified = load_airframe(_nested_tables(str(airframe), base.name, changes))
     except ConfigError as error:
         raise ConfigError(f"the fit is no airframe: {error} Add flights that turn and climb more.") from error
     return Identification(
@@ -212,7 +222,7 @@ def _forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArr
         world = np.stack([np.asarray(rotate(jnp.asarray(log.quat), jnp.asarray(x))) for x in body], axis=-1)
         return world, mass * (log.vel - gravity * log.t[:, None])
 
-    return _regressed(logs, terms, np.arange(7) > 0)
+    return _regression(logs, terms, np.arange(7) > 0)
 
 
 def _torques(
@@ -239,7 +249,7 @@ def _torques(
         columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
         return np.stack(columns, axis=-1), momentum - known
 
-    return _regressed(logs, terms, np.zeros(len(TORQUES), bool))
+    return _regression(logs, terms, np.zeros(len(TORQUES), bool))
 
 
 def _body(log: Log, vector: NDArray) -> NDArray:
@@ -247,7 +257,7 @@ def _body(log: Log, vector: NDArray) -> NDArray:
     return np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(vector)), np.float64)
 
 
-def _regressed(
+def _regression(
     logs: Sequence[Log], terms: Callable[[Log], tuple[NDArray, NDArray]], not_positive: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return coefficients by robust linear least squares, and their deviations from the scatter between blocks.
@@ -260,12 +270,12 @@ def _regressed(
     rates, changes, blocks = [], [], []
     for number, log in enumerate(logs):
         x, momentum = terms(log)
-        total, size = integral(x, log.t), round(DURATION / log.dt)
+        total, size = integral(x, log.t), round(WINDOW_DURATION / log.dt)
         starts = np.arange(0, len(log.t) - size, max(1, size // 5))
         starts = starts[[not np.any((log.gaps > k) & (log.gaps <= k + size)) for k in starts]]
         rates.append(total[starts + size] - total[starts])
         changes.append(momentum[starts + size] - momentum[starts])
-        blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK)
+        blocks.append(1000 * number + (log.t[starts] - log.t[0]) // BLOCK_DURATION)
     x, y, block = np.concatenate(rates), np.concatenate(changes), np.concatenate(blocks)
     k = x.shape[-1]
     weights = np.ones(y.shape)
@@ -286,7 +296,7 @@ def _regressed(
         weights = 1 / np.maximum(scale, np.abs(rest) / 2) / np.maximum(scale, 1e-30)
     # Deviations by leaving each block out (jackknife), without bounds, which hide what other coefficients may be.
     numbers = np.unique(block)
-    if len(numbers) < FEWEST:
+    if len(numbers) < MIN_BLOCKS:
         return found, np.full(k, np.nan)
     without = []
     for b in numbers:
@@ -296,7 +306,7 @@ def _regressed(
         without.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
     each = np.array(without) - np.mean(without, axis=0)
     n = len(numbers)
-    return found, enlarged(n) * np.sqrt((n - 1) / n * np.sum(each**2, axis=0))
+    return found, deviation_factor(n) * np.sqrt((n - 1) / n * np.sum(each**2, axis=0))
 
 
 def _smooth(x: NDArray, size: int = 9) -> NDArray:
@@ -394,7 +404,7 @@ def _changes(base: Airframe, mass: float, values: dict[str, float]) -> dict[str,
     return changes
 
 
-def _nested(base: str, name: str, changes: dict[str, NDArray]) -> dict:
+def _nested_tables(base: str, name: str, changes: dict[str, NDArray]) -> dict:
     """Return the tables of an airframe with a base and changes."""
     tables: dict = {"name": f"{name}_identified", "base": base}
     for path, value in changes.items():

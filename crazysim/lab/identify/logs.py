@@ -13,8 +13,23 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import motion as capture
 from crazysim.lab.identify.checks import check_motion
-from crazysim.lab.identify.columns import KNOWN, OPTIONAL, Columns, missing, numbered, plain, stacked
-from crazysim.lab.identify.repairs import SHORTEST, airborne, bridged, gaps_of, increasing, without_spikes
+from crazysim.lab.identify.columns import (
+    KNOWN_COLUMNS,
+    OPTIONAL_FIELDS,
+    Columns,
+    missing_columns,
+    stack_columns,
+    unsigned_name,
+    with_rotor_count,
+)
+from crazysim.lab.identify.repairs import (
+    MIN_SAMPLES,
+    airborne_samples,
+    find_gaps,
+    increasing_samples,
+    interpolate_missing,
+    remove_spikes,
+)
 from crazysim.lab.identify.tables import read_table
 
 
@@ -69,7 +84,7 @@ def read_log(
 
     Args:
         path: File, or columns by name.
-        columns: Names of the columns, or a key of ``KNOWN``; by default the first of ``KNOWN`` that the log has.
+        columns: Names of the columns, or a key of ``KNOWN_COLUMNS``; by default the first of these that the log has.
         motion: Motion capture of the same flight, whose columns are added to those of the log. Its clock may be another
             one: it is moved to where the angular velocities agree.
         between: Start and end of the part that is read, s after the first sample.
@@ -79,20 +94,22 @@ def read_log(
     """
     repairs: list[str] = []
     if isinstance(columns, str):
-        if columns not in KNOWN:
+        if columns not in KNOWN_COLUMNS:
             raise ConfigError(
-                f"expected columns as one of {', '.join(KNOWN)} or a Columns, got {columns!r}. "
+                f"expected columns as one of {', '.join(KNOWN_COLUMNS)} or a Columns, got {columns!r}. "
                 "Name the columns in a Columns."
             )
-        columns = KNOWN[columns]
+        columns = KNOWN_COLUMNS[columns]
     name, table = read_table(path, repairs, columns)
     if motion is not None:
         _, other = read_table(motion, repairs, columns)
-        table = capture.joined(name, table, other, columns or KNOWN["crazysim"], repairs)
+        table = capture.join_motion_capture(name, table, other, columns or KNOWN_COLUMNS["crazysim"], repairs)
     if columns is None:
-        columns = next((c for c in reversed(KNOWN.values()) if not missing(table, c)), KNOWN["crazysim"])
-    columns = numbered(table, columns)
-    if absent := missing(table, columns):
+        columns = next(
+            (c for c in reversed(KNOWN_COLUMNS.values()) if not missing_columns(table, c)), KNOWN_COLUMNS["crazysim"]
+        )
+    columns = with_rotor_count(table, columns)
+    if absent := missing_columns(table, columns):
         slow = "".join(f", and {x}" for x in repairs if x.startswith("left out a slow stream"))
         raise ConfigError(
             f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}{slow}. Name them, as in "
@@ -106,31 +123,31 @@ def read_log(
         "command": columns.share_per_command,
     }
     data = {}
-    for key in ("pos", "quat", *OPTIONAL):
+    for key in ("pos", "quat", *OPTIONAL_FIELDS):
         names = getattr(columns, key)
-        if names and plain(names[0]) in table:
+        if names and unsigned_name(names[0]) in table:
             # With the time, whose length all columns must have.
-            data[key] = stacked(name, table, (columns.time, *names))[:, 1:] * factors.get(key, 1.0)
+            data[key] = stack_columns(name, table, (columns.time, *names))[:, 1:] * factors.get(key, 1.0)
     if "attitude_command" in data:
         data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]
-    t = stacked(name, table, [columns.time])[:, 0]
-    keep = increasing(name, t, repairs)
+    t = stack_columns(name, table, [columns.time])[:, 0]
+    keep = increasing_samples(name, t, repairs)
     since = t - t[keep][0]
     keep &= (since >= between[0]) & (since <= between[1])
-    if np.sum(keep) < SHORTEST:
+    if np.sum(keep) < MIN_SAMPLES:
         raise ConfigError(
-            f"{name}: expected at least {SHORTEST} samples between {between[0]:g} and {between[1]:g} s, got "
+            f"{name}: expected at least {MIN_SAMPLES} samples between {between[0]:g} and {between[1]:g} s, got "
             f"{np.sum(keep)} of a log of {since[np.isfinite(since)].max():.3g} s. Give other times."
         )
-    t, data = bridged(name, t[keep], {key: x[keep] for key, x in data.items()}, repairs)
+    t, data = interpolate_missing(name, t[keep], {key: x[keep] for key, x in data.items()}, repairs)
     thrust = np.sum(data["rotor_vel"] ** 2, axis=1) if "rotor_vel" in data else None
     if thrust is None and "attitude_command" in data:
         thrust = data["attitude_command"][:, 3]
     if thrust is not None:
-        keep = airborne(name, t, thrust, repairs)
+        keep = airborne_samples(name, t, thrust, repairs)
         t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if "rotor_vel" in data:
-        data["rotor_vel"] = without_spikes(name, data["rotor_vel"], repairs)
+        data["rotor_vel"] = remove_spikes(name, data["rotor_vel"], repairs)
     else:
         data["rotor_vel"] = np.zeros((len(t), 0))
     derived = tuple(key for key in ("vel", "ang_vel") if key not in data)
@@ -144,5 +161,5 @@ def read_log(
     t, data = t[keep], {key: x[keep] for key, x in data.items()}
     if "voltage" in data:
         data["voltage"] = data["voltage"][:, 0]
-    gaps = gaps_of(name, t, repairs)
+    gaps = find_gaps(name, t, repairs)
     return Log(name, t, **data, gaps=gaps, repairs=tuple(repairs), modelled=False)

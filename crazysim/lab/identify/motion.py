@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.identify.columns import Columns, plain, stacked
-from crazysim.lab.identify.readers import Stream, at_equal_times
+from crazysim.lab.identify.columns import Columns, stack_columns, unsigned_name
+from crazysim.lab.identify.readers import Stream, resample
 
-STEP = 0.005
+LAG_STEP = 0.005
 """Interval at which angular velocities are compared, s."""
 MAX_SPAN = 100
 """Longest duration, in steps for each sample."""
-DERIVED_OVER = 0.06
+DERIVATIVE_DURATION = 0.06
 """Duration over which positions and attitudes are differentiated, s."""
 
 
-def joined(
+def join_motion_capture(
     name: str,
     table: Mapping[str, NDArray],
     motion: Mapping[str, NDArray],
@@ -40,8 +40,8 @@ def joined(
     Raises:
         ConfigError: If both do not move alike.
     """
-    time, quat = columns.time, [plain(x) for x in columns.quat]
-    ang_vel = stacked(name, table, columns.ang_vel, columns.rad_per_unit)
+    time, quat = columns.time, [unsigned_name(x) for x in columns.quat]
+    ang_vel = stack_columns(name, table, columns.ang_vel, columns.rad_per_unit)
     missing = [c for c in (time, *quat) if c not in motion]
     if missing:
         raise ConfigError(
@@ -49,19 +49,19 @@ def joined(
             "Give the names as time= and quat=."
         )
     t, other = (np.asarray(x[time], np.float64) for x in (table, motion))
-    turned = body_rates(other, stacked(name, motion, columns.quat))
-    size = round(DERIVED_OVER / STEP)
+    turned = body_rates(other, stack_columns(name, motion, columns.quat))
+    size = round(DERIVATIVE_DURATION / LAG_STEP)
     series = []
     for at, rates in ((t, ang_vel), ((other[1:] + other[:-1]) / 2, turned)):
         good = np.isfinite(at) & np.all(np.isfinite(rates), axis=-1)
         order = np.unique(at[good], return_index=True)[1]
         span = np.ptp(at[good]) if len(order) > 1 else 0.0
-        if not 0 < span < MAX_SPAN * STEP * len(order):
+        if not 0 < span < MAX_SPAN * LAG_STEP * len(order):
             raise ConfigError(
                 f"{name}: expected samples of one flight, got {len(order)} with times and angular velocities, over "
                 f"{span:.3g} s. Cut the log and its motion capture to the flight."
             )
-        grid = np.arange(at[good].min(), at[good].max(), STEP)
+        grid = np.arange(at[good].min(), at[good].max(), LAG_STEP)
         speed = np.interp(grid, at[good][order], np.linalg.norm(rates[good][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(size) / size, "same")))
     (first, a), (second, b) = series
@@ -71,13 +71,13 @@ def joined(
             f"{name}: expected motion capture of the same flight, got angular velocities that agree by "
             f"{agreement:.2f} of 1 at best. Check that both files are of one flight, that it turns, and quat=."
         )
-    shift = first - second + lag * STEP
+    shift = first - second + lag * LAG_STEP
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
     streams = {
         "the log": Stream(t, _numbers(table, len(t), (time,))),
         "motion capture": Stream(other + shift, _numbers(motion, len(other), (time, *table))),
     }
-    both = at_equal_times(name, streams, repairs, columns)
+    both = resample(name, streams, repairs, columns)
     return both | {time: both.pop("t")}
 
 
@@ -117,8 +117,8 @@ def body_rates(t: NDArray, quat: NDArray) -> NDArray:
 
 
 def velocity_of(t: NDArray, pos: NDArray) -> NDArray:
-    """Return the velocity that follows from positions: lines through ``DERIVED_OVER``, m/s. (n, 3)"""
-    half = max(1, round(DERIVED_OVER / float(np.median(np.diff(t))) / 2))
+    """Return the velocity that follows from positions: lines through ``DERIVATIVE_DURATION``, m/s. (n, 3)"""
+    half = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 2))
     padded = np.concatenate([2 * pos[:1] - pos[half:0:-1], pos, 2 * pos[-1:] - pos[-2 : -half - 2 : -1]])
     times = np.concatenate([2 * t[:1] - t[half:0:-1], t, 2 * t[-1:] - t[-2 : -half - 2 : -1]])
     weights = np.arange(-half, half + 1)[::-1].astype(float)
@@ -127,10 +127,10 @@ def velocity_of(t: NDArray, pos: NDArray) -> NDArray:
 
 
 def ang_vel_of(t: NDArray, quat: NDArray) -> NDArray:
-    """Return the angular velocity that follows from attitudes, means over ``DERIVED_OVER``, rad/s. (n, 3)"""
+    """Return the angular velocity that follows from attitudes, means over ``DERIVATIVE_DURATION``, rad/s. (n, 3)"""
     rates = body_rates(t, quat)
     rates = np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
-    half = max(1, round(DERIVED_OVER / float(np.median(np.diff(t))) / 4))
+    half = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 4))
     kernel = np.ones(2 * half + 1) / (2 * half + 1)
     padded = np.pad(rates, ((half, half), (0, 0)), mode="edge")
     return np.stack([np.convolve(x, kernel, "valid") for x in padded.T], axis=-1)

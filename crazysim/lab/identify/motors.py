@@ -15,15 +15,15 @@ from crazysim.dynamics.rotor import rotor_acceleration
 from crazysim.dynamics.utils.identification import lagged
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.logs import Log
-from crazysim.lab.identify.repairs import REPAIRABLE
+from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 
-SMOOTH = 1.0
+VOLTAGE_WINDOW = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
-GROUND = 1.0
+GROUND_MARGIN = 1.0
 """Duration after the rotors first carry the drone, and before they last do, that is left out, s."""
-SLOWEST, FASTEST = 2.0, 200.0
+MIN_RATE, MAX_RATE = 2.0, 200.0
 """Rates between which the lag of motors is sought, 1/s."""
-LATEST = 0.04
+MAX_DELAY = 0.04
 """Largest delay between commands and measured speeds, s."""
 
 
@@ -49,13 +49,13 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     if "battery.thrust_over_voltage" not in airframe.values:
         return log
     good = (command >= 0) & (command <= 1)
-    if np.sum(~good) > REPAIRABLE * good.size:
+    if np.sum(~good) > MAX_REPAIRED_SHARE * good.size:
         raise ConfigError(
             f"{log.name}: expected commands from 0 to 1, shares of the battery's voltage, got {command.min():.4g} to "
             f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535."
         )
     command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, good.T, strict=True)], axis=-1)
-    half = max(1, round(SMOOTH / log.dt / 2))
+    half = max(1, round(VOLTAGE_WINDOW / log.dt / 2))
     window = np.hanning(2 * half + 3)[1:-1]
     volts = np.convolve(np.pad(voltage, half, mode="edge"), window / window.sum(), "valid")[:, None] * command
     thrust = np.maximum(np.polynomial.polynomial.polyval(volts, airframe.value("battery.thrust_over_voltage")), 0.0)
@@ -65,8 +65,8 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     repairs = [*log.repairs, "modelled the rotor speeds from commands and voltage"]
     if not np.all(good):
         repairs.append(f"interpolated {np.sum(~good)} commands that were not from 0 to 1")
-    speeds = _behind(wanted, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
-    flying, margin = np.flatnonzero(total > 0.75 * np.median(total)), round(GROUND / log.dt)
+    speeds = _lagged_speeds(wanted, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
+    flying, margin = np.flatnonzero(total > 0.75 * np.median(total)), round(GROUND_MARGIN / log.dt)
     air = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
     repairs.append(f"left out {air.start} samples at the start and {len(log.t) - air.stop} at the end, near the ground")
     data = {key: x[air] for key, x in vars(log).items() if isinstance(x, np.ndarray) and key != "gaps"}
@@ -75,7 +75,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     return replace(log, **data, modelled=True, gaps=gaps, repairs=tuple(repairs))
 
 
-def _behind(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
+def _lagged_speeds(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
     """Return the speeds of rotors behind held commands, rpm. (n, n_rotors)"""
 
     def step(speed: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -117,7 +117,7 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
 def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
     """Return the rate of one rotor: a grid over rates and delays that is refined about its best point."""
     terms = np.c_[command, command**2] / max(np.max(np.abs(command)), 1e-30) ** [1, 2]
-    rates, delays = np.geomspace(SLOWEST, FASTEST, 15), np.linspace(-LATEST, LATEST, 9)
+    rates, delays = np.geomspace(MIN_RATE, MAX_RATE, 15), np.linspace(-MAX_DELAY, MAX_DELAY, 9)
     index, inner = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)
     rate = delay = 0.0
     for _ in range(5):
@@ -133,4 +133,4 @@ def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
                     best, rate, delay = cost, float(r), float(d)
         ratio, width = rates[1] / rates[0], delays[1] - delays[0]
         rates, delays = np.geomspace(rate / ratio, rate * ratio, 9), np.linspace(delay - width, delay + width, 7)
-    return rate if 1.05 * SLOWEST < rate < FASTEST / 1.05 else np.nan
+    return rate if 1.05 * MIN_RATE < rate < MAX_RATE / 1.05 else np.nan

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.identify.columns import Columns, plain, plausible
-from crazysim.lab.identify.repairs import PERIODS, continuous, unwrapped
+from crazysim.lab.identify.columns import Columns, unsigned_name, without_huge_numbers
+from crazysim.lab.identify.repairs import PERIOD_RANGE, align_signs, unwrap_angles
 
-LONGEST_HOLD = 3.0
+MAX_HOLD = 3.0
 """Intervals of a stream, after which its interpolated values count as a gap."""
-VARIABLE = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
+VARIABLE_PATTERN = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
 """Name and type of a variable of a micro-SD log, such as ``gyro.x(f)``."""
-LARGEST_RATE = 250.0
+MAX_RATE = 250.0
 """Rate to which faster logs are averaged, Hz: above some 50 Hz nothing is identified."""
 
 
@@ -34,7 +34,7 @@ class Stream(NamedTuple):
     """Values by name. (n,) each"""
 
 
-def at_equal_times(
+def resample(
     name: str, streams: Mapping[str, Stream], repairs: list[str], columns: Columns | None = None
 ) -> dict[str, NDArray]:
     """Return the columns of all streams, interpolated linearly at the times of the fastest; ``t`` begins at zero.
@@ -53,8 +53,8 @@ def at_equal_times(
             slow.
     """
     columns = columns or Columns()
-    quat, angles = ([plain(x) for x in names] for names in (columns.quat, columns.rpy))
-    needed, slowly = {*map(plain, columns.pos), *quat, *angles}, set(map(plain, columns.voltage))
+    quat, angles = ([unsigned_name(x) for x in names] for names in (columns.quat, columns.rpy))
+    needed, slowly = {*map(unsigned_name, columns.pos), *quat, *angles}, set(map(unsigned_name, columns.voltage))
     sorted_streams = {}
     for key, stream in streams.items():
         order = np.unique(stream.t, return_index=True)[1]
@@ -63,22 +63,24 @@ def at_equal_times(
             repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples have no time of their own")
         if len(order) < 2:
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
-        values = {c: plausible(x[order]) for c, x in stream.columns.items()}
+        values = {c: without_huge_numbers(x[order]) for c, x in stream.columns.items()}
         step = float(np.median(np.diff(stream.t[order])))
-        if step > PERIODS[1] and not set(values) <= slowly:
-            wanted = f"{key} every {PERIODS[1]:g} s or more often, got every {step:.2g} s"
+        if step > PERIOD_RANGE[1] and not set(values) <= slowly:
+            wanted = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
             if needed & set(values):
                 raise ConfigError(f"{name}: expected {wanted}. Log it faster.")
             repairs.append(f"left out a slow stream: expected {wanted}")
             continue
         if quat and all(c in values for c in quat):
-            turned = continuous(np.stack([values[c] for c in quat], axis=-1))
+            turned = align_signs(np.stack([values[c] for c in quat], axis=-1))
             values |= dict(zip(quat, turned.T, strict=True))
         turn = 2 * np.pi / abs(columns.rad_per_angle)
-        values |= {c: unwrapped(values[c], turn) for c in angles if c in values}
+        values |= {c: unwrap_angles(values[c], turn) for c in angles if c in values}
         sorted_streams[key] = Stream(stream.t[order], values)
     if not sorted_streams:
-        raise ConfigError(f"{name}: expected messages every {PERIODS[1]:g} s or more often, got none. Log them faster.")
+        raise ConfigError(
+            f"{name}: expected messages every {PERIOD_RANGE[1]:g} s or more often, got none. Log them faster."
+        )
     steps = {key: float(np.median(np.diff(s.t))) for key, s in sorted_streams.items()}
     start, end = (f(s.t[k] for s in sorted_streams.values()) for f, k in ((max, 0), (min, -1)))
     dt = min(steps.values())
@@ -90,25 +92,25 @@ def at_equal_times(
     keep = np.ones(len(t), bool)
     for key, s in sorted_streams.items():
         before = np.clip(np.searchsorted(s.t, t, side="right") - 1, 0, len(s.t) - 2)
-        keep &= s.t[before + 1] - s.t[before] <= LONGEST_HOLD * steps[key]
+        keep &= s.t[before + 1] - s.t[before] <= MAX_HOLD * steps[key]
     t = t[keep]
     columns_at = {c: np.interp(t, s.t, x) for s in sorted_streams.values() for c, x in s.columns.items()}
     return {"t": t - start} | columns_at
 
 
-def decimated(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
-    """Return the table with means over as many samples as bring it to ``LARGEST_RATE`` or just below.
+def decimate(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
+    """Return the table with means over as many samples as bring it to ``MAX_RATE`` or just below.
 
     Args:
         table: Columns by name, with the time ``t``, s.
         repairs: List that descriptions of repairs are appended to.
     """
     step = float(np.median(np.diff(table["t"]))) if len(table["t"]) > 1 else 0.0
-    if not step > 0 or (size := int(np.ceil(1 / (LARGEST_RATE * step) - 1e-6))) < 2:
+    if not step > 0 or (size := int(np.ceil(1 / (MAX_RATE * step) - 1e-6))) < 2:
         return table
     n = len(table["t"]) // size * size
     repairs.append(f"averaged {size} samples each of a log at {1 / step:.0f} Hz")
-    return {key: plausible(x[:n]).reshape(-1, size).mean(axis=1) for key, x in table.items()}
+    return {key: without_huge_numbers(x[:n]).reshape(-1, size).mean(axis=1) for key, x in table.items()}
 
 
 def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
@@ -167,21 +169,21 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
             names = [x if times[x] == 1 else f"{name}.{x}" for x in variables]
             values = dict(zip(names, table.T[1:], strict=True))
             for x in [x for x in names if x.endswith(".quat") and _are_uint32(values[x])]:
-                attitude = decompressed(values[x].astype(np.uint32))
+                attitude = decompress_quat(values[x].astype(np.uint32))
                 values |= {f"{x[:-4]}q{axis}": c for axis, c in zip("xyzw", attitude.T, strict=True)}
             streams[name] = Stream(table[:, 0], values)
     if not streams:
         raise ConfigError(f"{path.name}: expected records, got none. Start the log before the flight.")
     if wanted is not None:
         streams = {key: x for key, x in streams.items() if set(wanted.names) & set(x.columns)} or streams
-    return at_equal_times(path.name, streams, repairs, wanted)
+    return resample(path.name, streams, repairs, wanted)
 
 
 def _are_uint32(x: NDArray) -> bool:
     return bool(np.all((x >= 0) & (x < 2**32) & (np.floor(x) == x)))
 
 
-def decompressed(packed: NDArray) -> NDArray:
+def decompress_quat(packed: NDArray) -> NDArray:
     """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
 
     From the lowest bits up: magnitudes of nine bits, in units of 1 / (511 sqrt(2)), each below a bit that is set for
@@ -214,7 +216,7 @@ def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], s
         variables, layout = [], "<"
         for _ in range(count):
             entry, at = text(at)
-            if (found := VARIABLE.fullmatch(entry)) is None:
+            if (found := VARIABLE_PATTERN.fullmatch(entry)) is None:
                 raise struct.error(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
             variables.append(found[1])
             layout += found[2]

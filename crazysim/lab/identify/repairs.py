@@ -9,25 +9,25 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 
-REPAIRABLE = 0.05
+MAX_REPAIRED_SHARE = 0.05
 """Largest share of samples that may be repaired; a log with more is an error."""
-UNIT = 1e-3
+NORM_TOLERANCE = 1e-3
 """Deviation of a quaternion's norm from 1 that counts as rounding."""
-BRIDGED = 0.03
+MAX_INTERPOLATION = 0.03
 """Longest time that is interpolated, s. A straight line over T differs from a sine of frequency f by at most
 ``(2 pi f T)^2 / 8`` of its amplitude: by 11% at 5 Hz, about the fastest that a small drone follows."""
-PERIODS = (1e-4, 0.2)
+PERIOD_RANGE = (1e-4, 0.2)
 """Intervals between samples that a log of a flight can have, s: gyroscopes give up to 8 kHz; at less than 5 Hz nothing
 is left of the rotation."""
 UNITS_OF_TIME = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-SHORTEST = 20
+MIN_SAMPLES = 20
 """Least number of samples of a log."""
-GROUND = 1.0
+GROUND_DURATION = 1.0
 """Shortest stay on the ground within a log that is found, and the time beside each stay that is left out, too, s."""
-CARRIED, IDLE = 0.75, 0.4
-"""Shares of the typical thrust: one below the first for longer than ``GROUND`` that falls below the second is that of a
-drone on the ground, where flight controllers raise the thrust slowly before they take off."""
-NEIGHBOURS = 10
+CARRIED_SHARE, IDLE_SHARE = 0.75, 0.4
+"""Shares of the typical thrust. A drone is on the ground where its thrust is below the first for longer than
+``GROUND_DURATION`` and falls below the second: flight controllers raise the thrust slowly before they take off."""
+N_NEIGHBOURS = 10
 """Samples on both sides of an interval that show if time was lost or only jitters."""
 
 
@@ -43,7 +43,7 @@ def check_period(name: str, t: NDArray) -> None:
     """
     steps = np.diff(t[np.isfinite(t)])
     steps = steps[steps > 0]
-    period, (least, most) = float(np.median(steps)) if len(steps) else 0.0, PERIODS
+    period, (least, most) = float(np.median(steps)) if len(steps) else 0.0, PERIOD_RANGE
     if not len(steps) or least <= period <= most:
         return
     units = [(unit, x) for unit, x in UNITS_OF_TIME.items() if least <= period * x <= most]
@@ -53,34 +53,34 @@ def check_period(name: str, t: NDArray) -> None:
     raise ConfigError(f"{name}: expected samples every {least:g} to {most:g} s, got every {period:.4g} s. {hint}.")
 
 
-def increasing(name: str, t: NDArray, repairs: list[str]) -> NDArray:
+def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     """Return the samples of the longest sequence whose time increases. (n,), True where a sample is kept.
 
     A single time that is too early or too late is thus dropped alone.
     """
     keep = np.isfinite(t)
     if not np.all(np.diff(t[keep]) > 0):
-        keep = _longest_increasing(t)
+        keep = _longest_increasing_sequence(t)
     if np.sum(keep) > 2:  # A clock that is set at the start, or garbage at the end.
         at, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
         keep[[at[k] for k, step in ((0, 0), (-1, -2)) if t[at[step + 1]] - t[at[step]] > 100 * dt]] = False
     lost = int(np.sum(~keep))
-    if len(t) >= SHORTEST and 2 * (different := len(np.unique(t))) < len(t):
+    if len(t) >= MIN_SAMPLES and 2 * (different := len(np.unique(t))) < len(t):
         raise ConfigError(
             f"{name}: expected a time of its own for each sample, got {different} times of {len(t)} samples. "
             "Export the time with more digits, or name another column as time."
         )
-    if len(t) < SHORTEST or lost > REPAIRABLE * len(t):
+    if len(t) < MIN_SAMPLES or lost > MAX_REPAIRED_SHARE * len(t):
         raise ConfigError(
-            f"{name}: expected at least {SHORTEST} samples whose time increases, got {len(t)} of which {lost} do not. "
-            "Cut the log into flights."
+            f"{name}: expected at least {MIN_SAMPLES} samples whose time increases, got {len(t)} of which {lost} do "
+            "not. Cut the log into flights."
         )
     if lost:
         repairs.append(f"dropped {lost} samples whose time is not between those of their neighbours")
     return keep
 
 
-def _longest_increasing(t: NDArray) -> NDArray:
+def _longest_increasing_sequence(t: NDArray) -> NDArray:
     """Return True for the samples of the longest increasing sequence: patience sorting. (n,)"""
     ends: list[float] = []
     last: list[int] = []
@@ -96,7 +96,7 @@ def _longest_increasing(t: NDArray) -> NDArray:
     return keep
 
 
-def gaps_of(name: str, t: NDArray, repairs: list[str]) -> NDArray:
+def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     """Return the indices of samples that follow a gap. (n_gaps,)
 
     A gap is an interval of over 1.5 times the median for which the next ones do not make up: time that only jitters
@@ -105,9 +105,9 @@ def gaps_of(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     steps = np.diff(t)
     dt = float(np.median(steps))
     wide = 1 + np.flatnonzero(steps > 1.5 * dt)
-    over = min(5 * NEIGHBOURS, len(t) - 1)
+    over = min(5 * N_NEIGHBOURS, len(t) - 1)
     late = t - t[0] - np.median(t[over:] - t[:-over]) / over * np.arange(len(t))
-    sides = [(late[max(k - NEIGHBOURS, 0) : k], late[k : k + NEIGHBOURS]) for k in wide]
+    sides = [(late[max(k - N_NEIGHBOURS, 0) : k], late[k : k + N_NEIGHBOURS]) for k in wide]
     lost = [np.median(b) - np.median(a) > dt / 2 and np.min(b) > np.max(a) for a, b in sides]
     gaps = wide[np.array(lost, bool)]
     if len(wide) > len(gaps):
@@ -125,16 +125,19 @@ def gaps_of(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     return gaps
 
 
-def bridged(name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str]) -> tuple[NDArray, dict[str, NDArray]]:
-    """Return the data, interpolated where values are missing for up to ``BRIDGED``; the samples of longer times go.
+def interpolate_missing(
+    name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str]
+) -> tuple[NDArray, dict[str, NDArray]]:
+    """Return the data, with missing values interpolated over up to ``MAX_INTERPOLATION``, and without longer gaps.
 
-    Values are missing where they are not finite, and attitudes where a quaternion is zero, as of a lost motion capture.
+    A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
+    for a lost body.
     """
     keep, lost, whole = np.ones(len(t), bool), [], {}
     for key, x in data.items():
         good = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
-            good &= np.linalg.norm(np.where(np.isfinite(x), x, 0.0), axis=-1) > UNIT
+            good &= np.linalg.norm(np.where(np.isfinite(x), x, 0.0), axis=-1) > NORM_TOLERANCE
         if 2 * np.sum(good) < len(t):
             raise ConfigError(
                 f"{name}: expected finite {key}{' that is not zero' if key == 'quat' else ''}, got {np.sum(~good)} "
@@ -142,11 +145,11 @@ def bridged(name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str])
             )
         if key == "quat":
             x = x.copy()
-            x[good] = unit(name, x[good], repairs)
+            x[good] = normalise_quats(name, x[good], repairs)
             if not np.all(good):
-                x[good] = continuous(x[good])
+                x[good] = align_signs(x[good])
         at = np.flatnonzero(good)
-        pauses = np.flatnonzero((np.diff(at) > 1) & (np.diff(t[at]) > BRIDGED))
+        pauses = np.flatnonzero((np.diff(at) > 1) & (np.diff(t[at]) > MAX_INTERPOLATION))
         known = np.zeros(len(t), bool)
         known[at[0] : at[-1] + 1] = True
         for k in pauses:
@@ -155,7 +158,7 @@ def bridged(name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str])
             lost.append(key)
             keep &= known
         few = int(np.sum(known & ~good))
-        if few > REPAIRABLE * len(t):
+        if few > MAX_REPAIRED_SHARE * len(t):
             raise ConfigError(
                 f"{name}: expected finite {key}, got {few} samples of {len(t)} that are not. "
                 "Cut the log to where it is whole, or leave the column out."
@@ -168,12 +171,12 @@ def bridged(name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str])
         whole[key] = x
     if lost:
         repairs.append(
-            f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {BRIDGED:g} s"
+            f"dropped {np.sum(~keep)} samples, in which {', '.join(lost)} were missing for over {MAX_INTERPOLATION:g} s"
         )
     return t[keep], {key: x[keep] for key, x in whole.items()}
 
 
-def airborne(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDArray:
+def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDArray:
     """Return True for the samples in the air, by the size of the thrust. (n,)
 
     Args:
@@ -197,29 +200,33 @@ def airborne(name: str, t: NDArray, thrust: NDArray, repairs: list[str]) -> NDAr
         raise ConfigError(
             f"{name}: expected a flight, got rotors at rest. Check rotor_vel or attitude_command, or take another log."
         )
-    low = np.r_[False, smooth < CARRIED * typical, False]
+    low = np.r_[False, smooth < CARRIED_SHARE * typical, False]
     starts, ends = np.flatnonzero(np.diff(low.astype(int)) == 1), np.flatnonzero(np.diff(low.astype(int)) == -1)
     keep = np.ones(len(t), bool)
     for start, end in zip(starts, ends, strict=True):
         inside = start > 0 and end < len(t)
-        if np.min(smooth[start:end]) < IDLE * typical and not (inside and t[end - 1] - t[start] < GROUND):
-            keep &= (t < t[start] - GROUND) | (t > t[end - 1] + GROUND)
+        if np.min(smooth[start:end]) < IDLE_SHARE * typical and not (
+            inside and t[end - 1] - t[start] < GROUND_DURATION
+        ):
+            keep &= (t < t[start] - GROUND_DURATION) | (t > t[end - 1] + GROUND_DURATION)
     if np.all(keep):
         return keep
-    if np.sum(keep) < SHORTEST:
+    if np.sum(keep) < MIN_SAMPLES:
         raise ConfigError(
-            f"{name}: expected at least {SHORTEST} samples in the air, got {np.sum(keep)} of {t[-1] - t[0]:.3g} s. "
+            f"{name}: expected at least {MIN_SAMPLES} samples in the air, got {np.sum(keep)} of {t[-1] - t[0]:.3g} s. "
             "Take a longer flight, and check rotor_vel or attitude_command."
         )
-    repairs.append(f"left out {np.sum(~keep)} samples on the ground, or within {GROUND:g} s of it, by the thrust")
+    repairs.append(
+        f"left out {np.sum(~keep)} samples on the ground, or within {GROUND_DURATION:g} s of it, by the thrust"
+    )
     return keep
 
 
-def without_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
+def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
     """Return rotor speeds, interpolated where they are negative or more than three times their median. (n, n_rotors)"""
     good = (x >= 0) & (x <= 3 * np.median(x, axis=0))
     bad = int(np.sum(~good))
-    if bad > REPAIRABLE * x.size:
+    if bad > MAX_REPAIRED_SHARE * x.size:
         raise ConfigError(
             f"{name}: expected rotor speeds from 0 to three times their median, got {bad} others. "
             "Cut the log to the flight, and check that the columns are speeds."
@@ -231,10 +238,10 @@ def without_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
     return np.stack([np.interp(index, index[g], c[g]) for c, g in zip(x.T, good.T, strict=True)], axis=-1)
 
 
-def unit(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
+def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
     """Return unit quaternions; a constant that was added to each component is found by fitting a unit sphere."""
     norm = np.linalg.norm(quat, axis=-1)
-    if np.all(np.abs(norm - 1) < UNIT):
+    if np.all(np.abs(norm - 1) < NORM_TOLERANCE):
         return quat / norm[:, None]
     if not np.all(np.abs(norm - 1) < 0.2):
         raise ConfigError(
@@ -244,7 +251,7 @@ def unit(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
     solution, *_ = np.linalg.lstsq(np.c_[2 * quat, np.ones(len(quat))], norm**2, rcond=None)
     moved = quat - solution[:4]
     moved_norm = np.linalg.norm(moved, axis=-1)
-    if np.all(np.abs(moved_norm - 1) < UNIT):
+    if np.all(np.abs(moved_norm - 1) < NORM_TOLERANCE):
         offset = ", ".join(f"{x:.4f}" for x in solution[:4])
         repairs.append(f"subtracted ({offset}) from the quaternions, which makes them unit")
         return moved / moved_norm[:, None]
@@ -252,7 +259,7 @@ def unit(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
     return quat / norm[:, None]
 
 
-def unwrapped(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
+def unwrap_angles(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
     """Return angles that do not jump by a period, which interpolation needs; those that are missing stay NaN. (n,)"""
     good = np.isfinite(angles)
     angles = np.where(good, angles, np.nan)
@@ -260,6 +267,6 @@ def unwrapped(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
     return angles
 
 
-def continuous(quat: NDArray) -> NDArray:
+def align_signs(quat: NDArray) -> NDArray:
     """Return quaternions whose neighbours have one sign, as interpolation needs: q and -q are one attitude. (n, 4)"""
     return quat * np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])[:, None]

@@ -24,23 +24,23 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.logs import Log
 
-FAST, SLOW, YAW_SLOW = 0.05, 0.33, 1.0
+FAST_WIDTH, SLOW_WIDTH, YAW_SLOW_WIDTH = 0.05, 0.33, 1.0
 """Widths of the Hann windows whose difference is the band-pass, s: some 3 to 20 Hz, and 1 to 20 Hz about z."""
-LAGS = 0.15
+RESPONSE_DURATION = 0.15
 """Duration of the response from commands to rotor speeds, s."""
-BLOCK = 10.0
+BLOCK_DURATION = 10.0
 """Duration of the blocks of a log that are solved for themselves, each with a delay of its own, s."""
-FEWEST = 3
+MIN_BLOCKS = 3
 """Fewest blocks whose scatter gives a standard deviation."""
-LONGEST = 0.04
+MAX_DELAY = 0.04
 """Largest delay, s."""
-SAMPLING = 5e-4
+SAMPLING_ERROR = 5e-4
 """Relative error of integrals between samples, which is the same in all blocks: of moments of inertia it was 0.04 to
 0.12% in simulated flights without noise, at 100 and 500 Hz."""
-CORNER = 0.02
+DELAY_DEVIATION = 0.02
 """Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there, of
 which quadrature makes a delay of dt^2 / (12 time constant): 0.04 samples of 0.01 s for a time constant of 0.02 s."""
-ROUNDS = 3
+N_ITERATIONS = 3
 """Fits, each with the gyroscopic torques of the moments of inertia of the one before."""
 
 
@@ -50,7 +50,7 @@ class FastRotation(NamedTuple):
     values: NDArray
     """Factors of the moments of inertia about x, y, z, of the torque curve and of the rotors' inertia. (5,)"""
     deviations: NDArray
-    """Standard deviations, from the scatter between blocks, ``SAMPLING`` and ``CORNER``. (5,)"""
+    """Standard deviations, from the scatter between blocks, ``SAMPLING_ERROR`` and ``DELAY_DEVIATION``. (5,)"""
     delays: NDArray
     """Delay of the state behind the rotor speeds in each log, s. (n_logs,)"""
 
@@ -73,12 +73,14 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     """
     moments = np.diag(np.asarray(params.J, np.float64))
     values, blocks = np.ones(5), []
-    for _ in range(ROUNDS):
-        blocks = [_blocks(_Prepared.create(log, params, thrust_factor, values)) for log in logs]
+    for _ in range(N_ITERATIONS):
+        blocks = [_blocks(_LogTerms.create(log, params, thrust_factor, values)) for log in logs]
         found = np.concatenate(blocks)
         if not len(found):
-            raise ConfigError(f"expected logs of over {YAW_SLOW + 1:g} s without gaps, got none. Use longer logs.")
-        medians = [median(found[:, k], found[:, k + 5]) for k in range(4)]
+            raise ConfigError(
+                f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs."
+            )
+        medians = [weighted_median(found[:, k], found[:, k + 5]) for k in range(4)]
         (roll, pitch, drag, reaction), deviations = zip(*medians, strict=True)
         if not (roll > 0 and pitch > 0):
             raise ConfigError(
@@ -88,40 +90,44 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
         x, y = 1 / roll / moments[0], 1 / pitch / moments[1]
         z = (x * moments[0] + y * moments[1]) / (moments[0] + moments[1])
         values = np.array([x, y, z, *(max(c, 0.0) * moments[2] * z for c in (drag, reaction))])
-    late = np.concatenate([_blocks(_Prepared.create(log, params, thrust_factor, values), CORNER) for log in logs])
-    turned = [median(late[:, k], late[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
+    late = np.concatenate(
+        [_blocks(_LogTerms.create(log, params, thrust_factor, values), DELAY_DEVIATION) for log in logs]
+    )
+    turned = [weighted_median(late[:, k], late[:, k + 5])[0] - medians[k][0] for k in (2, 3)]
     inertia = moments * values[:3]
     tilt = np.array(deviations[:2]) / [roll, pitch]
     turn = np.hypot(*(tilt * inertia[:2])) / np.sum(inertia[:2])
-    spread = np.hypot([*tilt * [x, y], turn * z, *inertia[2] * np.hypot(deviations[2:], turned)], SAMPLING * values)
-    every = median(found[:, 4], np.ones(len(found)))[0]
-    delays = [median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
+    spread = np.hypot(
+        [*tilt * [x, y], turn * z, *inertia[2] * np.hypot(deviations[2:], turned)], SAMPLING_ERROR * values
+    )
+    every = weighted_median(found[:, 4], np.ones(len(found)))[0]
+    delays = [weighted_median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
     return FastRotation(values, spread, np.array(delays))
 
 
 def aligned(log: Log, delay: float) -> Log:
     """Return the log with rotor speeds and commands that are later by a delay, s."""
-    command = None if log.command is None else shifted(log.command, delay / log.dt)
-    return replace(log, rotor_vel=shifted(log.rotor_vel, delay / log.dt), command=command)
+    command = None if log.command is None else shift_series(log.command, delay / log.dt)
+    return replace(log, rotor_vel=shift_series(log.rotor_vel, delay / log.dt), command=command)
 
 
-def median(x: NDArray, variance: NDArray) -> tuple[float, float]:
+def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
     """Return the median, weighted by inverse variances, and its standard deviation from the scatter.
 
-    The standard deviation is NaN for fewer than ``FEWEST`` numbers.
+    The standard deviation is NaN for fewer than ``MIN_BLOCKS`` numbers.
     """
     weight = 1 / np.maximum(variance, 0.25 * np.median(variance))  # so that no single block decides
     order = np.argsort(x)
     share = (np.cumsum(weight[order]) - 0.5 * weight[order]) / np.sum(weight)
     center = float(np.interp(0.5, share, x[order]))
-    if len(x) < FEWEST:
+    if len(x) < MIN_BLOCKS:
         return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
     spread = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
-    return center, 1.2533 * enlarged(len(x)) * spread  # of a median over that of a mean (Gauss)
+    return center, 1.2533 * deviation_factor(len(x)) * spread  # of a median over that of a mean (Gauss)
 
 
-def enlarged(n: int) -> float:
+def deviation_factor(n: int) -> float:
     """Return the factor of a standard deviation from n numbers with which three hold as often as if it were known.
 
     Student's t distribution with n - 1 degrees of freedom over the normal one, by the expansion of Abramowitz and
@@ -131,7 +137,7 @@ def enlarged(n: int) -> float:
     return (3 + 30 / (4 * v) + 1656 / (96 * v**2) + 11592 / (384 * v**3)) / 3
 
 
-class _Prepared(NamedTuple):
+class _LogTerms(NamedTuple):
     """One log as the regression uses it, with changes over the two intervals around each sample."""
 
     dt: float
@@ -146,7 +152,7 @@ class _Prepared(NamedTuple):
     """Thrusts and torques at the rotor speeds that commands explain."""
 
     @staticmethod
-    def create(log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray) -> _Prepared:
+    def create(log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray) -> _LogTerms:
         """Return a log with the factors ``values`` of moments of inertia, torque curve and rotor inertia in force."""
         mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
         root = np.sqrt(values[:3])
@@ -160,16 +166,26 @@ class _Prepared(NamedTuple):
             torque = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
             # The drag of the air on rotors and their acceleration turn the body the same way.
             reaction = _change((rotor_inertia * speed) @ mixing[2])
-            return _Rotors(_over_two(torque, log.dt), _change(torque), reaction, _over_two(thrust.sum(axis=1), log.dt))
+            return _Rotors(
+                _integral_over_two(torque, log.dt),
+                _change(torque),
+                reaction,
+                _integral_over_two(thrust.sum(axis=1), log.dt),
+            )
 
         w, dt = log.ang_vel, log.dt
         spin = np.zeros_like(w)
         spin[:, 2] = -values[4] * (rotor_inertia * log.rotor_vel) @ mixing[2]
         gyro = np.linalg.solve(inertia, np.cross(w, w @ inertia + spin).T).T
-        speeds = log.rotor_vel if log.command is None else _explained(log)
-        return _Prepared(
-            dt, log.gaps, _change(w) + _over_two(gyro, dt), _over_two(w, dt), rotors(log.rotor_vel), rotors(speeds)
-        )  # fmt: skip
+        speeds = log.rotor_vel if log.command is None else _speeds_of_commands(log)
+        return _LogTerms(
+            dt,
+            log.gaps,
+            _change(w) + _integral_over_two(gyro, dt),
+            _integral_over_two(w, dt),
+            rotors(log.rotor_vel),
+            rotors(speeds),
+        )
 
 
 class _Rotors(NamedTuple):
@@ -185,9 +201,9 @@ class _Rotors(NamedTuple):
     """Integral of the collective thrust, N s. (n,)"""
 
 
-def _explained(log: Log) -> NDArray:
+def _speeds_of_commands(log: Log) -> NDArray:
     """Return the rotor speeds that commands explain: a finite impulse response, and squares. (n, n_rotors)"""
-    n, count = len(log.t), round(LAGS / log.dt)
+    n, count = len(log.t), round(RESPONSE_DURATION / log.dt)
     index = np.clip(np.arange(n)[:, None] - np.arange(-1, count)[None], 0, n - 1)
     speeds = []
     for command, speed in zip(np.asarray(log.command).T, log.rotor_vel.T, strict=True):
@@ -203,7 +219,7 @@ def _change(x: NDArray) -> NDArray:
     return change
 
 
-def _over_two(x: NDArray, dt: float) -> NDArray:
+def _integral_over_two(x: NDArray, dt: float) -> NDArray:
     """Return the integral over the two intervals around each sample, zero at the ends, exact for degree 5."""
     total = np.zeros_like(x)
     total[2:-2] = (114 * x[2:-2] + 34 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) * (dt / 90)
@@ -218,36 +234,36 @@ def _band(x: NDArray, dt: float, slow: float) -> NDArray:
         kernel = np.hanning(size + 2)[1:-1]
         return np.stack([np.convolve(c, kernel / kernel.sum(), "same") for c in x.T], axis=-1)
 
-    return smooth(FAST) - smooth(slow)
+    return smooth(FAST_WIDTH) - smooth(slow)
 
 
-def _blocks(d: _Prepared, late: float = 0.0) -> NDArray:
+def _blocks(d: _LogTerms, late: float = 0.0) -> NDArray:
     """Return the solution of each block, about z with a delay that is longer by ``late`` samples.
 
     Coefficients of torque about x and y, of drag torque and of reaction; delay; variances of the coefficients.
     (n_blocks, 9)
     """
-    n, margin = len(d.turned), round(YAW_SLOW / d.dt / 2)
+    n, margin = len(d.turned), round(YAW_SLOW_WIDTH / d.dt / 2)
     keep = np.ones(n, bool)
     for at in (0, *d.gaps, n):
         keep[max(0, at - margin) : at + margin] = False
-    size, found = max(1, round(BLOCK / d.dt)), []
+    size, found = max(1, round(BLOCK_DURATION / d.dt)), []
     for k in range(0, n, size):
         at = np.flatnonzero(keep[k : k + size]) + k
         if len(at) * d.dt < 1:
             continue
         delay = 0.0
         for _ in range(6):
-            tilt = [_solved(d, axis, delay, at) for axis in (0, 1)]
+            tilt = [_solve(d, axis, delay, at) for axis in (0, 1)]
             # Torque and its rate over time: torque(t - e) = torque - e rate.
             delay -= float(np.mean([x[1] / x[0] for x, _ in tilt]))
-            delay = float(np.clip(delay, -LONGEST, LONGEST))
-        turn, variance = _solved(d, 2, delay + late * d.dt, at)
+            delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
+        turn, variance = _solve(d, 2, delay + late * d.dt, at)
         found.append([*(x[0] for x, _ in tilt), *turn[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
     return np.reshape(found, (-1, 9))
 
 
-def _solved(d: _Prepared, axis: int, delay: float, at: NDArray) -> tuple[NDArray, NDArray]:
+def _solve(d: _LogTerms, axis: int, delay: float, at: NDArray) -> tuple[NDArray, NDArray]:
     """Return the coefficients of the regressors and their variances, at some samples.
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
@@ -259,9 +275,9 @@ def _solved(d: _Prepared, axis: int, delay: float, at: NDArray) -> tuple[NDArray
             columns = rotors.impulse[:, 2], rotors.reaction
         else:
             columns = rotors.impulse[:, axis], rotors.swing[:, axis], rotors.lift
-        return np.c_[shifted(np.stack(columns, axis=-1), delay / d.dt), d.angle[:, axis]]
+        return np.c_[shift_series(np.stack(columns, axis=-1), delay / d.dt), d.angle[:, axis]]
 
-    slow = YAW_SLOW if axis == 2 else SLOW
+    slow = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, turned = (
         _band(x, d.dt, slow)[at] for x in (terms(d.rotors), terms(d.instruments), d.turned[:, axis : axis + 1])
     )
@@ -271,7 +287,7 @@ def _solved(d: _Prepared, axis: int, delay: float, at: NDArray) -> tuple[NDArray
     return x, np.mean(rest**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
 
 
-def shifted(x: NDArray, samples: float) -> NDArray:
+def shift_series(x: NDArray, samples: float) -> NDArray:
     """Return series that are later by a number of samples, by Lagrange's polynomials through six of them. (n, k)
 
     A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; this lowers it by 1.5%.

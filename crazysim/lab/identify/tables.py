@@ -13,7 +13,7 @@ from crazysim import rotation
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.bags import is_bag, read_bag
 from crazysim.lab.identify.blackbox import header_of, read_blackbox
-from crazysim.lab.identify.columns import KNOWN, Columns, plain, stacked
+from crazysim.lab.identify.columns import KNOWN_COLUMNS, Columns, stack_columns, unsigned_name
 from crazysim.lab.identify.delimited import read_delimited
 from crazysim.lab.identify.readers import read_crazyflie
 from crazysim.lab.identify.repairs import check_period
@@ -38,9 +38,9 @@ def read_table(
         ConfigError: If the file cannot be read, or the interval of its samples is none of a flight.
     """
     name, table = _read(source, repairs, columns)
-    if columns is None or not columns.rpy or any(plain(x) not in table for x in columns.rpy):
+    if columns is None or not columns.rpy or any(unsigned_name(x) not in table for x in columns.rpy):
         return name, table
-    angles = stacked(name, table, columns.rpy, columns.rad_per_angle)
+    angles = stack_columns(name, table, columns.rpy, columns.rad_per_angle)
     if (most := np.nanmax(np.abs(angles[:, 1]), initial=0.0)) > 1.01 * np.pi / 2:
         raise ConfigError(
             f"{name}: expected a pitch of at most pi/2 rad, got {most:.3g}. Name roll, pitch and yaw in this order, "
@@ -81,9 +81,9 @@ def _read(
 
 def _in_seconds(name: str, table: Mapping[str, NDArray], columns: Columns | None) -> Mapping[str, NDArray]:
     """Return the table with its time in s."""
-    names = columns or KNOWN["crazysim"]
+    names = columns or KNOWN_COLUMNS["crazysim"]
     if names.time not in table:
         return table
-    t = stacked(name, table, [names.time], names.seconds_per_unit)[:, 0]
+    t = stack_columns(name, table, [names.time], names.seconds_per_unit)[:, 0]
     check_period(name, t)
     return {**table, names.time: t}

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.errors import ConfigError, DamagedFileError
-from crazysim.lab.identify.columns import plausible
-from crazysim.lab.identify.readers import Stream, at_equal_times
-from crazysim.lab.identify.repairs import unwrapped
+from crazysim.lab.identify.columns import without_huge_numbers
+from crazysim.lab.identify.readers import Stream, resample
+from crazysim.lab.identify.repairs import unwrap_angles
 
 TOPICS = (
     "vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity", "esc_status", "actuator_motors",
@@ -98,12 +98,12 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         aim = np.stack([wanted[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
         angles = np.asarray(jax.jit(rotation.to_rpy)(aim), np.float64)
         names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
-        values = [*map(unwrapped, angles.T), -wanted["thrust_body[2]"]]
+        values = [*map(unwrap_angles, angles.T), -wanted["thrust_body[2]"]]
         columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
     if "battery_status" in found:
         columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}
     streams = {key: Stream(found[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}
-    return at_equal_times(path.name, streams, repairs)
+    return resample(path.name, streams, repairs)
 
 
 class Topic(dict[str, NDArray]):
@@ -178,7 +178,7 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
             repairs.append(f"left out {len(parts[key]) - len(whole)} messages {name}, which are too short")
         if whole:
             table = np.frombuffer(b"".join(whole), layout)
-            columns = {field: plausible(table[field]) for field in layout.names or ()}
+            columns = {field: without_huge_numbers(table[field]) for field in layout.names or ()}
             found[name] = Topic(f"{path.name}: {name}", columns)
     return found
 

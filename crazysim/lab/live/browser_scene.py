@@ -20,7 +20,7 @@ SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
 CLICK_SIZE = 0.02
 """Smallest half size of what a click picks, as a multiple of the distance from the camera."""
-HIDDEN = 1e-6
+HIDDEN_SCALE = 1e-6
 """Scale of a mark that is not shown."""
 CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
 """Colours of marks, rgb, 0 to 255."""
@@ -69,16 +69,16 @@ class BrowserScene:
                 node = scene.add_frame(f"/world/fixed/{w}/{k}", position=offset, show_axes=False)
                 add_static(scene, node.name, others, rgba)
         self._batches: list[tuple[Any, NDArray]] = []
-        for alike in _alike(by_body):
+        for alike in _group_equal_bodies(by_body):
             self._add_bodies(np.array(alike), by_body[alike[0]], picture)
 
         colors = np.tile(colors_of(n_drones, None)[:, :3], (n_worlds, 1))
         drones = self._moved(picture.drones).reshape(-1, 3)
         self._setpoints = self._add_balls("setpoints", SETPOINT_RADIUS, picture.setpoint, rgb_of(colors), 0.8)
         self._contacts = self._add_balls("contacts", MARK_RADIUS, picture.drones, CONTACT_COLOR, 0.45)
-        self._contacts.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._contacts.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
         self._lights = self._add_balls("lights", LIGHT_RADIUS, picture.drones, rgb_of(0 * colors), 0.7)
-        self._lights.batched_scales = np.full(len(drones), HIDDEN, np.float32)
+        self._lights.batched_scales = np.full(len(drones), HIDDEN_SCALE, np.float32)
         self._lit = np.zeros_like(colors)
         self._followed = scene.add_icosphere(
             "/world/followed", radius=MARK_RADIUS, color=FOLLOWED_COLOR, opacity=0.25, visible=False
@@ -109,7 +109,7 @@ class BrowserScene:
             self._setpoints.visible = show["setpoints"]
             self._setpoints.batched_positions = finite_rows(self._moved(picture.setpoint).reshape(-1, 3))
         touching = picture.touching.ravel() & show["contacts"]
-        self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN).astype(np.float32)
+        self._contacts.batched_scales = np.where(touching, 1.0, HIDDEN_SCALE).astype(np.float32)
         if touching.any():
             self._contacts.batched_positions = finite_rows(drones.reshape(-1, 3))
         self._show_lights(drones.reshape(-1, 3), picture.lights.reshape(-1, 3) * show["lights"])
@@ -218,7 +218,7 @@ class BrowserScene:
         if not np.array_equal(colors, self._lit):
             self._lit = colors
             self._lights.batched_colors = rgb_of(colors)
-            self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN).astype(np.float32)
+            self._lights.batched_scales = np.where(colors.any(-1), 1.0, HIDDEN_SCALE).astype(np.float32)
         if colors.any():
             self._lights.batched_positions = finite_rows(drones)
 
@@ -256,7 +256,7 @@ def rgb_of(colors: NDArray) -> NDArray:
     return np.round(255 * colors[:, :3]).astype(np.uint8)
 
 
-def _alike(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
+def _group_equal_bodies(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
     """Return the bodies in groups of equal geoms."""
     groups: dict[tuple, list[int]] = defaultdict(list)
     for body, shapes in by_body.items():

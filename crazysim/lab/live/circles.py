@@ -32,7 +32,7 @@ class Circles:
 
     def __call__(self, live: Live) -> None:
         """Write the setpoints of this control step."""
-        command = circling(self._places, live.time)
+        command = circle_commands(self._places, live.time)
         if self._piloted:
             if live.time > CLIMB:
                 command[0, 0] = live.command[0, 0]
@@ -41,7 +41,7 @@ class Circles:
         live.command[:] = command
 
 
-def circling(places: NDArray, time: float) -> NDArray:
+def circle_commands(places: NDArray, time: float) -> NDArray:
     """Return state commands of drones that rise above places, and circle. (n_worlds, n_drones, 16)
 
     Args:

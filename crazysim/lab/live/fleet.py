@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
-from crazysim.lab.live.paths import Path
+from crazysim.lab.live.paths import HostTrajectory
 from crazysim.lab.show_files.lights import Lights
 from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
@@ -122,7 +122,7 @@ class Fleet:
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
-        return Path.of(self._active[drone]).at(self._now() - self._starts[drone])
+        return HostTrajectory.of(self._active[drone]).at(self._now() - self._starts[drone])
 
     def _now(self) -> float:
         return float(self.sim.time[0, 0])
@@ -195,7 +195,7 @@ class Fleet:
     def _receive(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
         if self.teleport and self._untouched[drone]:
-            begin = Path.of(trajectory).at(0.0)
+            begin = HostTrajectory.of(trajectory).at(0.0)
             states = self.sim.data.states
             pos = states.pos.at[0, drone].set(jnp.asarray(begin[:3], states.pos.dtype))
             quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(begin[3]), states.quat.dtype))
@@ -206,7 +206,7 @@ class Fleet:
     def _start(self, drone: int, relative: bool) -> None:
         trajectory = self._uploaded[drone]
         if relative:
-            trajectory = trajectory.moved((self.setpoint(drone) - Path.of(trajectory).at(0.0))[:3])
+            trajectory = trajectory.moved((self.setpoint(drone) - HostTrajectory.of(trajectory).at(0.0))[:3])
         self._fly(drone, trajectory)
 
     def _fly(self, drone: int, trajectory: Trajectory) -> None:

@@ -81,10 +81,10 @@ class Gamepad:
         self._before = buttons
         right_y, right_x = axes[glfw.GAMEPAD_AXIS_RIGHT_Y], axes[glfw.GAMEPAD_AXIS_RIGHT_X]
         left_y, left_x = axes[glfw.GAMEPAD_AXIS_LEFT_Y], axes[glfw.GAMEPAD_AXIS_LEFT_X]
-        return shaped(-np.array([right_y, right_x, left_y, left_x]))  # GLFW: down and right are positive
+        return remove_deadband(-np.array([right_y, right_x, left_y, left_x]))  # GLFW: down and right are positive
 
 
-def shaped(sticks: NDArray) -> NDArray:
+def remove_deadband(sticks: NDArray) -> NDArray:
     """Return deflections without their dead band, stretched to -1 to 1 again; non-finite ones count as released."""
     finite = np.where(np.isfinite(sticks), sticks, 0.0)
     return np.sign(finite) * np.clip((np.abs(finite) - DEADBAND) / (1 - DEADBAND), 0.0, 1.0)

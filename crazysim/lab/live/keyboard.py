@@ -12,12 +12,12 @@ from crazysim.errors import ConfigError
 
 L = TypeVar("L")
 
-NAMES = ("up", "down", "left", "right", "space", "tab", "backspace", "escape", "enter")
+KEY_NAMES = ("up", "down", "left", "right", "space", "tab", "backspace", "escape", "enter")
 """Names of keys that are not characters."""
 
 
 class Keyboard(Generic[L]):
-    """Keys by name: a lower-case character, or one of ``NAMES``. Viewers press and release them from any thread.
+    """Keys by name: a lower-case character, or one of ``KEY_NAMES``. Viewers press and release them from any thread.
 
     ``L`` is the loop whose functions they call.
     """
@@ -59,8 +59,8 @@ class Keyboard(Generic[L]):
         Raises:
             ConfigError: If there is no such key.
         """
-        if key not in NAMES and (len(key) != 1 or key != key.lower()):
-            raise ConfigError(f"expected a lower-case character or one of {', '.join(NAMES)} as a key, got {key!r}")
+        if key not in KEY_NAMES and (len(key) != 1 or key != key.lower()):
+            raise ConfigError(f"expected a lower-case character or one of {', '.join(KEY_NAMES)} as a key, got {key!r}")
         self._calls[key] = call
 
     def run(self, live: L) -> None:

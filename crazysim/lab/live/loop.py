@@ -19,7 +19,7 @@ from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
 from crazysim.lab.live.history import History, Snapshot
 from crazysim.lab.live.interaction import Interaction
-from crazysim.lab.live.pace import LiveReport, Pace, Speed, undisturbed
+from crazysim.lab.live.pace import LiveReport, Pace, Speed, protect_loop
 from crazysim.lab.live.process import Event, OnError, Process, RateLimit, period_of
 from crazysim.lab.live.recordings import Recordings
 from crazysim.lab.live.staging import StagedCommands, compile_step
@@ -267,7 +267,7 @@ class Live(Interaction, Closing):
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
         first, pictures, paused_s, begin = self.flown, self._viewers.n_pictures, 0.0, perf_counter()
-        with undisturbed(), contextlib.suppress(KeyboardInterrupt):
+        with protect_loop(), contextlib.suppress(KeyboardInterrupt):
             while not self._stopped and (end is None or self.flown < end):
                 paused_s += self._turn()
         jax.block_until_ready(self.sim.data.states.pos)

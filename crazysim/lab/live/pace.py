@@ -21,13 +21,13 @@ TOLERANCE = 2e-3
 """Lateness from which a control step counts as late, s."""
 MAX_LAG = 0.25
 """Lag from which the lost time is given up instead of caught up, s."""
-BIN = 1e-4
+BIN_WIDTH = 1e-4
 """Resolution of the statistics of lateness, s."""
 SWITCH_INTERVAL = 5e-4
 """Time after which another thread of Python gives way to the loop, s."""
 N_BINS = 5000
 """Number of their bins; the last one holds everything above."""
-LISTED = 3
+N_LISTED = 3
 """Most processes that a report lists."""
 
 
@@ -152,7 +152,7 @@ class Pace:
         if self._speed == "max":
             return 0.0
         lateness = max(self._clock() - self._due, 0.0)
-        self._counts[min(int(lateness / BIN), N_BINS - 1)] += 1
+        self._counts[min(int(lateness / BIN_WIDTH), N_BINS - 1)] += 1
         self.late += lateness > TOLERANCE
         if lateness > self.worst:
             self.worst, self.worst_at = lateness, time
@@ -168,7 +168,7 @@ class Pace:
         if not total:
             return 0.0
         k = int(np.searchsorted(np.cumsum(self._counts), part * total))
-        return min((k + 1) * BIN, self.worst) if k < N_BINS - 1 else self.worst
+        return min((k + 1) * BIN_WIDTH, self.worst) if k < N_BINS - 1 else self.worst
 
     def report(
         self, processes: Sequence[Process], simulated_s: float, wall_s: float, pictures: int, failures: int
@@ -182,7 +182,7 @@ class Pace:
             pictures: Number of pictures.
             failures: Number of errors of viewers and recordings that were passed over.
         """
-        longest = sorted(processes, key=lambda process: -process.longest)[:LISTED]
+        longest = sorted(processes, key=lambda process: -process.longest)[:N_LISTED]
         slowest = ", ".join(f"{p.name} {1e3 * p.longest:.1f} ms at {p.longest_at:.2f} s" for p in longest)
         failures += sum(process.failures for process in processes)
         return LiveReport(
@@ -192,7 +192,7 @@ class Pace:
 
 
 @contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
+def protect_loop() -> Iterator[None]:
     """Keep other threads of Python and the garbage collector from delaying the loop."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)

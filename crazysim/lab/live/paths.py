@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crazysim.trajectories import Trajectory
 
 
-class Path(NamedTuple):
+class HostTrajectory(NamedTuple):
     """One trajectory in float64."""
 
     ends: NDArray
@@ -26,10 +26,10 @@ class Path(NamedTuple):
     """True where the trajectory starts again after its end."""
 
     @staticmethod
-    def of(trajectory: Trajectory) -> Path:
+    def of(trajectory: Trajectory) -> HostTrajectory:
         """Return one trajectory on the host."""
         ends, coefficients = (np.asarray(x, float) for x in (trajectory.ends, trajectory.coefficients))
-        return Path(ends, coefficients, bool(trajectory.repeats))
+        return HostTrajectory(ends, coefficients, bool(trajectory.repeats))
 
     @property
     def duration(self) -> float:
@@ -62,12 +62,12 @@ def _powers(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
     return factors, np.maximum(powers - orders[:, None], 0), orders
 
 
-def paths_of(trajectories: Trajectory | Sequence[Trajectory]) -> list[Path]:
+def host_trajectories(trajectories: Trajectory | Sequence[Trajectory]) -> list[HostTrajectory]:
     """Return trajectories on the host: of one record, with or without a leading axis, or of a sequence."""
     if not isinstance(trajectories, Trajectory):
-        return [Path.of(t) for t in trajectories]
+        return [HostTrajectory.of(t) for t in trajectories]
     if np.ndim(trajectories.ends) == 1:
-        return [Path.of(trajectories)]
+        return [HostTrajectory.of(trajectories)]
     t = trajectories
     leaves = [np.asarray(x) for x in (t.ends, t.coefficients, t.repeats)]
-    return [Path(e.astype(float), c.astype(float), bool(r)) for e, c, r in zip(*leaves, strict=True)]
+    return [HostTrajectory(e.astype(float), c.astype(float), bool(r)) for e, c, r in zip(*leaves, strict=True)]

@@ -17,7 +17,7 @@ Sticks = Callable[[Live], NDArray]
 
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
 """Keys of forward and back, left and right, up and down, turn left and right."""
-LEAD = 0.7
+MAX_LEAD = 0.7
 """Most time by which the setpoint leads the drone at full speed, s: after a stick is released, or a drone is held
 back, the setpoint is not far away."""
 
@@ -27,7 +27,7 @@ def keyboard_sticks(live: Live) -> NDArray:
     return np.array([live.keyboard.axis(*keys) for keys in KEYS])
 
 
-def moved(setpoint: ArrayLike, sticks: ArrayLike, dt: float, speed: float, yaw_rate: float) -> NDArray:
+def move_setpoint(setpoint: ArrayLike, sticks: ArrayLike, dt: float, speed: float, yaw_rate: float) -> NDArray:
     """Return a setpoint after the sticks have moved it for a while, in axes that turn with its yaw.
 
     Args:
@@ -92,11 +92,11 @@ class Pilot:
         if live.selected is None or not np.any(sticks):
             return
         command = live.command[live.selected]
-        point = moved(setpoint_of(command), sticks, 1.0 / live.control_freq, self._speed, self._yaw_rate)
+        point = move_setpoint(setpoint_of(command), sticks, 1.0 / live.control_freq, self._speed, self._yaw_rate)
         here = np.asarray(live.sim.data.states.pos, float)[live.selected]
-        reach = LEAD * self._speed
+        reach = MAX_LEAD * self._speed
         point[:3] = np.clip(np.clip(point[:3], here - reach, here + reach), self._low, self._high)
-        hold(command, point)
+        hold_setpoint(command, point)
 
     def go_to(self, live: Live, world: int, point: ArrayLike) -> None:
         """Move the setpoint of the selected drone, if it is in that world, over a point at its present height.
@@ -114,7 +114,7 @@ class Pilot:
         command = live.command[live.selected]
         x, y, _ = np.clip(point, self._low, self._high)
         _, _, z, yaw = setpoint_of(command)
-        hold(command, [x, y, max(z, self._low[2], 0.5), yaw])
+        hold_setpoint(command, [x, y, max(z, self._low[2], 0.5), yaw])
 
 
 def require_state_control(live: Live) -> None:
@@ -134,7 +134,7 @@ def setpoint_of(command: NDArray) -> NDArray:
     return np.append(command[:3], yaw_of(command[9:13]))
 
 
-def hold(command: NDArray, point: NDArray | Sequence[float]) -> None:
+def hold_setpoint(command: NDArray, point: NDArray | Sequence[float]) -> None:
     """Write a setpoint at rest into a state command.
 
     Args:

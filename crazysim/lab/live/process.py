@@ -13,7 +13,7 @@ from crazysim.errors import ConfigError
 
 OnError = Literal["raise", "report"]
 """Reaction of the loop to an error of a process: end with it, or log it and continue."""
-QUIET = 1.0
+MIN_LOG_INTERVAL = 1.0
 """Least time between two log messages of one kind, s."""
 
 log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 class RateLimit:
     """Permission to log one message in some time."""
 
-    def __init__(self, period: float = QUIET):
+    def __init__(self, period: float = MIN_LOG_INTERVAL):
         """Begin with the permission.
 
         Args:

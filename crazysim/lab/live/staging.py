@@ -10,7 +10,7 @@ from crazysim.control import Control
 from crazysim.core.functional import staged_leaves
 from crazysim.sim.sim import Sim
 
-UNSET = np.eye(16)[12]
+DEFAULT_COMMAND = np.eye(16)[12]
 """State command of a drone that has had none: the origin, level. (16,)"""
 
 
@@ -27,7 +27,7 @@ class StagedCommands:
     def array(self) -> NDArray:
         """Command of every drone, writable. (n_worlds, n_drones, k)"""
         if self._array is None:
-            self._array = _present(self._sim)
+            self._array = _initial_commands(self._sim)
         return self._array
 
     def stage(self) -> None:
@@ -47,7 +47,7 @@ class StagedCommands:
         if array is not None:
             self.array[:] = array
         elif self._array is not None:
-            self._array[:] = _present(self._sim)
+            self._array[:] = _initial_commands(self._sim)
 
 
 def compile_step(sim: Sim, n_steps: int) -> None:
@@ -59,10 +59,10 @@ def compile_step(sim: Sim, n_steps: int) -> None:
         sim.data = data
 
 
-def _present(sim: Sim) -> NDArray:
+def _initial_commands(sim: Sim) -> NDArray:
     """Return the staged commands; of drones that have had no state command, hovering where they are."""
     command = np.array(staged_leaves(sim.data)[0], float)
     if sim.control == Control.state:
-        unset = (command == UNSET).all(-1)
+        unset = (command == DEFAULT_COMMAND).all(-1)
         command[unset, :3] = np.asarray(sim.data.states.pos, float)[unset]
     return command

@@ -24,17 +24,17 @@ from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import camera_id
 from crazysim.scene.window import Window
 
-IDLE = 0.005
+IDLE_TIME = 0.005
 """Time between two looks for a new picture, s."""
-REDRAW = 0.03
+REDRAW_TIME = 0.03
 """Longest time between two drawings, s: the mouse moves the view even when no new picture arrives."""
-DOUBLE_CLICK = 0.35
+DOUBLE_CLICK_TIME = 0.35
 """Longest time between the clicks of a double click, s."""
-STILL = 0.01
+MAX_CLICK_MOVE = 0.01
 """Largest movement of the cursor between these clicks, as a fraction of the window's size."""
 SETPOINT_RADIUS = 0.02
 """Radius of a setpoint's sphere, m."""
-TOUCHING, FOLLOWED, AIR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
+CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (0.9, 0.15, 0.1, 0.4), (0.25, 0.6, 1.0, 0.25), (0.35, 0.6, 0.8, 0.9)
 """Colours of marks, rgba."""
 
 
@@ -126,8 +126,8 @@ class Program:
         self._say("ready")
         while self.window.is_open and not inbox.ended:
             picture, now = inbox.picture, time.perf_counter()
-            if picture is None or (picture is shown and now - drawn < REDRAW):
-                time.sleep(IDLE)
+            if picture is None or (picture is shown and now - drawn < REDRAW_TIME):
+                time.sleep(IDLE_TIME)
                 continue
             if picture is not shown and self._trail is not None:
                 self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._tracked])
@@ -164,17 +164,17 @@ class Program:
         if settings["setpoints"] and len(picture.setpoint[k]):
             overlays.points(picture.setpoint[k], colors, SETPOINT_RADIUS)
         if picture.touching[k].any():
-            overlays.points(drones[picture.touching[k]], TOUCHING, MARK_RADIUS)
+            overlays.points(drones[picture.touching[k]], CONTACT_COLOR, MARK_RADIUS)
         for pos, air in zip(drones, picture.wind[k], strict=False):
             if air.any():
-                overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, AIR, cylinder=True)
+                overlays.capsule(pos, pos + WIND_SCALE * air, 0.006, WIND_COLOR, cylinder=True)
         self._leds.color(picture.lights[k])
         lit = picture.lights[k].any(-1)
         if lit.any():
             overlays.points(drones[lit], np.insert(picture.lights[k, lit], 3, 0.6, axis=1), LIGHT_RADIUS, emission=1.0)
         if picture.followed is not None and picture.followed[0] == picture.worlds[k]:
             place, radius = picture.pos[k, picture.followed[1]], self._bodies.radius(picture.followed[1])
-            overlays.points(place[None], FOLLOWED, radius)
+            overlays.points(place[None], FOLLOWED_COLOR, radius)
             overlays.label(_ascii(picture.name), place + [0.0, 0.0, radius])
         text = picture.status if k == 0 else ""
         if len(picture.worlds) > 1:
@@ -192,7 +192,10 @@ class Program:
         if not down or was_down:
             return False
         (then, where), here, now = self._click, self.window.cursor, time.perf_counter()
-        double = now - then < DOUBLE_CLICK and max(abs(a - b) for a, b in zip(where, here, strict=True)) < STILL
+        double = (
+            now - then < DOUBLE_CLICK_TIME
+            and max(abs(a - b) for a, b in zip(where, here, strict=True)) < MAX_CLICK_MOVE
+        )
         self._click = (-np.inf if double else now, here)
         return double
 

@@ -14,7 +14,7 @@ import numpy as np
 from crazysim.errors import ConfigError
 from crazysim.lab.show_files.lights import Lights
 
-TICK = 0.02
+TICK_DURATION = 0.02
 """Unit of durations, s."""
 MAX_BYTES = 2**20
 """Longest program, bytes."""
@@ -61,7 +61,7 @@ def decode_lights(
     if len(program) > MAX_BYTES:
         raise ConfigError(f"expected at most {MAX_BYTES} bytes in {place}, got {len(program)}")
     machine = _Machine(program, place)
-    machine.run(round(until / TICK), len(program) + max_repeated)
+    machine.run(round(until / TICK_DURATION), len(program) + max_repeated)
     return machine.lights()
 
 
@@ -100,7 +100,7 @@ class _Machine:
         for _ in range(max_commands):
             if self.at >= len(self.code) or self.now > end or not self.command(self.byte()):
                 return
-        self.refuse(f"a program that runs at most {max_commands} commands in {end * TICK:g} s", "more")
+        self.refuse(f"a program that runs at most {max_commands} commands in {end * TICK_DURATION:g} s", "more")
 
     def command(self, code: int) -> bool:
         """Run one command; return False at the end of the program."""
@@ -174,7 +174,7 @@ class _Machine:
         """Return the colours so far: of pieces that begin at one time, the last."""
         last = {start: (a, b) for start, a, b in self.pieces}
         starts, colors = list(last), np.array(list(last.values()), float) / 255
-        return Lights.of_pieces(TICK * np.array(starts), colors[:, 0], colors[:, 1])
+        return Lights.of_pieces(TICK_DURATION * np.array(starts), colors[:, 0], colors[:, 1])
 
 
 def encode_lights(lights: Lights) -> bytes:
@@ -189,7 +189,7 @@ def encode_lights(lights: Lights) -> bytes:
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if times.ndim != 1:
         raise ConfigError(f"expected the lights of one drone, got shape {times.shape}. Encode one drone at a time.")
-    ticks = np.maximum(np.round((times - min(times[0], 0.0)) / TICK), 0).astype(int)
+    ticks = np.maximum(np.round((times - min(times[0], 0.0)) / TICK_DURATION), 0).astype(int)
     first, last = np.round(255 * starts).astype(int), np.round(255 * ends).astype(int)
     code = bytearray()
     color = None
@@ -229,7 +229,8 @@ def _colored(code: int, color: np.ndarray, duration: int) -> bytes:
 def _varint(value: int) -> bytes:
     if value > MAX_VARINT:
         raise ConfigError(
-            f"expected durations of at most {MAX_VARINT * TICK:g} s, got {value * TICK:g} s. Split longer pieces."
+            f"expected durations of at most {MAX_VARINT * TICK_DURATION:g} s, got {value * TICK_DURATION:g} s. "
+            "Split longer pieces."
         )
     code = bytearray()
     while value >= 0x80:

@@ -74,7 +74,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     end = show.duration if seconds is None else min(float(seconds), show.duration)
     if not np.isfinite(end) or end <= 0:
         raise ConfigError(f"expected a positive duration of the flight, s, got {seconds!r}")
-    sim = at_start(show, settings)
+    sim = start_simulation(show, settings)
     rate = _rate(sim.freq, end, show.n_drones)
     n = max(int(np.ceil(end * rate - 1e-6)), 1)
     times = np.arange(n + 1) / rate
@@ -96,7 +96,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - begin)
 
 
-def at_start(show: Show, settings: dict[str, Any]) -> Sim:
+def start_simulation(show: Show, settings: dict[str, Any]) -> Sim:
     """Return a simulation of one world whose drones hover where their trajectories begin."""
     sim = Sim(n_worlds=1, n_drones=show.n_drones, control="state", **settings)
     sim.add(Follow(show.trajectories, index=np.arange(show.n_drones)[None], visible=False))

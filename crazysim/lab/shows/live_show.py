@@ -7,7 +7,7 @@ from typing import Any
 from crazysim.lab.live.loop import Live
 from crazysim.lab.live.pace import Speed
 from crazysim.lab.show_files.show import Show
-from crazysim.lab.shows.flight import at_start
+from crazysim.lab.shows.flight import start_simulation
 
 LIGHT_FREQ = 50
 """Rate at which the LEDs change, Hz."""
@@ -44,7 +44,7 @@ def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
     Raises:
         ConfigError: If a setting is invalid.
     """
-    sim = at_start(show, settings)
+    sim = start_simulation(show, settings)
     live = Live(sim, speed=speed)
     live.add(ShowLights(show), freq=LIGHT_FREQ, name="lights")
     return live

@@ -37,13 +37,13 @@ def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArr
             difference = axis[i + 1 :] - axis[i]
             difference *= difference
             squares += difference
-        least, at = _refined(squares, t)
+        least, at = _refine_approach(squares, t)
         distance[i, i + 1 :] = distance[i + 1 :, i] = np.sqrt(least)
         when[i, i + 1 :] = when[i + 1 :, i] = at
     return distance, when
 
 
-def _refined(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
+def _refine_approach(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
     """Return the minima of sampled curves and their times, from parabolas through three samples. (k,) each
 
     Args:

@@ -21,15 +21,15 @@ from crazysim.media.flight_recorder import show_flight_at
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import change_material, draw_label, draw_points
 
-GLOW = 0.006
+GLOW_RADIUS_SHARE = 0.006
 """Radius of the glow around a light, as a fraction of the size of the show."""
-MIN_GLOW = 0.03
+MIN_GLOW_RADIUS = 0.03
 """Least radius of that glow, m."""
-ROOM = 1.2
+CAMERA_DISTANCE = 1.2
 """Distance of the camera, as a multiple of the size of the show."""
-SHOWN = 0.7
+MARK_DURATION = 0.7
 """Time for which a collision is marked, s."""
-RED = (1.0, 0.1, 0.1, 0.55)
+COLLISION_COLOR = (1.0, 0.1, 0.1, 0.55)
 """Colour of a mark."""
 MAX_FPS = 60.0
 """Largest number of images per second of a window."""
@@ -115,9 +115,9 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
         settings: Settings of ``crazysim.media.View`` that replace the defaults.
     """
     camera = camera_around(flight.planned)
-    size = camera["distance"] / ROOM
+    size = camera["distance"] / CAMERA_DISTANCE
     marks = collisions(flight)
-    lit = _lit(flight.sim)
+    lit = _led_materials(flight.sim)
 
     def draw(sim: Sim, world: int) -> None:
         now = float(sim.time[world, 0])
@@ -125,12 +125,12 @@ def view_of(flight: ShowFlight, **settings: Any) -> View:
         color_leds(sim, lit, flight.colors[k])
         glow = np.concatenate([flight.colors[k], np.full((flight.show.n_drones, 1), 0.6)], axis=1)
         pos = np.asarray(sim.data.states.pos[world], float)
-        sim.overlays.points(pos, glow, max(GLOW * size, MIN_GLOW), emission=1.0)
+        sim.overlays.points(pos, glow, max(GLOW_RADIUS_SHARE * size, MIN_GLOW_RADIUS), emission=1.0)
         for mark in marks:
-            if 0 <= now - mark["time"] <= SHOWN:
+            if 0 <= now - mark["time"] <= MARK_DURATION:
                 ids = [flight.show.names.index(name) for name in mark["drones"]]
                 point = pos[ids].mean(0)
-                draw_points(sim, point, RED, 4 * max(GLOW * size, MIN_GLOW))
+                draw_points(sim, point, COLLISION_COLOR, 4 * max(GLOW_RADIUS_SHARE * size, MIN_GLOW_RADIUS))
                 draw_label(sim, point, _ascii(" x ".join(mark["drones"])))
 
     defaults = {"width": 1280, "height": 720, "cam_config": camera, "text": "{time:.1f} s", "draw": draw}
@@ -141,7 +141,7 @@ def camera_around(points: NDArray) -> dict[str, Any]:
     """Return the settings of a free camera with all points of a show in view. (n, n_drones, 3)"""
     low, high = points.min((0, 1)), points.max((0, 1))
     size = max(float(np.linalg.norm(high - low)), 1.0)
-    return {"lookat": (low + high) / 2, "distance": ROOM * size, "azimuth": 110, "elevation": -18}
+    return {"lookat": (low + high) / 2, "distance": CAMERA_DISTANCE * size, "azimuth": 110, "elevation": -18}
 
 
 def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:
@@ -171,7 +171,7 @@ def darken(sim: Sim) -> None:
         np.minimum(sky[:, :3], NIGHT_SKY, out=sky[:, :3], casting="unsafe")
 
 
-def _lit(sim: Sim) -> tuple[str, ...]:
+def _led_materials(sim: Sim) -> tuple[str, ...]:
     """Return the materials of the LEDs that the airframe has."""
     return tuple(
         x for x in LED_MATERIALS if mujoco.mj_name2id(sim.mj_model, mujoco.mjtObj.mjOBJ_MATERIAL, f"{x}:0") >= 0

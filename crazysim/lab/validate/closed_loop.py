@@ -20,12 +20,12 @@ FREQ = 100
 """Samples of a flight per second, Hz, at which setpoints are commanded."""
 COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrltarget_z", "sp_ctrltarget_yaw")
 """Columns of a log of NanoBench (arXiv 2603.09908): time, s, motion capture, m, setpoint, m and degrees."""
-AIRBORNE, SETTLED, BEFORE_LANDING = 0.9, 2.0, 0.5
+AIRBORNE_SHARE, SETTLING_TIME, LANDING_TIME = 0.9, 2.0, 0.5
 """A flight is compared from SETTLED seconds after its setpoint has reached this share of its median height, until
 BEFORE_LANDING seconds before it leaves that height."""
-LOST = 2.0
+MAX_DISTANCE = 2.0
 """Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
-LONGEST_LAG = 1.2
+MAX_LAG = 1.2
 """Longest lag that is looked for, s."""
 
 
@@ -44,8 +44,8 @@ class Flight:
     def compared(self) -> slice:
         """Samples that are compared."""
         height = self.setpoint[:, 2]
-        up = np.flatnonzero(height > AIRBORNE * np.median(height[height > 0.5 * height.max()]))
-        return slice(up[0] + round(SETTLED * FREQ), up[-1] - round(BEFORE_LANDING * FREQ))
+        up = np.flatnonzero(height > AIRBORNE_SHARE * np.median(height[height > 0.5 * height.max()]))
+        return slice(up[0] + round(SETTLING_TIME * FREQ), up[-1] - round(LANDING_TIME * FREQ))
 
     def rmse(self, pos: NDArray) -> float:
         """Return the root mean square distance of positions, (n, 3), from the setpoint, m."""
@@ -59,7 +59,7 @@ class Flight:
         def distance(k: int) -> float:
             return float(np.mean((pos[first + k : last, :2] - self.setpoint[first : last - k, :2]) ** 2))
 
-        return min(range(round(LONGEST_LAG * FREQ)), key=distance) / FREQ
+        return min(range(round(MAX_LAG * FREQ)), key=distance) / FREQ
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Comparison:
     simulated_lag: float
     """The same in the simulation, s."""
     failed: bool
-    """True if the real drone was farther than ``LOST`` from its setpoint."""
+    """True if the real drone was farther than ``MAX_DISTANCE`` from its setpoint."""
 
     @property
     def ratio(self) -> float:
@@ -133,7 +133,7 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
     return commanded
 
 
-def laboratory(quat_deviation: float = 0.06) -> Estimator:
+def laboratory_estimator(quat_deviation: float = 0.06) -> Estimator:
     """Return the firmware's filter as laboratories with motion capture set it up.
 
     Positions at rest in NanoBench's logs scatter by 0.1 mm at most. The default of ``quat_deviation``, rad, is what
@@ -177,5 +177,5 @@ def compare(
         away = np.linalg.norm(flight.pos - flight.setpoint[:, :3], axis=-1)[flight.compared]
         errors = flight.rmse(flight.pos), flight.rmse(pos)
         lags = flight.lag(flight.pos), flight.lag(pos)
-        rows.append(Comparison(flight.name, *errors, *lags, bool(np.max(away) > LOST)))
+        rows.append(Comparison(flight.name, *errors, *lags, bool(np.max(away) > MAX_DISTANCE)))
     return rows

@@ -41,20 +41,20 @@ def parameters(car: Any) -> CommonRoadParams:
     return CommonRoadParams(**{name: as_parameter(x) for name, x in numbers.items()})
 
 
-def rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
+def commonroad_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
     """Return the rates of states and commands in CommonRoad's order. (..., 7)"""
     x = jnp.asarray(state)
     split = CommonRoadState(x[..., :2], *(x[..., k : k + 1] for k in range(2, 7)))
     return jnp.concatenate(commonroad_single_track(split, jnp.asarray(command), params), axis=-1)
 
 
-def own_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
+def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
     """Return the rates by ``single_track``, the model of our cars, which has tyres with limited grip. (7,)
 
     Steering angle and acceleration follow the commands within CommonRoad's limits.
     """
     x, p = jnp.asarray(state), params
-    limited = rates(state, command, params)
+    limited = commonroad_rates(state, command, params)
     zero, speed, slip = jnp.zeros(1), x[3:4], x[6:7]
     loads = p.mass * GRAVITY_MAGNITUDE * p.arms[..., ::-1] / jnp.sum(p.arms)
     car = CarParams(
@@ -95,7 +95,7 @@ def drive(f: Callable[[NDArray, list[float]], ArrayLike], start: NDArray, rate: 
     return x
 
 
-def of_commonroad() -> Iterable[Row]:
+def compare_with_commonroad() -> Iterable[Row]:
     """Yield differences from CommonRoad's single-track model, of rates and of drives under the same commands."""
     model = importlib.import_module("vehiclemodels.vehicle_dynamics_st").vehicle_dynamics_st
     car = importlib.import_module("vehiclemodels.parameters_vehicle2").parameters_vehicle2()
@@ -107,11 +107,11 @@ def of_commonroad() -> Iterable[Row]:
     theirs = np.array([model(list(row), list(command), car) for row, command in zip(x, u, strict=True)])
     with jax.enable_x64(True):
         params = parameters(car)
-        ours = np.asarray(rates(x, u, params))
+        ours = np.asarray(commonroad_rates(x, u, params))
         # rounding of float64 in differences of terms up to 1,000 times as large
         apart = float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
         yield Row("rates of 500 states, commands beyond the limits", REFERENCE, apart, "", (0, 1e-11))
-        laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (rates, own_rates)]
+        laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (commonroad_rates, crazysim_rates)]
         start = np.array([0.0, 0, 0, SPEED, 0, 0, 0])
         for rate in (0.03, 0.12):
             known = drive(lambda x, u: model(list(x), list(u), car), start, rate)

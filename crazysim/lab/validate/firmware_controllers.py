@@ -27,11 +27,11 @@ from crazysim.lab.validate.rows import Row
 RATE, POSITION_EVERY = 500, 5
 VECTORS = Path(crazysim.__file__).parents[1] / "tests"
 """Folder with the recorded outputs; it exists in a checkout of the sources only."""
-FILTERED = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
+FILTERED_AIRFRAME = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
 CASES: dict[str, tuple[Any, str, AirframeSource]] = {
     "pid-state": (PID(hold_yaw=True), "state", "cf2x_L250"),
     "pid-brushless": (PID(hold_yaw=True), "state", "cf21B_500"),
-    "pid-filters": (PID(hold_yaw=True), "state", FILTERED),
+    "pid-filters": (PID(hold_yaw=True), "state", FILTERED_AIRFRAME),
     "pid-attitude": (PID(hold_yaw=True), "attitude", "cf2x_L250"),
     "pid-rate": (PID(hold_yaw=True), "body_rate", "cf2x_L250"),
     "mellinger": (Mellinger(), "state", "cf2x_L250"),
@@ -39,20 +39,20 @@ CASES: dict[str, tuple[Any, str, AirframeSource]] = {
     "m-heavy": (Mellinger(), "state", "cf21B_500"),
 }
 """Controller, command level and airframe, by name of the recording."""
-TRUNCATED = 5.0
+MAX_TRUNCATION = 5.0
 """Most that the firmware's integers take from a motor, PWM: roll, pitch, yaw and motor lose less than one each, and
 where all motors are lowered by the excess of the highest, the difference of two motors counts."""
 FLOAT32 = 3.0
 """Rounding, PWM: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
 
 
-def recorded(name: str) -> NDArray:
+def recorded_pwm(name: str) -> NDArray:
     """Return the PWM of the motors by the compiled firmware. (n_ticks, n, 4)"""
     with np.load(VECTORS / "control" / "firmware_motors.npz") as file:
         return file[name].astype(float)
 
 
-def difference(name: str, whole_numbers: bool = False) -> NDArray:
+def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
     """Return the differences from the compiled firmware in 8 flights of 240 ticks, PWM. (240, 8, 4)
 
     Args:
@@ -62,17 +62,17 @@ def difference(name: str, whole_numbers: bool = False) -> NDArray:
     controller, mode, drone = CASES[name]
     states, commands = (x.astype(np.float32) for x in flights(mode, 8, 240, seed=11))
     controller = dataclasses.replace(controller, whole_numbers=whole_numbers)
-    return np.abs(law(controller, mode, states, commands, drone) - recorded(name))
+    return np.abs(compiled_pwm(controller, mode, states, commands, drone) - recorded_pwm(name))
 
 
-def of_controllers() -> Iterable[Row]:
+def compare_controllers() -> Iterable[Row]:
     """Yield the largest differences of the motors from those of the compiled firmware."""
     for name, (controller, mode, drone) in CASES.items():
         flown = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
-        for whole, bound in ((False, TRUNCATED + FLOAT32), (True, 1.0 + FLOAT32)):
+        for whole, bound in ((False, MAX_TRUNCATION + FLOAT32), (True, 1.0 + FLOAT32)):
             numbers = "integers as the firmware" if whole else "real numbers"
             what = f"{type(controller).__name__} on {mode} commands, {flown}, {numbers}: motors"
-            yield Row(what, "compiled C, 240 ticks", float(difference(name, whole).max()), "PWM", (0, bound))
+            yield Row(what, "compiled C, 240 ticks", float(pwm_differences(name, whole).max()), "PWM", (0, bound))
 
 
 def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArray]:
@@ -92,7 +92,9 @@ def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArra
     pos, vel = smooth(3, 2 * size, 1.0), smooth(3, 3 * size, 0.7)
     # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
     tilt, yaw = smooth(2, 1.2 * size, 0.5) * [1.0, 0.5], 3.0 + smooth(1, 2.0, 0.9)
-    quat = np.array([[of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)])
+    quat = np.array(
+        [[quat_of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)]
+    )
     ang_vel = smooth(3, 10 * size, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
@@ -110,7 +112,7 @@ def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArra
     return states, commands
 
 
-def of_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
+def quat_of_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
     """Return the quaternion of Rz(yaw) Ry(pitch) Rx(roll), xyzw."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(np.array([roll, pitch, yaw]) / 2), np.sin(np.array([roll, pitch, yaw]) / 2)
     return (
@@ -121,29 +123,33 @@ def of_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
     )
 
 
-def law(controller: Any, mode: str, states: NDArray, commands: NDArray, drone: AirframeSource = "cf2x_L250") -> NDArray:
+def compiled_pwm(
+    controller: Any, mode: str, states: NDArray, commands: NDArray, drone: AirframeSource = "cf2x_L250"
+) -> NDArray:
     """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
-    return np.asarray(_compiled(controller, mode)(numbers_of(controller, drone), states, commands))
+    return np.asarray(_compiled_flight(controller, mode)(controller_numbers(controller, drone), states, commands))
 
 
 @functools.cache
-def _compiled(controller: Any, mode: str) -> Any:
-    return jax.jit(functools.partial(_flown, controller, mode))
+def _compiled_flight(controller: Any, mode: str) -> Any:
+    return jax.jit(functools.partial(_flight_pwm, controller, mode))
 
 
-def numbers_of(controller: Any, drone: AirframeSource) -> tuple:
+def controller_numbers(controller: Any, drone: AirframeSource) -> tuple:
     """Return parameters and memory of a controller for an airframe, N of full PWM, and the curve of the thrust."""
     airframe = load_airframe(drone)
     newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
     return controller.params(airframe), controller.memory(airframe), newton, airframe.value("rotors.thrust_curve")[None]
 
 
-def law_of(controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250") -> Array:
-    """Return the same as ``law``, traceable."""
-    return _flown(controller, mode, numbers_of(controller, drone), states, commands)
+def pwm_of_controller(
+    controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250"
+) -> Array:
+    """Return the same as ``compiled_pwm``, traceable."""
+    return _flight_pwm(controller, mode, controller_numbers(controller, drone), states, commands)
 
 
-def _flown(controller: Any, mode: str, numbers: tuple, states: Any, commands: Any) -> Array:
+def _flight_pwm(controller: Any, mode: str, numbers: tuple, states: Any, commands: Any) -> Array:
     params, rest, newton, thrust_curve = numbers
     rest = jax.tree.map(jnp.asarray, rest)
     if mode != "state":

@@ -28,7 +28,7 @@ DIODE = np.array([0.015, 0.0075, 0.0], np.float32)
 NOISE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
 
 
-def measured(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
+def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
     """Return the estimate after the measurements of a loop, as tests/plugins/estimators/record_filter.py takes them."""
     if kind in ("position", "ground"):
         return error_state.select(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
@@ -55,7 +55,7 @@ def measured(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, 
     return error_state.select(k % 5 == 0, after, estimate)
 
 
-def kalman(kind: str) -> tuple[NDArray, NDArray]:
+def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
     """Return states and covariances of the Kalman filter in flights of 4 s, every 0.1 s, ours and the firmware's.
 
     Args:
@@ -75,7 +75,7 @@ def kalman(kind: str) -> tuple[NDArray, NDArray]:
         accel, gyro = inert[:3], inert[3:]
         predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
         estimate = error_state.add_noise(error_state.select(k % 10 == 0, predicted, estimate), jnp.asarray(NOISE))
-        estimate = error_state.finalize(measured(kind, k, m, gyro, estimate, rot, stations))
+        estimate = error_state.finalize(update_with_measurements(kind, k, m, gyro, estimate, rot, stations))
         state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
         return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
 
@@ -85,7 +85,7 @@ def kalman(kind: str) -> tuple[NDArray, NDArray]:
     return np.asarray(run(start, loops))[99::100], recorded
 
 
-def complementary(kind: str) -> tuple[NDArray, NDArray]:
+def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
     """Return states of the complementary filter in 2 s of 1 ms, every 20 ms, ours and the firmware's.
 
     Args:
@@ -118,10 +118,10 @@ def complementary(kind: str) -> tuple[NDArray, NDArray]:
     return np.asarray(run(start, inputs))[19::20], recorded
 
 
-def of_filters() -> Iterable[Row]:
+def compare_filters() -> Iterable[Row]:
     """Yield the largest differences of states from those of the compiled firmware."""
     for kind in KINDS:
-        found, recorded = kalman(kind)
+        found, recorded = kalman_states(kind)
         difference = np.abs(found - recorded)
         # rounding of float32, which 4,000 loops add up
         yield Row(f"Kalman filter, {kind}: position, velocity, attitude error", "compiled C, 4 s",
@@ -132,6 +132,6 @@ def of_filters() -> Iterable[Row]:
         yield Row(f"Kalman filter, {kind}: covariance", "compiled C, 4 s", float(relative.max()), "",
                   (0, 5e-3))  # fmt: skip
     for kind in ("pressure", "ground"):
-        found, recorded = complementary(kind)
+        found, recorded = complementary_states(kind)
         yield Row(f"complementary filter, {kind}: quaternion, height in m", "compiled C, 2 s",
                   float(np.abs(found - recorded)[:, :5].max()), "", (0, 5e-6))  # fmt: skip

@@ -11,10 +11,10 @@ from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Model, aligned, fast_rotation, prediction_errors, read_log
 from crazysim.lab.identify.prediction import HORIZONS
-from crazysim.lab.validate.closed_loop import compare, laboratory, read_flight
+from crazysim.lab.validate.closed_loop import compare, laboratory_estimator, read_flight
 from crazysim.lab.validate.rows import Row
 
-PUBLISHED = {
+PUBLISHED_ERRORS = {
     "position": {"rigid body at constant body rates": (0.0126, 0.1269), "hybrid model": (0.0166, 0.1119)},
     "attitude": {"rigid body at constant body rates": (1.175, 14.58), "hybrid model": (2.154, 13.21)},
 }
@@ -25,7 +25,7 @@ MASS = 0.045
 """Mass of IDSIA's drone, kg."""
 
 
-def logs(folder: Path, pattern: str) -> list[Path]:
+def find_logs(folder: Path, pattern: str) -> list[Path]:
     """Return the logs of a folder, ``.npz`` and ``.csv``, sorted.
 
     Raises:
@@ -39,9 +39,9 @@ def logs(folder: Path, pattern: str) -> list[Path]:
     return found
 
 
-def open_loop(folder: Path) -> Iterable[Row]:
+def compare_open_loop(folder: Path) -> Iterable[Row]:
     """Yield mean errors of predictions of melon from measured rotor speeds, over ``HORIZONS``, and published ones."""
-    path = logs(folder, "melon*")[0]
+    path = find_logs(folder, "melon*")[0]
     log = read_log(path)
     found: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
     errors: dict[str, NDArray] = {}
@@ -57,7 +57,7 @@ def open_loop(folder: Path) -> Iterable[Row]:
     found["attitude"]["constant body rates"] = errors["attitude at constant body rates"]
     found["attitude"]["unchanged"] = errors["attitude unchanged"]
     for what, unit in (("position", "m"), ("attitude", "degrees")):
-        known = {f"published {name}": figures for name, figures in PUBLISHED[what].items()}
+        known = {f"published {name}": figures for name, figures in PUBLISHED_ERRORS[what].items()}
         for series, figures in (found[what] | known).items():
             at, of = ((0.1, 0.5), "three melon flights") if series in known else (HORIZONS, path.stem)
             for h, figure in zip(at, figures, strict=True):
@@ -65,10 +65,10 @@ def open_loop(folder: Path) -> Iterable[Row]:
                 yield Row(label, of, float(figure), unit, series=series.replace("`", ""), at=h)
 
 
-def closed_loop(folder: Path) -> Iterable[Row]:
+def compare_closed_loop(folder: Path) -> Iterable[Row]:
     """Yield simulated over logged tracking errors, flight by flight."""
-    paths = [path for name in ("circle", "figure8", "trefoil") for path in logs(folder, f"*{name}*")]
-    for row in compare([read_flight(path) for path in paths], estimator=laboratory()):
+    paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
+    for row in compare([read_flight(path) for path in paths], estimator=laboratory_estimator()):
         other = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"
         if row.failed:
             yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, other=other)

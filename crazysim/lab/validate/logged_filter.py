@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError
-from crazysim.lab.validate.closed_loop import LOST, columns_of, commanded_samples
-from crazysim.lab.validate.flights import logs
+from crazysim.lab.validate.closed_loop import MAX_DISTANCE, columns_of, commanded_samples
+from crazysim.lab.validate.flights import find_logs
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.kalman import DEVIATIONS
@@ -25,13 +25,13 @@ PERIOD, LOOPS = 0.01, 10
 """Time between samples of a log, s, and the firmware's loops in it, each of which adds process noise."""
 PROCESS = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
 """Deviations of the noise of a loop of 1 ms, m, m/s, rad: (0.5, 0.5, 1) m/s^2 and 0.1 rad/s of the firmware."""
-SETTLED = 2.0
+SETTLING_TIME = 2.0
 """Time from the first setpoint, s, after which estimates are compared and drones fly."""
 
 
-def read(path: Path) -> dict[str, NDArray]:
+def read_filter_log(path: Path) -> dict[str, NDArray]:
     """Return a log of NanoBench from its first setpoint to its last: ``accel``, m/s^2, ``gyro``, rad/s, ``pos`` and
-    ``quat`` of motion capture (see ``along_thrust``), ``est_pos`` and ``est_quat`` of the filter on board, and
+    ``quat`` of motion capture (see ``thrust_attitudes``), ``est_pos`` and ``est_quat`` of the filter on board, and
     ``goal``, m. (n, k)
 
     Raises:
@@ -52,22 +52,22 @@ def read(path: Path) -> dict[str, NDArray]:
     commanded = commanded_samples(path.name, log["goal"][:, 2])
     log = {k: x[commanded[0] : commanded[-1]] for k, x in log.items()}
     accel = np.float32(GRAVITY_MAGNITUDE) * log["accel"]
-    return log | {"accel": accel, "quat": along_thrust(log["pos"], log["quat"])}
+    return log | {"accel": accel, "quat": thrust_attitudes(log["pos"], log["quat"])}
 
 
-def along_thrust(pos: NDArray, quat: NDArray) -> NDArray:
+def thrust_attitudes(pos: NDArray, quat: NDArray) -> NDArray:
     """Return the attitudes of a body whose z axis is the mean direction of the thrust in a flight. (n, 4)
 
     The tracked body is whatever its markers make it, while the filter takes z as the direction of the thrust, which it
-    is for the drone. The direction is that of the mean of R^T (a + g) from ``SETTLED`` on, with the acceleration a of
-    the positions: the mean of the drag is small beside it.
+    is for the drone. The direction is the mean of R^T (a + g) from ``SETTLING_TIME`` on, with the acceleration a of the
+    positions, compared with which the mean drag is small.
 
     Args:
         pos: Position of the tracked body, world frame, m. (n, 3)
         quat: Its attitude, body to world, xyzw. (n, 4)
     """
     accel = np.gradient(np.gradient(pos, PERIOD, axis=0), PERIOD, axis=0) + [0, 0, GRAVITY_MAGNITUDE]
-    force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[round(SETTLED / PERIOD) :]
+    force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[round(SETTLING_TIME / PERIOD) :]
     x, y, z = np.mean(force, axis=0) / np.linalg.norm(np.mean(force, axis=0))
     tilt = np.array([-y, x, 0, 1 + z]) / np.sqrt(2 + 2 * z)  # the shortest rotation of the z axis to (x, y, z)
     return np.asarray(rotation.multiply(jnp.asarray(quat), jnp.asarray(tilt, quat.dtype)))
@@ -98,24 +98,24 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
 
 def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float, float]:
     """Return the RMS differences of estimates from motion capture, of position, m, and of attitude, degrees."""
-    after = round(SETTLED / PERIOD)
+    after = round(SETTLING_TIME / PERIOD)
     turn = np.asarray(rotation.multiply(rotation.conjugate(jnp.asarray(log["quat"])), jnp.asarray(quat)))[after:]
     angle = 2 * np.arctan2(np.linalg.norm(turn[:, :3], axis=-1), np.abs(turn[:, 3]))
     distance = np.linalg.norm(pos - log["pos"], axis=-1)[after:]
     return float(np.sqrt(np.mean(distance**2))), float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
-def of_filter(folder: Path) -> Iterable[Row]:
+def compare_filter(folder: Path) -> Iterable[Row]:
     """Yield errors of the filter over those of the filter on board, flight by flight, without crashed flights."""
     flights = {}
-    for path in logs(folder, "*"):
+    for path in find_logs(folder, "*"):
         try:
-            flights[path.stem] = read(path)
+            flights[path.stem] = read_filter_log(path)
         except ConfigError as error:  # others are compared
             yield Row(path.stem, "filter on board", problem=str(error))
     n = max((len(log["pos"]) for log in flights.values()), default=0)
     for name, log in flights.items():
-        if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > LOST:
+        if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > MAX_DISTANCE:
             continue
         size = len(log["pos"])  # all are continued to one length, so that the filter compiles once
         longest = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))

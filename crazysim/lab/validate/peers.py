@@ -43,7 +43,7 @@ def mujoco_differences() -> dict[str, float]:
     return {k: float(np.max(np.abs(x - known[k]))) for k, x in found.items()}
 
 
-def of_mujoco() -> Iterable[Row]:
+def compare_with_mujoco() -> Iterable[Row]:
     """Yield the differences from C MuJoCo."""
     names = {"pos": ("position", "m"), "vel": ("velocity", "m/s"), "quat": ("quaternion", "")}
     names["ang_vel"] = "angular velocity", "rad/s"
@@ -54,7 +54,7 @@ def of_mujoco() -> Iterable[Row]:
         yield Row(f"free body under a wrench, 0.5 s: {name}", reference, x, unit, (0, bound))
 
 
-def of_crazyflow() -> Iterable[Row]:
+def compare_with_crazyflow() -> Iterable[Row]:
     """Yield the distance from Crazyflow's drone after 2 s under its own controllers, in float32."""
     weight = 0.0434 * GRAVITY_MAGNITUDE
     state = np.zeros((1, 1, 16), np.float32)

@@ -75,7 +75,9 @@ class Pilot:
         return self._action
 
 
-def held(pilot: Pilot, period: int, observe: Callable[[], np.ndarray], fly: Callable[[np.ndarray], None]) -> np.ndarray:
+def hold_goal(
+    pilot: Pilot, period: int, observe: Callable[[], np.ndarray], fly: Callable[[np.ndarray], None]
+) -> np.ndarray:
     """Return which drones stay within 0.3 m of their goal in the last second of a flight. (n,)
 
     Args:
@@ -93,7 +95,9 @@ def held(pilot: Pilot, period: int, observe: Callable[[], np.ndarray], fly: Call
     return away < 0.3  # a NaN is not held
 
 
-def held_here(sim: Sim, top: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int) -> np.ndarray:
+def hold_in_simulation(
+    sim: Sim, top: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int
+) -> np.ndarray:
     """Return which drones of a simulation, one a world, RAPTOR holds. (n_worlds,)
 
     Args:
@@ -122,17 +126,17 @@ def held_here(sim: Sim, top: np.ndarray, action: np.ndarray, delay: np.ndarray |
     sim.data = with_states(sim.data, pos=np.resize(start, (n, 1, 3)) + goal, rotor_vel=speeds(action))
     sim.rotor_vel_control(speeds(action))
     sim.add(Latency(delay))
-    return held(Pilot(period, action), period, observe, fly)
+    return hold_goal(Pilot(period, action), period, observe, fly)
 
 
-def of_airframes() -> Iterable[Row]:
+def compare_airframes() -> Iterable[Row]:
     """Yield the longest latency at which RAPTOR holds all drones of an airframe."""
     for drone in AIRFRAMES:
         top = load_airframe(drone).rotor_vel_limits[1].max()
         for period in PERIODS:
             sim = Sim(STARTS * len(DELAYS), drone=drone, control="rotor_vel", integrator="rk4")
             delay = np.repeat(np.array(DELAYS) // STEP, STARTS)[:, None]
-            shares = held_here(sim, top, np.zeros((sim.n_worlds, 4)), delay, period)
+            shares = hold_in_simulation(sim, top, np.zeros((sim.n_worlds, 4)), delay, period)
             shares = 100 * np.mean(shares.reshape(-1, STARTS), axis=-1)
             whole = int(np.argmin(np.append(shares == 100, False)))
             listed = ", ".join(f"{share:.0f}" for share in shares)
@@ -180,7 +184,7 @@ class Quadrotors:
         return np.repeat((2 * np.sqrt(self.mass * GRAVITY_MAGNITUDE / (4 * self.thrust)) - 1)[:, None], 4, axis=1)
 
 
-def trained_here(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
+def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
     """Return which quadrotors RAPTOR holds in crazysim. (n,)
 
     Args:
@@ -203,10 +207,10 @@ def trained_here(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
         "rotor_vel_max": np.full(1, top),
     }  # fmt: skip
     sim.data = sim.data.replace(params=params.replace(**{k: np.asarray(x, np.float32) for k, x in changes.items()}))
-    return held_here(sim, np.asarray(top), q.hover, delay, period)
+    return hold_in_simulation(sim, np.asarray(top), q.hover, delay, period)
 
 
-def trained_there(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
+def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
     """Return which quadrotors RAPTOR holds in l2f, the simulator of its training. (n,)
 
     Args:
@@ -252,16 +256,16 @@ def trained_there(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray
             batch.step(device, world, parameters, state, sent.pop(0).astype(np.float32), later, rng)
             state.assign(later)
 
-    return held(Pilot(period, q.hover), period, observe, fly)
+    return hold_goal(Pilot(period, q.hover), period, observe, fly)
 
 
-def of_trained() -> Iterable[Row]:
+def compare_training_airframes() -> Iterable[Row]:
     """Yield by how much the shares of held quadrotors of its training differ here and in the simulator of it."""
     quadrotors = Quadrotors.sample()
     for period in PERIODS:
         for delay in (0, 2, 6, 10):
             here, there = (
-                100 * np.mean(fly(quadrotors, delay // STEP, period)) for fly in (trained_here, trained_there)
+                100 * np.mean(fly(quadrotors, delay // STEP, period)) for fly in (hold_in_crazysim, hold_in_l2f)
             )
             # rounding decides over quadrotors at the edge of stability: 5 of 256 are 2 points
             yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim beside l2f",

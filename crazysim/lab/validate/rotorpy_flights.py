@@ -64,7 +64,7 @@ def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> 
     return sim
 
 
-def moving_air(params: dict[str, Any]) -> RotorAerodynamics:
+def rotor_aerodynamics(params: dict[str, Any]) -> RotorAerodynamics:
     """Return the effect with the coefficients of RotorPy's rotors."""
     return RotorAerodynamics(drag=params["k_d"], inflow=params["k_z"], hub_height=0.0)
 
@@ -90,7 +90,7 @@ def flight(params: dict[str, Any], commands: NDArray, effects: Sequence[Plugin] 
     return states
 
 
-def flight_of_rotorpy(params: dict[str, Any], commands: NDArray, aero: bool = False) -> States:
+def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False) -> States:
     """Return RotorPy's states after each command, in our names and units; with ``aero`` in ``WIND``."""
     multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
     drone = multirotor(params, aero=aero, integrator_kwargs={"rtol": 1e-10, "atol": 1e-12})
@@ -105,7 +105,7 @@ def flight_of_rotorpy(params: dict[str, Any], commands: NDArray, aero: bool = Fa
     return states
 
 
-def differences(one: dict[str, NDArray], other: dict[str, NDArray]) -> dict[str, float]:
+def state_differences(one: dict[str, NDArray], other: dict[str, NDArray]) -> dict[str, float]:
     """Return the differences of two states: of ``quat`` the angle, degrees, of others the length."""
     found = {name: float(np.linalg.norm(one[name] - other[name])) for name in one}
     return found | {"quat": math.degrees(angle_between(one["quat"], other["quat"]))}
@@ -126,7 +126,7 @@ def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArra
     vel, rate = rng.uniform(-speed, speed, (n, 3)), rng.uniform(-3, 3, (n, 3))
     speeds = hover_speed(params) * rng.uniform(0.9, 1.1, (n, 4))
     sim = simulation(params, n)
-    plugin = sim.add(moving_air(params))
+    plugin = sim.add(rotor_aerodynamics(params))
     moving = with_states(sim.data, vel=vel[:, None], ang_vel=rate[:, None], rotor_vel=speeds[:, None] / RPM_TO_RAD_S)
     s = stage("drone")(plugin.influence)(moving).states
     drag = vel @ np.asarray(sim.data.params.drag_matrix).reshape(3, 3)
@@ -140,16 +140,16 @@ def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArra
     return ours, np.stack(theirs)
 
 
-def of_rotorpy() -> Iterable[Row]:
+def compare_with_rotorpy() -> Iterable[Row]:
     """Yield differences of flights under the same commands of the rotors, and of wrenches in moving air."""
     params = importlib.import_module("rotorpy.vehicles.crazyflie_params").quad_params
     commands = hover_speed(params) * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (20, 4)))
     with jax.enable_x64(True):
-        ours, theirs = flight(params, commands[:10]), flight_of_rotorpy(params, commands[:10])
-        apart = differences(ours[-1], theirs[-1])
+        ours, theirs = flight(params, commands[:10]), rotorpy_flight(params, commands[:10])
+        apart = state_differences(ours[-1], theirs[-1])
         drag_only = flight(params, commands, [Wind(WIND)], drag=True)
-        ours = flight(params, commands, [Wind(WIND), moving_air(params)], drag=True)
-        theirs = flight_of_rotorpy(params, commands, aero=True)
+        ours = flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
+        theirs = rotorpy_flight(params, commands, aero=True)
         slow, fast = (wrenches(params, speed) for speed in (0.1, 3.0))
     # RotorPy's integrator keeps 1e-10 of each state in each of some 100 steps
     for name, what, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
@@ -169,7 +169,7 @@ def of_rotorpy() -> Iterable[Row]:
             yield Row(f"air at up to {speed:g} m/s: {what}", "RotorPy", apart_at, unit, None, size)
     for seconds in (1, 2):
         k = round(seconds / PERIOD) - 1
-        apart, simple = differences(ours[k], theirs[k]), differences(drag_only[k], theirs[k])
+        apart, simple = state_differences(ours[k], theirs[k]), state_differences(drag_only[k], theirs[k])
         for name, what, unit in (("pos", "position", "m"), ("quat", "attitude", "degrees")):
             other = f"linear drag alone: {simple[name]:.3g} {unit}"
             yield Row(f"flight in wind, {seconds} s: {what}", "RotorPy", apart[name], unit, None, other)

@@ -46,7 +46,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "closed", "Closed forms and orders", "In float64, at 500 Hz.", closed_forms.CHECKS,
         ),
         Section(
-            "mujoco", "C MuJoCo", "In float64, steps of 1 ms.", (peers.of_mujoco,),
+            "mujoco", "C MuJoCo", "In float64, steps of 1 ms.", (peers.compare_with_mujoco,),
         ),
         Section(
             "firmware", "The Crazyflie's firmware",
@@ -56,11 +56,12 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "Those of the Kalman filter last 4 s, with up to 5.4 m/s and tilts of up to 62 degrees, except on the "
             "ground; `flow` has no other sensor, `range` has flow and time of flight. Differences of covariances are "
             "relative to their size plus 1e-5.",
-            (firmware_controllers.of_controllers, firmware_filters.of_filters),
+            (firmware_controllers.compare_controllers, firmware_filters.compare_filters),
             absent="" if firmware_controllers.VECTORS.is_dir() else "run it in a checkout of the sources",
         ),
         Section(
-            "crazyflow", "Crazyflow", "In float32, Crazyflow's controllers in both programs.", (peers.of_crazyflow,),
+            "crazyflow", "Crazyflow", "In float32, Crazyflow's controllers in both programs.",
+            (peers.compare_with_crazyflow,),
             packages={"crazyflow": "crazyflow==0.4.0"},
         ),
         Section(
@@ -69,7 +70,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "s. In moving air ours has `RotorAerodynamics` with RotorPy's coefficients. Forces across the rotors are "
             "the same. Along them RotorPy's thrust falls linearly with the velocity, and ours follows momentum theory, "
             "with the lift of forward flight. The wind is (3, -1, 0.5) m/s.",
-            (rotorpy_flights.of_rotorpy,), packages={"rotorpy": "rotorpy==3.0.0"},
+            (rotorpy_flights.compare_with_rotorpy,), packages={"rotorpy": "rotorpy==3.0.0"},
         ),
         Section(
             "commonroad", "CommonRoad",
@@ -77,7 +78,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "equations above 0.5 m/s (slower, CommonRoad's model becomes kinematic at 0.1 m/s). `single_track` is the "
             "model of our cars, whose tyres have limited grip and loads that do not shift. The lane changes begin at "
             "15 m/s.",
-            (commonroad_cars.of_commonroad,), packages={"vehiclemodels": "commonroad-vehicle-models==3.0.2"},
+            (commonroad_cars.compare_with_commonroad,), packages={"vehiclemodels": "commonroad-vehicle-models==3.0.2"},
         ),
         Section(
             "idsia", "Real flights, open loop",
@@ -93,7 +94,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "does not have, so that its prediction turns over. "
             "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
             "`cf21B_500_idsia` is off, too.",
-            (partial(flights.open_loop, idsia),), absent=absent(idsia), logs=True,
+            (partial(flights.compare_open_loop, idsia),), absent=absent(idsia), logs=True,
             axes=("prediction over, s", "mean error"),
         ),
         Section(
@@ -101,7 +102,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "A Crazyflie 2.1: NanoBench. The simulated drone `cf2x_L250` follows the logged setpoints with the "
             "firmware's controller and filter. The figure is its RMS distance from the setpoint over that of the real "
             "drone.",
-            (partial(flights.closed_loop, nanobench),), absent=absent(nanobench), logs=True,
+            (partial(flights.compare_closed_loop, nanobench),), absent=absent(nanobench), logs=True,
             axes=("", "error of the simulation over that of the flight"),
         ),
         Section(
@@ -115,7 +116,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "and before both filters are compared with them, which lowers the attitude error of the filter on board in "
             "each flight, from 2.1 to 1.6 degrees in the median. The angle is that of the mean thrust over the whole "
             "flight, which no filter in flight has: with that of the first 3 s in the air the largest ratio is 1.17.",
-            (partial(logged_filter.of_filter, nanobench),), absent=absent(nanobench), logs=True,
+            (partial(logged_filter.compare_filter, nanobench),), absent=absent(nanobench), logs=True,
             axes=("", "error over that of the filter on board"),
         ),
         Section(
@@ -127,13 +128,13 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "latency, on thrusts of 1.5 to 5 weights and time constants of rising rotor speeds of 30 to 100 ms. Only "
             "`cf21B_500` is within these ranges: `cf2x_L250` has 1.49 weights and 136 ms, `crazyflie` 20 ms, "
             "`bumblebee` 10.1 weights.",
-            (raptor.of_airframes,), packages=RAPTOR,
+            (raptor.compare_airframes,), packages=RAPTOR,
         ),
         Section(
             "l2f", "l2f, the simulator of RAPTOR's training",
             "RAPTOR flies the same 256 quadrotors, drawn from the ranges of its training, in crazysim and in `l2f`, "
             "with methods of Runge-Kutta of order 4 and steps of 2 ms in both. The figure is the difference of "
             "the shares that it holds; latency costs as many quadrotors in the one as in the other.",
-            (raptor.of_trained,), packages=RAPTOR | {"l2f": "l2f==2.0.18"},
+            (raptor.compare_training_airframes,), packages=RAPTOR | {"l2f": "l2f==2.0.18"},
         ),
     )  # fmt: skip

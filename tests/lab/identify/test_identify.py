@@ -21,7 +21,7 @@ from crazysim.lab.identify import (
     prediction_errors,
     read_log,
 )
-from crazysim.lab.identify.readers import Stream, at_equal_times
+from crazysim.lab.identify.readers import Stream, resample
 from crazysim.plugins.effects import Residual
 from crazysim.rotation import to_rpy
 from crazysim.sim import Sim
@@ -335,7 +335,7 @@ def test_angles_that_wrap_are_interpolated_across_the_wrap(flights):
         "fast": Stream(0.004 * np.arange(500), {"x": yaw}),
         "slow": Stream(0.02 * np.arange(100), {"yaw": (yaw[::5] + 180) % 360 - 180}),
     }
-    table = at_equal_times("log", streams, [], Columns(rpy=("r", "p", "-yaw"), rad_per_angle=np.pi / 180))
+    table = resample("log", streams, [], Columns(rpy=("r", "p", "-yaw"), rad_per_angle=np.pi / 180))
     np.testing.assert_allclose(table["yaw"], yaw[: len(table["t"])], atol=1e-9)
 
 

@@ -6,7 +6,7 @@ from log_files import ANGLE, COLUMNS, RATE, SIDE, N, T, bag, blackbox, crazyflie
 
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Columns, read_log
-from crazysim.lab.identify.readers import Stream, at_equal_times, decompressed
+from crazysim.lab.identify.readers import Stream, decompress_quat, resample
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -38,7 +38,7 @@ def test_angles_after_a_sample_that_is_missing_are_kept():
     logged[20] = 1e30
     table = {"x": angle, "y": angle, "z": angle, "roll": 0 * angle, "pitch": 0 * angle, "yaw": logged}
     columns = Columns(rpy=("roll", "pitch", "yaw"), rad_per_angle=np.pi / 180)
-    found = at_equal_times("log", {"a": Stream(0.01 * np.arange(200), table)}, [], columns)["yaw"]
+    found = resample("log", {"a": Stream(0.01 * np.arange(200), table)}, [], columns)["yaw"]
     bad = np.isnan(found)
     assert 0 < np.sum(bad) < 3
     np.testing.assert_allclose(found[~bad], angle[: len(found)][~bad], atol=1e-6)
@@ -53,7 +53,7 @@ def test_compressed_attitudes_are_unpacked():
     unit = np.sqrt(0.5) / 511
     expected = np.array([[255, -511, 0, 511], [0, -100, 1, 0]]) * unit
     expected[0, 2], expected[1, 3] = 0.0, np.sqrt(1 - (100**2 + 1) * unit**2)
-    found = decompressed(np.array(packed, np.uint32))
+    found = decompress_quat(np.array(packed, np.uint32))
     np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
     np.testing.assert_allclose(found[0, [0, 1, 3]], expected[0, [0, 1, 3]], atol=1e-12)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim.__main__ import main
-from crazysim.lab.live.circles import CLIMB, HEIGHT, PERIOD, RADIUS, circling
+from crazysim.lab.live.circles import CLIMB, HEIGHT, PERIOD, RADIUS, circle_commands
 from crazysim.media import Flight
 
 
@@ -28,10 +28,10 @@ def test_circles_are_consistent():
     """Velocity and acceleration are derivatives of position once the drones have risen, and the start is at rest."""
     places = np.array([[[1.0, 2.0, 0.0]]])
     t, h = CLIMB + 0.3 * PERIOD, 1e-4
-    before, now, after = (circling(places, t + k * h)[0, 0] for k in (-1, 0, 1))
+    before, now, after = (circle_commands(places, t + k * h)[0, 0] for k in (-1, 0, 1))
     np.testing.assert_allclose(now[3:6], (after[:3] - before[:3]) / (2 * h), atol=1e-6)
     np.testing.assert_allclose(now[6:9], (after[:3] - 2 * now[:3] + before[:3]) / h**2, atol=1e-5)
-    start = circling(places, 0.0)[0, 0]
+    start = circle_commands(places, 0.0)[0, 0]
     np.testing.assert_allclose(start[:3], places[0, 0])
     assert not start[3:9].any()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim.errors import ConfigError
-from crazysim.lab.live.pace import BIN, MAX_LAG, Pace
+from crazysim.lab.live.pace import BIN_WIDTH, MAX_LAG, Pace
 
 
 class Clock:
@@ -60,7 +60,7 @@ def test_quantiles_of_lateness(clock):
     for k in range(1000):
         clock.now = 10.0 + k + (0.007 if k == 500 else 0.0)
         pace.begin(k)
-    assert pace.quantile(0.999) <= BIN + 1e-9
+    assert pace.quantile(0.999) <= BIN_WIDTH + 1e-9
     np.testing.assert_allclose(pace.quantile(1.0), 0.007, atol=1e-9)
 
 

@@ -8,24 +8,26 @@ import pytest
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live import Gamepad, Keyboard, Live, Pilot, keyboard_sticks
-from crazysim.lab.live.gamepad import DEADBAND, shaped
-from crazysim.lab.live.piloting import hold, moved, setpoint_of
+from crazysim.lab.live.gamepad import DEADBAND, remove_deadband
+from crazysim.lab.live.piloting import hold_setpoint, move_setpoint, setpoint_of
 from crazysim.sim import Sim
 
 
 def test_sticks_move_in_the_axes_of_the_drone():
     """A second forwards, left, up and turning, from a yaw of 90 degrees: forwards is y, left is -x."""
     start = [1.0, 2.0, 3.0, np.pi / 2]
-    np.testing.assert_allclose(moved(start, [1, 0, 0, 0], 1.0, 2.0, 0.5), [1, 4, 3, np.pi / 2], atol=1e-12)
-    np.testing.assert_allclose(moved(start, [0, 1, 0, 0], 1.0, 2.0, 0.5), [-1, 2, 3, np.pi / 2], atol=1e-12)
-    np.testing.assert_allclose(moved(start, [0, 0, -1, 0], 0.5, 2.0, 0.5), [1, 2, 2, np.pi / 2], atol=1e-12)
-    np.testing.assert_allclose(moved(start, [0, 0, 0, 1], 1.0, 2.0, 0.5), [1, 2, 3, np.pi / 2 + 0.5], atol=1e-12)
-    assert abs(moved([0, 0, 0, 3.0], [0, 0, 0, 1], 1.0, 1.0, 1.0)[3] - (4.0 - 2 * np.pi)) < 1e-12
+    np.testing.assert_allclose(move_setpoint(start, [1, 0, 0, 0], 1.0, 2.0, 0.5), [1, 4, 3, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(move_setpoint(start, [0, 1, 0, 0], 1.0, 2.0, 0.5), [-1, 2, 3, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(move_setpoint(start, [0, 0, -1, 0], 0.5, 2.0, 0.5), [1, 2, 2, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(
+        move_setpoint(start, [0, 0, 0, 1], 1.0, 2.0, 0.5), [1, 2, 3, np.pi / 2 + 0.5], atol=1e-12
+    )
+    assert abs(move_setpoint([0, 0, 0, 3.0], [0, 0, 0, 1], 1.0, 1.0, 1.0)[3] - (4.0 - 2 * np.pi)) < 1e-12
 
 
 def test_a_setpoint_is_written_and_read():
     command = np.ones(16)
-    hold(command, [1.0, 2.0, 3.0, -2.5])
+    hold_setpoint(command, [1.0, 2.0, 3.0, -2.5])
     np.testing.assert_allclose(setpoint_of(command), [1, 2, 3, -2.5])
     np.testing.assert_allclose(np.linalg.norm(command[9:13]), 1.0)
     assert not command[3:9].any()
@@ -142,8 +144,8 @@ def test_a_gamepad_is_sticks_and_buttons():
 
 
 def test_noise_of_sticks():
-    np.testing.assert_array_equal(shaped(np.array([DEADBAND, -DEADBAND, np.nan, np.inf])), 0)
-    np.testing.assert_allclose(shaped(np.array([1.0, -1.0, 1.2])), [1, -1, 1])
+    np.testing.assert_array_equal(remove_deadband(np.array([DEADBAND, -DEADBAND, np.nan, np.inf])), 0)
+    np.testing.assert_allclose(remove_deadband(np.array([1.0, -1.0, 1.2])), [1, -1, 1])
 
 
 def test_a_gamepad_flies(live):

@@ -14,7 +14,7 @@ from waiting import wait_for
 
 from crazysim import IMU, ConfigError, Sim
 from crazysim.drones import load_airframe
-from crazysim.lab.live.sitl import ArduPilot, Betaflight, Measured, Origin, Px4, SoftwareInTheLoop
+from crazysim.lab.live.sitl import ArduPilot, Betaflight, Measurements, Origin, Px4, SoftwareInTheLoop
 from crazysim.lab.live.sitl.loop import FIELD, motor_order
 from crazysim.lab.live.sitl.measured import quat_ned
 from crazysim.plugins.sensors import GPS, Barometer, Magnetometer, Triad
@@ -428,7 +428,7 @@ def test_measurements_are_those_of_the_plugins_in_the_axes_of_the_body():
                 sim.step(50)
             states = sim.data.states
             for k, measured in enumerate(loop.measure()):
-                assert isinstance(measured, Measured)
+                assert isinstance(measured, Measurements)
                 pos, rotation = np.asarray(states.pos[k, 0]), matrix(states.quat[k, 0])
                 assert measured.height == pytest.approx(pos[2])
                 # In float32, with positions of 50 m.

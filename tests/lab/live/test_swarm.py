@@ -11,9 +11,9 @@ from crazysim import Sim
 from crazysim.control import Control
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.lab.live.loop import Live
-from crazysim.lab.live.paths import Path, paths_of
+from crazysim.lab.live.paths import HostTrajectory, host_trajectories
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
-from crazysim.lab.live.swarm.plan import Plan, move, nearest_yaw
+from crazysim.lab.live.swarm.plan import PlannedMotion, move, nearest_yaw
 from crazysim.trajectories import Trajectory, circle, line, minimum_snap
 
 OFFSET = 0.02
@@ -49,8 +49,8 @@ def test_a_move_begins_and_ends_as_it_must():
 
 
 def test_a_reversed_slow_plan():
-    path = Path.of(line([0, 0, 1], [2, 0, 1], 4.0))
-    plan = Plan(path, 1.0, timescale=2.0, reversed=True)
+    path = HostTrajectory.of(line([0, 0, 1], [2, 0, 1], 4.0))
+    plan = PlannedMotion(path, 1.0, timescale=2.0, reversed=True)
     np.testing.assert_allclose(plan.at(1.0)[0, :3], [2, 0, 1], atol=1e-6)
     np.testing.assert_allclose(plan.at(5.0)[0, :3], [1, 0, 1], atol=1e-6)
     ahead = (plan.at(5.01)[0] - plan.at(4.99)[0]) / 0.02
@@ -62,13 +62,13 @@ def test_a_reversed_slow_plan():
 
 def test_paths_equal_trajectories():
     trajectories = [circle(radius=0.5, period=3.0), minimum_snap([[0, 0, 1], [1, 0, 2], [2, 1, 1]], [1.0, 2.0])]
-    for path, trajectory in zip(paths_of(trajectories), trajectories, strict=True):
+    for path, trajectory in zip(host_trajectories(trajectories), trajectories, strict=True):
         for t in (-1.0, 0.0, 0.7, 1.0, 2.9, 4.1):
             s = trajectory.evaluate(t)
             expected = [[*s.pos, *s.yaw], [*s.vel, *s.yaw_rate], [*s.acc, *s.yaw_acc]]
             np.testing.assert_allclose(path.derivatives(t, 2), expected, atol=2e-3)
-    assert len(paths_of(Trajectory.stack(trajectories))) == 2
-    assert len(paths_of(trajectories[0])) == 1
+    assert len(host_trajectories(Trajectory.stack(trajectories))) == 2
+    assert len(host_trajectories(trajectories[0])) == 1
 
 
 def test_the_nearest_yaw():
@@ -188,7 +188,7 @@ def test_groups():
 
 
 def test_trajectories_start_where_they_must():
-    path = Path.of(line([0, 0, 1], [2, 0, 1], 4.0))
+    path = HostTrajectory.of(line([0, 0, 1], [2, 0, 1], 4.0))
     commander = flying(upload=(3, path), take_off=(1.0, 1.0))
     tick(commander, 12.0)
     commander.start_trajectory(3)
@@ -306,7 +306,7 @@ calls = st.one_of(
 @settings(max_examples=200, deadline=None)
 @given(sequence=st.lists(st.tuples(st.floats(0.01, 3.0), calls), max_size=8))
 def test_setpoints_stay_finite_whatever_is_commanded(sequence):
-    commander = flying(upload=(1, Path.of(circle(radius=0.5, period=2.0))))
+    commander = flying(upload=(1, HostTrajectory.of(circle(radius=0.5, period=2.0))))
     now = 10.0
     for dt, (name, arguments) in sequence:
         with contextlib.suppress(ConfigError):

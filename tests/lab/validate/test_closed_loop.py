@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.lab.validate.closed_loop import Flight, compare, fly, laboratory, read_flight
+from crazysim.lab.validate.closed_loop import Flight, compare, fly, laboratory_estimator, read_flight
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_a_flight_of_the_simulation_is_matched(circling, tmp_path):
     assert abs(row.ratio - 1) < 0.01
     assert row.logged_lag == row.simulated_lag == pytest.approx(0.5, abs=0.1)  # 1 / kp of the position loop
     assert not row.failed
-    (row,) = compare([flight], estimator=laboratory())
+    (row,) = compare([flight], estimator=laboratory_estimator())
     assert 1.0 < row.ratio < 1.3
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.lab.validate.logged_filter import errors, of_filter, read
+from crazysim.lab.validate.logged_filter import compare_filter, errors, read_filter_log
 
 RNG = np.random.default_rng(0)
 
@@ -35,11 +35,11 @@ def write(path, away=0.0, n=600):
 def test_a_hover_is_estimated_better_than_by_a_filter_that_is_off(tmp_path):
     write(tmp_path / "hover.npz")
     write(tmp_path / "crashed.npz", away=3.0)
-    log = read(tmp_path / "hover.npz")
+    log = read_filter_log(tmp_path / "hover.npz")
     # The scatter moves the mean thrust by 1 mm / (2 * 0.01 s) / 4 s, 0.1 degrees.
     np.testing.assert_allclose(errors(log, log["est_pos"], log["est_quat"]), [0.03, 10.0], rtol=1e-3)
     np.testing.assert_allclose(np.degrees(2 * log["quat"][:, :3]), 0, atol=0.2)
-    position, attitude = of_filter(tmp_path)
+    position, attitude = compare_filter(tmp_path)
     assert "hover" in position.what
     assert position.figure < 0.1  # scatter of sqrt(3) mm at most, of 30
     assert attitude.figure < 0.1
@@ -48,7 +48,7 @@ def test_a_hover_is_estimated_better_than_by_a_filter_that_is_off(tmp_path):
 def test_a_log_without_a_flight_is_a_row(tmp_path):
     write(tmp_path / "hover.npz")
     write(tmp_path / "rest.npz", away=-1.0)
-    *flown, failed = sorted(of_filter(tmp_path), key=lambda row: row.failed)
+    *flown, failed = sorted(compare_filter(tmp_path), key=lambda row: row.failed)
     assert "expected a setpoint above the floor" in failed.problem
     assert len(flown) == 2
 
@@ -56,4 +56,4 @@ def test_a_log_without_a_flight_is_a_row(tmp_path):
 def test_other_logs_are_refused(tmp_path):
     np.savez(tmp_path / "other.npz", t=0.01 * np.arange(9))
     with pytest.raises(ConfigError, match="got no imu_acc_x"):
-        read(tmp_path / "other.npz")
+        read_filter_log(tmp_path / "other.npz")

@@ -16,7 +16,7 @@ from crazysim.plugins.sensors import IMU, Barometer, TimeOfFlight
 @pytest.mark.parametrize("kind", ["pressure", "ground"])
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
     """In 2 s of 1 ms: but for rounding of float32, in 500 updates of numbers around one."""
-    found, recorded = firmware_filters.complementary(kind)
+    found, recorded = firmware_filters.complementary_states(kind)
     assert np.ptp(recorded[:, [0, 1, 2, 4, 5]], axis=0).min() > 0.05, "nothing moved: the run shows nothing"
     np.testing.assert_allclose(found[:, :4], recorded[:, :4], rtol=0, atol=5e-6)
     np.testing.assert_allclose(found[:, 4], recorded[:, 4], rtol=0, atol=5e-6)

@@ -19,7 +19,7 @@ ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
 @pytest.mark.parametrize("kind", firmware_filters.KINDS)
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
     """In fast flights of 4 s: but for rounding of float32 that 4,000 loops of 1 ms add up."""
-    found, recorded = firmware_filters.kalman(kind)
+    found, recorded = firmware_filters.kalman_states(kind)
     assert np.ptp(recorded[:, :3], axis=0).max() > (0.01 if kind == "ground" else 1.0), "nothing moved"
     np.testing.assert_allclose(found[:, :9], recorded[:, :9], rtol=0, atol=2e-4)
     np.testing.assert_allclose(found[:, 9:13], recorded[:, 9:13], rtol=0, atol=5e-6)

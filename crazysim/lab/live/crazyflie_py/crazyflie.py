@@ -12,7 +12,7 @@ from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.crazyflie_py.uav_trajectory import Trajectory
 from crazysim.lab.live.swarm import Commander, Swarm
-from crazysim.lab.live.swarm.parameters import SOLID
+from crazysim.lab.live.swarm.parameters import LED_SOLID
 from crazysim.lab.live.swarm.sensors import battery_of
 
 
@@ -120,7 +120,7 @@ class Crazyflie:
 
     def setLEDColor(self, r: float, g: float, b: float) -> None:
         """Set the colour of the light, 0 to 1, by the effect for one colour of ``ring.effect``."""
-        self.setParam("ring.effect", SOLID)
+        self.setParam("ring.effect", LED_SOLID)
         for color, value in zip(("Red", "Green", "Blue"), np.clip([r, g, b], 0.0, 1.0).tolist(), strict=True):
             self.setParam(f"ring.solid{color}", int(255 * value))
 

@@ -10,7 +10,7 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.live.paths import Path
+from crazysim.lab.live.paths import HostTrajectory
 
 
 class Polynomial:
@@ -93,7 +93,7 @@ class Trajectory:
         found = path.derivatives(t, 2)
         return TrajectoryOutput(found[0, :3], found[1, :3], found[2, :3], np.array([0, 0, found[1, 3]]), found[0, 3])
 
-    def path(self) -> Path:
+    def path(self) -> HostTrajectory:
         """Return the trajectory for ``Commander.upload``.
 
         Raises:
@@ -111,4 +111,4 @@ class Trajectory:
         ):
             raise ConfigError(f"expected pieces of finite coefficients and positive durations, got {len(axes)} pieces")
         scaled = coefficients * durations[:, None, None] ** np.arange(n)
-        return Path(np.cumsum(durations), scaled, False)
+        return HostTrajectory(np.cumsum(durations), scaled, False)

@@ -17,7 +17,7 @@ import numpy as np
 
 from crazysim.control import Control
 from crazysim.errors import ConfigError
-from crazysim.lab.live.crtp.setpoints import high_level, streamed
+from crazysim.lab.live.crtp.setpoints import handle_generic, handle_high_level
 from crazysim.lab.live.crtp.tables import (
     LOG_TYPES,
     PARAM_TYPES,
@@ -225,12 +225,12 @@ class CrtpDevice:
             else:
                 self.commander.attitude(*angles, self._force(thrust))
         elif channel == 0:
-            streamed(self.commander, data)
+            handle_generic(self.commander, data)
         return []
 
     def _high_level(self, channel: int, data: bytes) -> list[Packet]:
         try:
-            high_level(self.commander, data, bytes(self.memory))
+            handle_high_level(self.commander, data, bytes(self.memory))
             code = 0
         except ConfigError as error:
             self._report(str(error))

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.live.paths import Path
+from crazysim.lab.live.paths import HostTrajectory
 from crazysim.lab.live.swarm.commander import Commander
 from crazysim.trajectories.bezier import power_of
 
-PIECE = 132
+PIECE_SIZE = 132
 """Size of an uncompressed piece, bytes: 8 coefficients each of x, y, z and yaw, and the duration."""
 N_POINTS = (0, 1, 3, 7)
 """Number of further control points of each type of a compressed coordinate (``CompressedSegment`` of cflib)."""
 
 
-def streamed(commander: Commander, data: bytes) -> None:
+def handle_generic(commander: Commander, data: bytes) -> None:
     """Carry out a packet of the generic commander: its type, then numbers (crtp_commander_generic.c).
 
     Raises:
@@ -58,7 +58,7 @@ def unpack_quat(packed: int) -> NDArray:
     return quat
 
 
-def high_level(commander: Commander, data: bytes, memory: bytes) -> None:
+def handle_high_level(commander: Commander, data: bytes, memory: bytes) -> None:
     """Carry out a packet of the high-level commander: its type, then numbers (crtp_commander_high_level.c).
 
     Raises:
@@ -75,7 +75,7 @@ def high_level(commander: Commander, data: bytes, memory: bytes) -> None:
             raise ConfigError(
                 f"expected a trajectory in memory of type 0 or 1, got location {location}, type {encoding}"
             )
-        path = _compressed(memory, offset) if encoding else _uncompressed(memory, offset, n)
+        path = _bezier_trajectory(memory, offset) if encoding else _polynomial_trajectory(memory, offset, n)
         commander.upload(identity, path, compressed=bool(encoding))
         return
     if not commander.in_group(content[0]):
@@ -105,19 +105,19 @@ def high_level(commander: Commander, data: bytes, memory: bytes) -> None:
         raise ConfigError(f"expected a high-level command of type 0 to 8, 12 or 13, got {kind}")
 
 
-def _uncompressed(memory: bytes, offset: int, n: int) -> Path:
+def _polynomial_trajectory(memory: bytes, offset: int, n: int) -> HostTrajectory:
     """Return the trajectory of polynomials in memory."""
-    if not n or offset + PIECE * n > len(memory):
+    if not n or offset + PIECE_SIZE * n > len(memory):
         raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n} from {offset} on")
     with np.errstate(invalid="ignore"):  # of NaN, which is refused below
         numbers = np.frombuffer(memory, "<f4", 33 * n, offset).astype(float).reshape(n, 33)
     durations, c = numbers[:, 32], numbers[:, :32].reshape(n, 4, 8)
     _require_durations(durations)
     with np.errstate(over="ignore", invalid="ignore"):
-        return _checked(durations, c * durations[:, None, None] ** np.arange(8))
+        return _checked_trajectory(durations, c * durations[:, None, None] ** np.arange(8))
 
 
-def _compressed(memory: bytes, offset: int) -> Path:
+def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     """Return the trajectory of Bezier curves in memory: a start, then segments of control points.
 
     A segment without duration ends it, whatever number of pieces was sent with its definition (pptraj_compressed.c).
@@ -146,7 +146,7 @@ def _compressed(memory: bytes, offset: int) -> Path:
         ) from None
     if not pieces:  # the firmware stays at the start
         durations, pieces = [0.001], [[[x] + [0.0] * 7 for x in last]]
-    return _checked(np.array(durations), np.array(pieces))
+    return _checked_trajectory(np.array(durations), np.array(pieces))
 
 
 def _require_durations(durations: NDArray) -> None:
@@ -154,7 +154,7 @@ def _require_durations(durations: NDArray) -> None:
         raise ConfigError(f"expected pieces of positive durations, got {durations.tolist()} s")
 
 
-def _checked(durations: NDArray, coefficients: NDArray) -> Path:
+def _checked_trajectory(durations: NDArray, coefficients: NDArray) -> HostTrajectory:
     if not np.isfinite(coefficients).all() or np.abs(coefficients).max() > 1e6:
         raise ConfigError("expected a trajectory of finite coefficients, got others")
-    return Path(np.cumsum(durations), coefficients, False)
+    return HostTrajectory(np.cumsum(durations), coefficients, False)

@@ -25,9 +25,9 @@ PARAM_TYPES = {
     "uint8_t": (8, "<B"), "uint16_t": (9, "<H"), "uint32_t": (10, "<I"),
 }  # fmt: skip
 """Number and format of the types of parameters (``ParamTocElement`` of cflib)."""
-READ_ONLY = 0x40
+READ_ONLY_BIT = 0x40
 """Bit of the type of a parameter that cannot be written."""
-OUT_OF_RANGE = 32767
+OUT_OF_RANGE_DISTANCE = 32767
 """Distance where nothing is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
 RANGES = {"down": "zrange"}
 """Log variables of directions that have another name."""
@@ -69,7 +69,7 @@ class Table:
         """Return the description of a variable: type, group and name."""
         variable = self.variables[k]
         group, name = variable.name.split(".")
-        kind = self.types[variable.ctype][0] | (READ_ONLY if variable.read_only else 0)
+        kind = self.types[variable.ctype][0] | (READ_ONLY_BIT if variable.read_only else 0)
         return bytes([kind]) + group.encode() + b"\0" + name.encode() + b"\0"
 
     def format(self, k: int) -> str:
@@ -143,7 +143,7 @@ def log_of(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
     def distance(name: str) -> Reading:
         def millimetres(_state: DroneState, _commander: Commander) -> float:
             value = 1000 * ranges_of(sim, drone)[name]
-            return value if math.isfinite(value) else OUT_OF_RANGE
+            return value if math.isfinite(value) else OUT_OF_RANGE_DISTANCE
 
         return millimetres
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.mocap.frames import Convention, Frame
-from crazysim.lab.live.paths import paths_of
+from crazysim.lab.live.paths import host_trajectories
 from crazysim.storage import Closing
 from crazysim.trajectories import Trajectory
 
@@ -117,7 +117,7 @@ def show_source(
     Raises:
         ConfigError: If there is not one name for each trajectory.
     """
-    given = paths_of(trajectories)
+    given = host_trajectories(trajectories)
     names = [f"vcf{k}" for k in range(len(given))] if names is None else list(names)
     if len(names) != len(given) or len(set(names)) < len(names):
         raise ConfigError(

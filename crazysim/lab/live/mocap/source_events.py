@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 log = logging.getLogger(__name__)
 
-KEPT = 1000
+MAX_REPORTS = 1000
 """Number of reports that are kept."""
 
 
@@ -30,7 +30,7 @@ class Reports:
 
     def __init__(self) -> None:
         """Begin without reports."""
-        self.latest: deque[Report] = deque(maxlen=KEPT)
+        self.latest: deque[Report] = deque(maxlen=MAX_REPORTS)
         self.counts: Counter[tuple[str, str]] = Counter()
 
     def add(self, kind: str, name: str, time: float, text: str) -> None:

@@ -15,9 +15,9 @@ from crazysim.lab.live.mocap.source_events import Reports
 
 N_INTERVALS = 32
 """Number of intervals between frames whose median is the period of the source."""
-FARTHEST = 1e6
+MAX_COORDINATE = 1e6
 """Coordinates from here on are invalid, m."""
-CLOCK = 10.0
+CLOCK_AGE = 10.0
 """Age of the least delay, s, after which it is forgotten: clocks drift."""
 
 
@@ -183,7 +183,7 @@ class Tracker:
 
     def _watch_delay(self, now: float, delay: float) -> None:
         """Report frames that took longer than the quickest one; the clocks may differ by any constant."""
-        if delay < self._least_delay or now - self._least_at > CLOCK:
+        if delay < self._least_delay or now - self._least_at > CLOCK_AGE:
             self._least_delay, self._least_at = delay, now
         elif delay - self._least_delay > self.rules.late:
             self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
@@ -212,7 +212,7 @@ class Tracker:
         entries, rows = self._rows(frame.names, now)
         pos, quat = frame.pos[entries], frame.quat[entries]
         norm = np.sqrt((quat * quat).sum(-1))
-        valid = (np.abs(pos) < FARTHEST).all(-1) & (norm > 1e-3) & np.isfinite(norm)
+        valid = (np.abs(pos) < MAX_COORDINATE).all(-1) & (norm > 1e-3) & np.isfinite(norm)
         if not valid.all():
             for k in rows[~valid]:
                 self._report("invalid", self.names[k], now, "pose not finite, or quaternion zero; it keeps its pose")

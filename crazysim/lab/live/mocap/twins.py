@@ -28,7 +28,7 @@ from crazysim.sim.sim import Sim
 from crazysim.storage import Closing
 from crazysim.tables import read_numbers
 
-NOWHERE = (0.0, 0.0, -100.0)
+HIDDEN_POSITION = (0.0, 0.0, -100.0)
 """Position of an object before its first pose, world frame, m: below every floor."""
 
 
@@ -130,10 +130,11 @@ class Twins(Closing):
                 )
             found[name] = twin
         self.twins = found
-        self._order = _in_order(found)
+        self._order = _parents_first(found)
         with sim.scene.unchanged_on_error():
             self.handles: dict[str, Handle] = {
-                name: sim.scene.add(t.what, name, pos=NOWHERE, mocap=True, **t.options) for name, t in found.items()
+                name: sim.scene.add(t.what, name, pos=HIDDEN_POSITION, mocap=True, **t.options)
+                for name, t in found.items()
             }
         self._rows = np.array([handle.rows[0] for handle in self.handles.values()], np.int32)
         self.tracker = Tracker(self.names, rules, source.name)
@@ -145,7 +146,7 @@ class Twins(Closing):
         fixed = np.array([[np.nan if x is None else x for x in t.fixed] for t in of_twins], float).reshape(-1, 3)
         self._fixed, self._is_fixed = fixed, np.isfinite(fixed).any(-1)
         self._poses = (
-            np.tile(NOWHERE, (len(found), 1)),
+            np.tile(HIDDEN_POSITION, (len(found), 1)),
             np.tile([0.0, 0, 0, 1], (len(found), 1)),
             np.zeros((len(found), 3)),
         )
@@ -180,7 +181,7 @@ class Twins(Closing):
                 "expected the simulation whose scene has the twins, got one without movable objects. Pass the one that "
                 "Twins(sim, ...) was made for."
             )
-        new = _written((objects.pos, objects.quat, objects.vel), self._rows, self._poses)
+        new = _write_poses((objects.pos, objects.quat, objects.vel), self._rows, self._poses)
         sim.data = data.replace(objects=objects.replace(pos=new[0], quat=new[1], vel=new[2]))
 
     def freeze(self, *names: str) -> None:
@@ -280,12 +281,12 @@ def discover(source: MocapSource, twins: Mapping[str, Twin], seconds: float = 1.
 
 
 @jax.jit
-def _written(old: tuple[Array, Array, Array], rows: Array, new: tuple[NDArray, NDArray, NDArray]) -> list[Array]:
+def _write_poses(old: tuple[Array, Array, Array], rows: Array, new: tuple[NDArray, NDArray, NDArray]) -> list[Array]:
     """Return poses and velocities of all objects with some rows replaced in every world."""
     return [x.at[..., rows, :].set(jnp.asarray(y, x.dtype)) for x, y in zip(old, new, strict=True)]
 
 
-def _in_order(twins: Mapping[str, Twin]) -> list[int]:
+def _parents_first(twins: Mapping[str, Twin]) -> list[int]:
     """Return the indices of the parts of skeletons, parents first.
 
     Raises:

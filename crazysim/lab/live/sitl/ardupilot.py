@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink
-from crazysim.lab.live.sitl.measured import Measured, frd, ned, quat_ned
+from crazysim.lab.live.sitl.measured import Measurements, frd, ned, quat_ned
 
 PORT = 9002
 """Port at which a simulation listens."""
@@ -47,7 +47,7 @@ class ArduPilot(FirmwareLink):
         """
         self._link = Datagrams(host, port)
 
-    def send(self, measured: Measured) -> None:
+    def send(self, measured: Measurements) -> None:
         """Answer the last packet with the state; before the first one there is nothing to answer."""
         line = {
             "timestamp": measured.time,

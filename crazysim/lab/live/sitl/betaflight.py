@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.sitl.link import Datagrams, FirmwareLink, Rate, check_address
-from crazysim.lab.live.sitl.measured import TURN, ZURICH, Measured, Origin, as_origin, frd
+from crazysim.lab.live.sitl.measured import HALF_TURN_COSINE, ZURICH, Measurements, Origin, as_origin, frd
 from crazysim.tables import range_between, read_numbers
 
 PORTS = (9002, 9003, 9004)
@@ -89,7 +89,7 @@ class Betaflight(FirmwareLink):
     def channels(self, values: ArrayLike) -> None:
         self._channels = _pulses(values).astype(np.float64)
 
-    def send(self, measured: Measured) -> None:
+    def send(self, measured: Measurements) -> None:
         """Send the state, and the remote control when it is due."""
         gyro, (x, y, z, w) = frd(measured.gyro), measured.quat
         latitude, longitude, altitude = self.origin.place(measured.gps_pos)
@@ -98,7 +98,7 @@ class Betaflight(FirmwareLink):
             self._start = self._start or (latitude, longitude)  # the bridge mirrors places at the first one
             latitude, longitude = (2 * x - y for x, y in zip(self._start, (latitude, longitude), strict=True))
         else:
-            quat = TURN * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
+            quat = HALF_TURN_COSINE * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up
             gyro = gyro * [1, 1, -1]
         place = (longitude, latitude, altitude)
         state = (*gyro, *frd(measured.accel), *quat, *measured.gps_vel, *place, self.origin.pressure(measured.height))

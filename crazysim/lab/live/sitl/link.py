@@ -12,17 +12,17 @@ from typing import ClassVar
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, short_repr
-from crazysim.lab.live.sitl.measured import Measured
+from crazysim.lab.live.sitl.measured import Measurements
 from crazysim.storage import Closing
 from crazysim.tables import POSITIVE, range_between, read_number, read_numbers
 
 ROUNDING = 1e-6
 """Tolerance of times for the rounding of sums of periods, s."""
-MAX_NUMBER = 65535
+MAX_DATAGRAM = 65535
 """Longest datagram, bytes."""
 LAST_PORT = 65535
 """Largest number of a port."""
-DRAINING = 0.1
+MAX_DRAIN_TIME = 0.1
 """Longest time for reading the packets that are there once the time to wait is over, s, however fast others arrive."""
 TIMEOUT = range_between(high=1e6, positive=True)
 """Range of a time to wait, s."""
@@ -43,7 +43,7 @@ class FirmwareLink(Closing):
     """True for a firmware that waits for the simulation, False for one with a clock of its own."""
 
     @abstractmethod
-    def send(self, measured: Measured) -> None:
+    def send(self, measured: Measurements) -> None:
         """Send the measurements of an instant."""
 
     @abstractmethod
@@ -132,11 +132,11 @@ class Datagrams(Closing):
             read: Function that returns the contents of a packet, or None for another format, which is skipped.
         """
         found, now = None, time.monotonic()
-        deadline, end = now + timeout, now + timeout + DRAINING
+        deadline, end = now + timeout, now + timeout + MAX_DRAIN_TIME
         while now < end:
             self._socket.settimeout(max(deadline - now, 0.0) if found is None else 0.0)
             try:
-                packet, sender = self._socket.recvfrom(MAX_NUMBER)
+                packet, sender = self._socket.recvfrom(MAX_DATAGRAM)
             except (TimeoutError, BlockingIOError):
                 break
             except ConnectionRefusedError:  # of a packet that was sent to a program that does not listen

@@ -18,7 +18,7 @@ from crazysim.errors import ConfigError, short_repr
 from crazysim.lab.live.attitude import rotate
 from crazysim.lab.live.pace import Pace, Speed
 from crazysim.lab.live.sitl.link import ROUNDING, TIMEOUT, FirmwareLink
-from crazysim.lab.live.sitl.measured import Measured
+from crazysim.lab.live.sitl.measured import Measurements
 from crazysim.lab.live.staging import compile_step
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
@@ -28,13 +28,13 @@ from crazysim.tables import NOT_NEGATIVE, read_number
 
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field where there is no ``Magnetometer``, world frame, T: about that of central Europe."""
-LONG = 1.0
+SILENCE_LIMIT = 1.0
 """Time of a run from which a firmware that sends no motor commands in it is an error, s."""
 GPS_FREQ = 5
 """Rate of satellite navigation where there is no ``GPS``, Hz."""
-KINDS = (IMU, Barometer, Magnetometer, GPS)
+SENSOR_KINDS = (IMU, Barometer, Magnetometer, GPS)
 """Sensors whose measurements firmware receives."""
-MOUNTED = (IMU, Magnetometer)
+MOUNTED_SENSORS = (IMU, Magnetometer)
 """Those that measure in a frame of their own, at an attitude in the body."""
 
 
@@ -90,7 +90,7 @@ class SoftwareInTheLoop(Closing):
         self._orders = [motor_order(a, link, reversed) for a, link in zip(airframes, self.links, strict=True)]
         self._airframes, self._fastest = airframes, [airframe.rotor_vel_limits[1] for airframe in airframes]
         self._sensors: dict[type, Any] = {
-            kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None) for kind in KINDS
+            kind: next((p for p in sim.plugins.values() if isinstance(p, kind)), None) for kind in SENSOR_KINDS
         }
         if self._sensors[IMU] is None:
             self._sensors[IMU] = sim.add(IMU())
@@ -127,7 +127,7 @@ class SoftwareInTheLoop(Closing):
             self.exchange()
             self._check_heard(time.monotonic() - self.timeout, self.timeout)
             self.sim.step(self._n_steps)
-        if seconds > LONG and (passed := time.monotonic() - began) > LONG:
+        if seconds > SILENCE_LIMIT and (passed := time.monotonic() - began) > SILENCE_LIMIT:
             self._check_heard(began, passed)
 
     def exchange(self) -> None:
@@ -141,33 +141,33 @@ class SoftwareInTheLoop(Closing):
                 self._rotor_vel[k] = self._speeds(k, command)
                 self._heard[k] = time.monotonic()
             elif link.lockstep:
-                raise _silent(link, self.timeout)
+                raise _silence_error(link, self.timeout)
         self._exchanges += 1
         sim = self.sim
         sim.rotor_vel_control(self._rotor_vel.reshape(sim.n_worlds, sim.n_drones, 4))
 
-    def measure(self) -> list[Measured]:
+    def measure(self) -> list[Measurements]:
         """Return the measurements of every drone; new ones are those since the last exchange."""
         return self._measurements()[0]
 
-    def _measurements(self) -> tuple[list[Measured], NDArray]:
+    def _measurements(self) -> tuple[list[Measurements], NDArray]:
         """Return the measurements of every drone, and when the sensors took them. (n_links, n_kinds)"""
         states, time_now = self.sim.data.states, self._exchanges * self._n_steps / self.sim.freq
         pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
-        values, taken = zip(*map(self._latest, KINDS), strict=True)
+        values, taken = zip(*map(self._latest, SENSOR_KINDS), strict=True)
         imu, height, field, gps = values
         if field is None:
             field = rotate(quat * [-1, -1, -1, 1], FIELD)
         gps = np.concatenate([pos, vel], axis=-1) if gps is None else gps
         counts: dict[type[Sensor], int] = {GPS: math.floor(time_now * GPS_FREQ + ROUNDING)}
-        when = np.empty((len(self.links), len(KINDS)), np.int64)
-        for k, kind in enumerate(KINDS):
+        when = np.empty((len(self.links), len(SENSOR_KINDS)), np.int64)
+        for k, kind in enumerate(SENSOR_KINDS):
             when[:, k] = counts.get(kind, self._exchanges) if taken[k] is None else taken[k]
         is_new = np.ones_like(when, bool) if self._taken is None else when != self._taken
         found = []
         for k in range(len(self.links)):
             found.append(
-                Measured(
+                Measurements(
                     time=time_now,
                     gyro=imu[k, :3],
                     accel=imu[k, 3:],
@@ -179,7 +179,7 @@ class SoftwareInTheLoop(Closing):
                     gps_vel=gps[k, 3:],
                     height=float(pos[k, 2] if height is None else height[k, 1]),
                     field=field[k],
-                    new=frozenset(kind for kind, changed in zip(KINDS, is_new[k], strict=True) if changed),
+                    new=frozenset(kind for kind, changed in zip(SENSOR_KINDS, is_new[k], strict=True) if changed),
                 )
             )
         return found, when
@@ -197,7 +197,7 @@ class SoftwareInTheLoop(Closing):
         if taken.min() < 0:
             observed = self.sim.plugins.observations(self.sim.data)
             value = np.concatenate([observed[f"{sensor.name}.{name}"] for name in sensor.channels], axis=-1)
-        if kind in MOUNTED:
+        if kind in MOUNTED_SENSORS:
             vectors = value.reshape(*value.shape[:-1], -1, 3)
             value = rotate(np.asarray(record.quat, float)[..., None, :], vectors).reshape(value.shape)
         return _rows(value), taken
@@ -206,7 +206,7 @@ class SoftwareInTheLoop(Closing):
         """Check that motor commands of every firmware arrived after a time of ``time.monotonic``, ``seconds`` ago."""
         for link, heard in zip(self.links, self._heard, strict=True):
             if heard <= since:
-                raise _silent(link, seconds)
+                raise _silence_error(link, seconds)
 
     def close(self) -> None:
         """Close all links."""
@@ -248,7 +248,7 @@ def _rows(values: Any) -> NDArray:
     return values.reshape(-1, values.shape[-1])
 
 
-def _silent(link: FirmwareLink, seconds: float) -> ConfigError:
+def _silence_error(link: FirmwareLink, seconds: float) -> ConfigError:
     return ConfigError(
         f"expected motor commands of {type(link).__name__} within {seconds:.3g} s, got none. Start the firmware, or "
         f"set timeout."

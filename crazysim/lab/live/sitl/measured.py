@@ -16,15 +16,15 @@ from crazysim.plugins.sensors.sensor import Sensor
 
 METRES_PER_DEGREE = 6371000.0 * np.pi / 180
 """Length of a degree of latitude on a sphere with the mean radius of the earth (IUGG), m."""
-MOST_LATITUDE = 89.0
+MAX_LATITUDE = 89.0
 """Largest latitude, degrees: the plane that touches the earth has no longitudes at a pole."""
-LOWEST, HIGHEST = -1000.0, 11000.0
+MIN_ALTITUDE, MAX_ALTITUDE = -1000.0, 11000.0
 """Altitudes of the lowest layer of the standard atmosphere, m, whose pressures are sent: up to the tropopause."""
-TURN = np.sqrt(0.5)
+HALF_TURN_COSINE = np.sqrt(0.5)
 """Cosine and sine of half a quarter turn, 1."""
 
 
-class Measured(NamedTuple):
+class Measurements(NamedTuple):
     """Measurements of one drone, and its true state.
 
     World axes are x east, y north and z up (ENU), body axes x forward, y left and z up (FLU).
@@ -61,11 +61,11 @@ class Measured(NamedTuple):
 class Origin:
     """Place of the world's origin on the earth."""
 
-    latitude: float = setting(low=-MOST_LATITUDE, high=MOST_LATITUDE)
+    latitude: float = setting(low=-MAX_LATITUDE, high=MAX_LATITUDE)
     """Latitude, degrees."""
     longitude: float = setting(low=-180.0, high=180.0)
     """Longitude, degrees."""
-    altitude: float = setting(low=LOWEST, high=HIGHEST)
+    altitude: float = setting(low=MIN_ALTITUDE, high=MAX_ALTITUDE)
     """Altitude above sea level, m."""
 
     def __post_init__(self) -> None:
@@ -129,4 +129,4 @@ def quat_ned(quat: NDArray) -> NDArray:
         quat: Attitude of forward, left, up in east, north, up, xyzw. (4,)
     """
     x, y, z, w = quat
-    return TURN * np.array([w + z, x + y, x - y, w - z])
+    return HALF_TURN_COSINE * np.array([w + z, x + y, x - y, w - z])

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, not_installed
-from crazysim.lab.live.sitl.link import DRAINING, TIMEOUT, FirmwareLink, check_address
-from crazysim.lab.live.sitl.measured import ZURICH, Measured, Origin, as_origin, frd, ned, quat_ned
+from crazysim.lab.live.sitl.link import MAX_DRAIN_TIME, TIMEOUT, FirmwareLink, check_address
+from crazysim.lab.live.sitl.measured import ZURICH, Measurements, Origin, as_origin, frd, ned, quat_ned
 from crazysim.plugins.sensors import GPS, IMU, Barometer, Magnetometer
 from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.tables import read_number
@@ -94,7 +94,7 @@ class Px4(FirmwareLink):
         """Address at which it listens."""
         return self._server.getsockname()
 
-    def send(self, measured: Measured) -> None:
+    def send(self, measured: Measurements) -> None:
         """Send ``HIL_SENSOR``, ``HIL_GPS`` where there is a new position, and ``HIL_STATE_QUATERNION``."""
         origin, mav, micros = self.origin, self._mavlink, round(measured.time * 1e6)
         field = frd(measured.field) / GAUSS
@@ -144,7 +144,7 @@ class Px4(FirmwareLink):
     def _newest(self, deadline: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
         found, now = None, time.monotonic()
-        end = max(deadline, now) + DRAINING
+        end = max(deadline, now) + MAX_DRAIN_TIME
         while now < end and self._readable(max(deadline - now, 0.0) if found is None else 0.0):
             for message in self._messages():
                 if message.get_type() == "HIL_ACTUATOR_CONTROLS":

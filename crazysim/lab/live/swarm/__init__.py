@@ -1,8 +1,8 @@
 """Swarms of simulated drones that take the commands of Crazyflies."""
 
 from crazysim.lab.live.swarm.commander import Commander
-from crazysim.lab.live.swarm.plan import Plan
+from crazysim.lab.live.swarm.plan import PlannedMotion
 from crazysim.lab.live.swarm.state import DroneState
 from crazysim.lab.live.swarm.swarm import Swarm
 
-__all__ = ["Commander", "DroneState", "Plan", "Swarm"]
+__all__ = ["Commander", "DroneState", "PlannedMotion", "Swarm"]

@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import yaw_of
-from crazysim.lab.live.paths import Path
+from crazysim.lab.live.paths import HostTrajectory
 from crazysim.lab.live.swarm.estimate import EstimateFrame
-from crazysim.lab.live.swarm.plan import Plan, move, nearest_yaw
+from crazysim.lab.live.swarm.plan import PlannedMotion, move, nearest_yaw
 from crazysim.lab.live.swarm.state import DroneState
 
 STABILIZE, SHUTDOWN = 0.5, 2.0
 """Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
-FARTHEST = 1e3
+MAX_COORDINATE = 1e3
 """Largest coordinate of a command, m, and largest number of any command."""
 SINK, DEEPEST = 0.3, 1.0
 """Speed at which the setpoint continues down where a landing has ended above its height, m/s, and its distance, m."""
@@ -52,7 +52,7 @@ class Commander:
         self.control = control
         self._report = report
         self.group = 0
-        self.trajectories: dict[int, Path] = {}
+        self.trajectories: dict[int, HostTrajectory] = {}
         self._compressed: set[int] = set()
         self.reset()
 
@@ -61,8 +61,8 @@ class Commander:
         self.now = 0.0
         self.pos, self.vel, self.yaw = np.zeros(3), np.zeros(3), 0.0
         self.armed, self.locked = True, False
-        self._plan: Plan | None = None
-        self._held: tuple[Plan, NDArray] | None = None
+        self._plan: PlannedMotion | None = None
+        self._held: tuple[PlannedMotion, NDArray] | None = None
         self.estimate_frame: EstimateFrame | None = None
         self._stream: tuple[str, NDArray] | None = None
         self._stream_time, self._released = 0.0, math.inf
@@ -116,13 +116,13 @@ class Commander:
         if relative:
             goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
         end = [*goal, nearest_yaw(begin[0, 3], yaw)]
-        self._plan = Plan(move(begin, end, _duration(duration), linear), self.now)
+        self._plan = PlannedMotion(move(begin, end, _duration(duration), linear), self.now)
 
     def stop(self) -> None:
         """Stop the motors."""
         self._plan = self._stream = None
 
-    def upload(self, identity: int, path: Path, compressed: bool = False) -> None:
+    def upload(self, identity: int, path: HostTrajectory, compressed: bool = False) -> None:
         """Receive a trajectory.
 
         Args:
@@ -170,7 +170,7 @@ class Commander:
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
-        plan = Plan(self.trajectories[identity], self.now, timescale, bool(reversed))
+        plan = PlannedMotion(self.trajectories[identity], self.now, timescale, bool(reversed))
         begin, first = self._begin("start_trajectory")[0], plan.at(self.now)[0]
         shift = np.zeros(4)
         if relative:
@@ -297,7 +297,7 @@ class Commander:
             self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
         return self._held[1]
 
-    def _has_landed(self, plan: Plan) -> bool:
+    def _has_landed(self, plan: PlannedMotion) -> bool:
         """Return True if the drone is as low as its landing goes, or stands on something."""
         stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING
         return stands or self.pos[2] <= plan.at(self.now)[0, 2] + REACHED
@@ -345,7 +345,7 @@ class Commander:
         if yaw is not None:
             goal[3] = nearest_yaw(here[3], _numbers("yaw", [yaw], 1)[0])
         begin = np.array([here, np.zeros(4), np.zeros(4)])
-        self._plan = Plan(move(begin, goal, _duration(duration)), self.now, lands=lands)
+        self._plan = PlannedMotion(move(begin, goal, _duration(duration)), self.now, lands=lands)
 
     def _motion(self) -> NDArray:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
@@ -378,7 +378,7 @@ class Commander:
             )
 
 
-def _numbers(name: str, values: ArrayLike, n: int, limit: float = FARTHEST) -> NDArray:
+def _numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE) -> NDArray:
     """Return finite numbers within a limit. (n,)"""
     try:
         x = np.array(values, float)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from crazysim.drones import Airframe
 from crazysim.errors import ConfigError
 
-OFF, SOLID, MEMORY, FADE = 0, 7, 13, 14
+LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE = 0, 7, 13, 14
 """Effects of the LED ring (``effectsFct`` in ledring12.c of crazyflie-firmware): dark, ``ring.solidRed`` and so on, the
 memory of 12 LEDs, ``ring.fadeColor``."""
-LIGHTS = ("ring.", "colorLedBot.")
+LIGHT_GROUPS = ("ring.", "colorLedBot.")
 """Groups of parameters of lights."""
-INITIAL = ("kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
+INITIAL_POSE = ("kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
 """Pose that ``kalman.resetEstimation`` gives to the estimate, m and rad."""
 
 
@@ -38,13 +38,13 @@ PARAMETERS: dict[str, Parameter] = {
     "stabilizer.estimator": Parameter("uint8_t", 2, simulated=False),
     "stabilizer.controller": Parameter("uint8_t", 1, simulated=False),
     "kalman.resetEstimation": Parameter("uint8_t"),
-    **{name: Parameter("float") for name in INITIAL},
+    **{name: Parameter("float") for name in INITIAL_POSE},
     "commander.enHighLevel": Parameter("uint8_t", 1, simulated=False),
     **{f"flightmode.stabMode{axis}": Parameter("uint8_t", axis != "Yaw") for axis in ("Roll", "Pitch", "Yaw")},
     "locSrv.extPosStdDev": Parameter("float", 0.01, simulated=False),
     "locSrv.extQuatStdDev": Parameter("float", 0.0045, simulated=False),
     "hlCommander.groupmask": Parameter("uint8_t"),
-    "ring.effect": Parameter("uint8_t", OFF),
+    "ring.effect": Parameter("uint8_t", LED_OFF),
     "ring.neffect": Parameter("uint32_t", 18, read_only=True),
     **{f"ring.solid{color}": Parameter("uint8_t", 20) for color in ("Red", "Green", "Blue")},
     "ring.fadeColor": Parameter("uint32_t"),
@@ -104,7 +104,7 @@ class Parameters(Mapping[str, float]):
     @property
     def initial_pose(self) -> NDArray:
         """Position, m, and yaw, rad, that a reset gives to the estimate. (4,)"""
-        return np.array([self._values[name] for name in INITIAL])
+        return np.array([self._values[name] for name in INITIAL_POSE])
 
     def get_value(self, name: str) -> float:
         """Return a value.
@@ -131,15 +131,15 @@ class Parameters(Mapping[str, float]):
             raise ConfigError(f"expected a finite value of a parameter that can be written, got {name} = {value:g}")
         # Clients read values in their format, so 0.0045 comes back with the rounding of float32.
         is_same = math.isclose(value, self._values[name], rel_tol=1e-6)
-        is_effect = name != "ring.effect" or value in (OFF, SOLID, MEMORY, FADE)
+        is_effect = name != "ring.effect" or value in (LED_OFF, LED_SOLID, LED_MEMORY, LED_FADE)
         if not (is_effect and (kind.simulated or is_same)):
             raise ConfigError(
                 f"expected a value whose effect is simulated, got {name} = {value:g}; it stays {self._values[name]:g}. "
                 f"{PAGE}"
             )
         self._values[name] = value
-        self.has_initial_pose |= name in INITIAL
-        if name.startswith(LIGHTS):
+        self.has_initial_pose |= name in INITIAL_POSE
+        if name.startswith(LIGHT_GROUPS):
             self.light.changed(self._values, name, now)
 
 
@@ -173,17 +173,17 @@ class Light:
             now: Time, s.
         """
         effect, duration = values["ring.effect"], 0.0
-        sets = {SOLID: ("ring.solidRed", "ring.solidGreen", "ring.solidBlue"), FADE: ("ring.fadeColor",)}
+        sets = {LED_SOLID: ("ring.solidRed", "ring.solidGreen", "ring.solidBlue"), LED_FADE: ("ring.fadeColor",)}
         if name.startswith("colorLedBot."):
             white, *color = int(values["colorLedBot.wrgb8888"]).to_bytes(4, "big")
             target = np.minimum(np.array(color) + white, 255) / 255
         elif name not in ("ring.effect", *sets.get(int(effect), ("memory",))):
             return
-        elif effect == SOLID:
-            target = np.array([values[color] for color in sets[SOLID]]) / 255
-        elif effect == FADE:
+        elif effect == LED_SOLID:
+            target = np.array([values[color] for color in sets[LED_SOLID]]) / 255
+        elif effect == LED_FADE:
             target = np.array(list((int(values["ring.fadeColor"]) & 0xFFFFFF).to_bytes(3, "big"))) / 255
             duration = max(values["ring.fadeTime"], 0.0)
         else:
-            target = self.memory.mean(axis=0) if effect == MEMORY else np.zeros(3)
+            target = self.memory.mean(axis=0) if effect == LED_MEMORY else np.zeros(3)
         self._begin, self._target, self._start, self._duration = self.color(now), target, now, duration

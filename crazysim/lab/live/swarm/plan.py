@@ -7,18 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.lab.live.paths import Path
+from crazysim.lab.live.paths import HostTrajectory
 
-NO_JERK = np.linalg.inv(
+NO_JERK_INVERSE = np.linalg.inv(
     [[k * (k - 1) * (k - 2) if d == 3 else [1, k, k * (k - 1)][d] for k in range(4, 8)] for d in range(4)]
 )
 """Inverse of the powers 4 to 7 of a polynomial and its derivatives 1, 2, 3 at the end of its unit interval. (4, 4)"""
 
 
-class Plan(NamedTuple):
+class PlannedMotion(NamedTuple):
     """A path with its start, speed, direction and place."""
 
-    path: Path
+    path: HostTrajectory
     """Path."""
     start: float
     """Time at which it starts, s."""
@@ -50,7 +50,7 @@ class Plan(NamedTuple):
         return found
 
 
-def move(begin: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> Path:
+def move(begin: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> HostTrajectory:
     """Return the move to rest at a goal.
 
     It is the polynomial of degree 7 with the given position, velocity and acceleration at its start, at rest at its
@@ -70,8 +70,8 @@ def move(begin: ArrayLike, goal: ArrayLike, duration: float, linear: bool = Fals
     else:
         known = np.stack([p, v, a, np.zeros(4)])
         ends = np.stack([goal - p - v - a, -v - 2 * a, -2 * a, np.zeros(4)])
-        coefficients = np.concatenate([known, NO_JERK @ ends]).T
-    return Path(np.array([duration]), coefficients[None], False)
+        coefficients = np.concatenate([known, NO_JERK_INVERSE @ ends]).T
+    return HostTrajectory(np.array([duration]), coefficients[None], False)
 
 
 def nearest_yaw(yaw: float, goal: float) -> float:

@@ -24,7 +24,7 @@ from crazysim.lab.live.loop import Live
 from crazysim.lab.live.mocap.source_events import Reports
 from crazysim.lab.live.staging import compile_step
 from crazysim.lab.live.swarm.commander import Commander
-from crazysim.lab.live.swarm.parameters import LIGHTS, Parameters, parameters_of
+from crazysim.lab.live.swarm.parameters import LIGHT_GROUPS, Parameters, parameters_of
 from crazysim.lab.live.swarm.sensors import ranges_of
 from crazysim.lab.live.swarm.state import DroneState
 from crazysim.plugins.effects import MotorFailure
@@ -134,7 +134,7 @@ class Swarm(Closing):
                 self.commanders[k].group = int(value)
             elif name == "kalman.resetEstimation" and value and parameters.has_initial_pose:
                 self.commanders[k].place_estimate(self._states[k].pos, self._yaws[k], parameters.initial_pose)
-            elif name.startswith(LIGHTS):
+            elif name.startswith(LIGHT_GROUPS):
                 self.colors[k] = parameters.light.color(self.time)
 
     def set_leds(self, drone: int, packed: NDArray) -> None:
