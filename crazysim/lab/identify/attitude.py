@@ -42,7 +42,7 @@ class FittedModel(PyTree):
         Args:
             airframe: Airframe.
             dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
-            mass: Mass, kg; None for that of the airframe.
+            mass: Mass, kg; None for the airframe's.
 
         Raises:
             ConfigError: If the airframe has no fit of that model.
@@ -120,7 +120,7 @@ def identify_attitude(
         airframe: Name or path of the airframe to start from.
         dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
         source: Description of the logs, with date.
-        mass: Mass in the flights, kg; None for that of the airframe.
+        mass: Mass in the flights, kg; None for the airframe's.
 
     Raises:
         ConfigError: If a log has no attitude commands or has gaps, or the fit is no airframe.

@@ -70,10 +70,10 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
     """Return the columns of a bag of ROS 1 or 2, interpolated at the times of the fastest topic.
 
     A name such as ``/drone/odom/pose/pose/position/x`` or ``/motors/data[0]`` is a topic and a field of its messages.
-    Without such names, the columns are those of crazysim's logs: position and attitude of the only topic of a type in
-    ``POSES``; the twist of Odometry, which is in the frame of the body (nav_msgs/Odometry), with the velocity
+    Without such names, the columns are named as in crazysim's logs: position and attitude of the only topic of a type
+    in ``POSES``; the twist of Odometry, which is in the frame of the body (nav_msgs/Odometry), with the velocity
     turned to the world; the angular velocity of the only Imu, which precedes; and rotor speeds of the only Actuators,
-    rad/s (actuator_msgs, mav_msgs). Units are SI (REP 103). Times are those of headers, or else of the bag.
+    rad/s (actuator_msgs, mav_msgs). Units are SI (REP 103). Times come from the headers, or else from the bag.
 
     Args:
         path: File ``.bag``, ``.mcap`` or ``.db3``, or folder with ``metadata.yaml``.

@@ -38,7 +38,7 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Betaflight's order; ``command1`` to ``commandN``, the outputs to the motors; ``voltage``; and ``qx`` to ``qw`` where
     the log has ``imuQuaternion``. Position and velocity are not in such logs.
 
-    Units are those of the Blackbox Explorer (betaflight/blackbox-log-viewer, flightlog_fields_presenter.js): degrees/s
+    Units are as in the Blackbox Explorer (betaflight/blackbox-log-viewer, flightlog_fields_presenter.js): degrees/s
     for ``gyroADC``, ten times as much with ``blackbox_high_resolution``; 100 electrical rpm for ``eRPM``; 0.01 V for
     ``vbatLatest``, and V where blackbox_decode names the unit; microseconds for the time. Axes follow from Betaflight's
     src/main/flight/imu.c, whose yaw is negative where the rotation about body z is positive.

@@ -31,7 +31,7 @@ MIN_TURN_RATE = 0.01
 """Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
 (BMI088, 0.014 degrees/s over the root of Hz) gives 0.003 rad/s at 250 Hz."""
 MIN_SPAN = 0.3
-"""Span of the position below which a fault is that of a drone at rest, whose estimator drifts, m."""
+"""Span of the position below which the drone counts as resting, m. The estimator of a resting drone drifts."""
 PIECE_DURATION = 2.0
 """Duration of the pieces that are left out where a rate has diverged, s."""
 
@@ -64,7 +64,7 @@ class Pair(NamedTuple):
         return np.divide(along, size, out=np.full(3, np.nan), where=size > 0)
 
     def agrees(self) -> bool:
-        """Return True if the ratios of all axes that move are those of one motion, but for half of the floor."""
+        """Return True if measured and expected motion agree on every axis that moves, but for half of the floor."""
         along, size = self.sizes().T
         slack = self.floor / 2
         return bool(np.all((along >= RATIOS[0] * size - slack) & (along <= RATIOS[1] * size + slack)))
@@ -77,7 +77,7 @@ def check_motion(
 
     The velocity must move the position, the angular velocity must turn the attitude, the thrust must point up on
     average, and thrust and gravity must accelerate the drone. Pieces in which a measured rate has diverged, such as
-    that of a gyroscope that failed, are left out.
+    where a gyroscope failed, are left out.
 
     Args:
         name: Name of the log, for messages.
@@ -161,7 +161,7 @@ def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> 
 
 
 def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
-    """Yield the rates that were measured, beside what they are the rates of, and the samples of a window."""
+    """Yield each measured rate with the changes of its integral, and the samples of a window."""
     if "vel" not in derived:
         width, (moved, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
         yield Pair("a velocity that moves the position", moved, expected, 0.01), width
@@ -173,7 +173,7 @@ def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) ->
 
 
 def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
-    """Return changes of the acceleration beside those that follow from attitude, rotor speeds and gravity.
+    """Return measured changes of the acceleration, and expected ones from attitude, rotor speeds and gravity.
 
     The thrust over the mass is proportional to the squares of the speeds, with the weight as its median along z;
     without speeds it balances the weight. Changes between windows leave out what is
@@ -200,7 +200,7 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
 
 
 def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
-    """Return the samples of a window, and the changes of series over all windows; zero for those that cross a gap."""
+    """Return the samples of a window, and the changes of series over all windows, zero where a window crosses a gap."""
     dt = float(np.median(np.diff(t)))
     width = min(max(1, round(duration / dt)), len(t) - 1)
     whole = t[width:] - t[:-width] < 1.5 * width * dt

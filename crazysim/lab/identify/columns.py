@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 
 NAME_COUNTS = {"pos": (3,), "quat": (4,), "rpy": (0, 3), "vel": (0, 3), "ang_vel": (0, 3), "attitude_command": (0, 4)}
-"""Numbers of names of a field, the last of them if it is not left out."""
+"""Allowed numbers of column names of a field; the last one is required if the field is present."""
 NAME_ORDERS = {
     "quat": "x, y, z, w, in this order",
     "rpy": "roll, pitch and yaw",
@@ -157,14 +157,14 @@ def _numbers(name: str, key: str, values: NDArray) -> NDArray:
 
 
 def without_huge_numbers(x: NDArray) -> NDArray:
-    """Return numbers as float64, NaN in place of any above ``MAX_NUMBER``, whose squares and products would overflow."""
+    """Return numbers as float64, NaN instead of any above ``MAX_NUMBER``, whose squares and products would overflow."""
     with np.errstate(invalid="ignore"):  # bytes of a damaged log may be a signalling NaN
         x = x.astype(np.float64)
     return np.where(np.abs(x) <= MAX_NUMBER, x, np.nan)
 
 
 def missing_columns(table: Mapping[str, NDArray], columns: Columns) -> list[str]:
-    """Return the columns that a log lacks; those of default names are optional as a whole."""
+    """Return the columns that a log lacks; a field with default names may be absent as a whole."""
     names = [columns.time, *columns.pos, *(columns.rpy or columns.quat)]
     for key in OPTIONAL_FIELDS:
         given = getattr(columns, key)

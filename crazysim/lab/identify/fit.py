@@ -41,9 +41,9 @@ SLOW_CORNER = 0.2
 samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples, whose cause is unknown."""
 MAX_FACTOR = 10.0
 """Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
-checked, a thrust factor stays below 2.5 squared times that of the mass."""
+checked, a thrust factor stays below 2.5 squared times the factor of the mass."""
 MIN_FACTORS = {"rotor inertia": 0.0}
-"""Factors that may be smaller: flights that hardly yaw do not show the inertia of the rotors."""
+"""Least values of factors that may be smaller: flights that hardly yaw do not show the inertia of the rotors."""
 
 
 FACTORS = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
@@ -100,7 +100,7 @@ class Identification:
 
     @property
     def doubtful(self) -> list[str]:
-        """Names of factors below 1/3 or above 3: the fit predicts with them, but they are hardly those of the body."""
+        """Names of factors below 1/3 or above 3: the fit predicts with them, but they are hardly physical."""
         return [name for name in FACTORS if not 1 / 3 < self.values[name] < 3]
 
     def toml(self, source: str) -> str:
@@ -143,7 +143,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     Args:
         logs: Logs of the same sample time.
         airframe: Name or path of the airframe to start from.
-        mass: Mass in the flights, kg; None for that of the airframe.
+        mass: Mass in the flights, kg; None for the airframe's.
 
     Raises:
         ConfigError: If the mass is not positive, if sample times, lengths or rotors of the logs do not fit, or if a

@@ -85,8 +85,8 @@ def read_log(
     Args:
         path: File, or columns by name.
         columns: Names of the columns, or a key of ``KNOWN_COLUMNS``; by default the first of these that the log has.
-        motion: Motion capture of the same flight, whose columns are added to those of the log. Its clock may be another
-            one: it is moved to where the angular velocities agree.
+        motion: Motion capture of the same flight, whose columns are added to the log. Its clock may differ: it is
+            shifted so that the angular velocities agree.
         between: Start and end of the part that is read, s after the first sample.
 
     Raises:

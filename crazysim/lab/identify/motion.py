@@ -1,4 +1,4 @@
-"""Motion capture beside a log of another clock."""
+"""Motion capture that is added to a log with another clock."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def join_motion_capture(
     columns: Columns,
     repairs: list[str],
 ) -> dict[str, NDArray]:
-    """Return a log's columns with those of motion capture that it lacks, on the clock of the log.
+    """Return a log's columns, and from motion capture the columns that it lacks, on the clock of the log.
 
-    The clocks may differ by any time, which is found where the sizes of the angular velocities of both agree best.
+    The clocks may differ by any time, which is found by correlating the magnitudes of the angular velocities.
 
     Args:
         name: Name of the log, for messages.

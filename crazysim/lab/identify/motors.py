@@ -1,4 +1,4 @@
-"""Motors: rotor speeds that were not measured, from commands and voltage; and the lag of those that were."""
+"""Motors: rotor speeds modelled from commands and voltage where none were measured, and the lag of measured ones."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ MAX_DELAY = 0.04
 def with_speeds(log: Log, airframe: Airframe) -> Log:
     """Return the log with rotor speeds, modelled where they were not measured.
 
-    The voltage at a motor is its command times that of the battery. The airframe's ``battery.thrust_over_voltage``
-    gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays that. Motors and propellers differ by some
-    percent, which would be a torque larger than that of most manoeuvres: each rotor's thrusts are scaled so that all
+    The voltage at a motor is its command times the battery's voltage. The airframe's ``battery.thrust_over_voltage``
+    gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays the speed. Motors and propellers differ by
+    some percent, which would be a torque larger than in most manoeuvres: each rotor's thrusts are scaled so that all
     rotors pull equally on average over the flight. So these logs show no centre of mass and no constant torque.
-    What precedes take-off and follows landing is left out.
+    Samples before take-off and after landing are left out.
 
     Args:
         log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.

@@ -66,7 +66,7 @@ class Predictor(Protocol):
         ...
 
     def derivative(self, state: State, inputs: Array) -> State:
-        """Return the time derivatives of a state under inputs, (...); that of the attitude is the angular velocity."""
+        """Return the time derivatives of a state under inputs. (...) The attitude's is the angular velocity."""
         ...
 
 
@@ -84,7 +84,7 @@ class Model(PyTree):
 
         Args:
             airframe: Airframe.
-            mass: Mass, kg; None for that of the airframe.
+            mass: Mass, kg; None for the airframe's.
         """
         params = first_principles.Params.create(airframe)
         if mass is not None:

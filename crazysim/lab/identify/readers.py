@@ -116,7 +116,8 @@ def decimate(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray
 def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None) -> dict[str, NDArray]:
     """Return the columns of a log of the Crazyflie's micro-SD card, by the names of its log variables.
 
-    The format is that of Bitcraze's crazyflie-firmware, tools/usdlog/cfusdlog.py at commit 34c90e75: versions 1 and 2.
+    The format is defined by tools/usdlog/cfusdlog.py of Bitcraze's crazyflie-firmware at commit 34c90e75: versions 1
+    and 2.
     Compressed attitudes, such as ``stateEstimateZ.quat``, become four columns, such as ``stateEstimateZ.qx`` to ``qw``
     (src/modules/interface/quatcompress.h). Variables that two events share get the name of the event in front.
 

@@ -260,7 +260,7 @@ def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
 
 
 def unwrap_angles(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
-    """Return angles that do not jump by a period, which interpolation needs; those that are missing stay NaN. (n,)"""
+    """Return angles that do not jump by a period, as interpolation needs; missing ones stay NaN. (n,)"""
     good = np.isfinite(angles)
     angles = np.where(good, angles, np.nan)
     angles[good] = np.unwrap(angles[good], period=period)

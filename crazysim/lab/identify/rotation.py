@@ -124,7 +124,7 @@ def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
         return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
     spread = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
-    return center, 1.2533 * deviation_factor(len(x)) * spread  # of a median over that of a mean (Gauss)
+    return center, 1.2533 * deviation_factor(len(x)) * spread  # deviation of a median over a mean's (Gauss)
 
 
 def deviation_factor(n: int) -> float:
@@ -143,7 +143,7 @@ class _LogTerms(NamedTuple):
     dt: float
     gaps: NDArray
     turned: NDArray
-    """Change of the angular velocity, plus that of gyroscopic torques, rad/s. (n, 3)"""
+    """Change of the angular velocity, plus the change by gyroscopic torques, rad/s. (n, 3)"""
     angle: NDArray
     """Integral of the angular velocity, rad. (n, 3)"""
     rotors: _Rotors

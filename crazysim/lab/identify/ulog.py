@@ -1,7 +1,7 @@
 """Logs of PX4, in its format ULog.
 
-The format is that of https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data, which PX4 writes after a
-crash, follow the others without a mark of their own.
+The format is described at https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data,
+which PX4 writes after a crash, follow the others without a mark of their own.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAGIC = b"ULog\x01\x12\x35"
 """First bytes of a file."""
 SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
 """Content of a message ``S``, after which a damaged file is read again."""
-HEADER = 16
+HEADER_SIZE = 16
 """Bytes before the first message."""
 KINDS = b"ABCDFILMOPQRS"
 """Letters of the messages."""
@@ -107,10 +107,9 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
 
 
 class Topic(dict[str, NDArray]):
-    """Fields of a topic by name; those that are missing are errors that name the file."""
+    """Fields of a topic by name. A missing field is an error that names the file."""
 
     def __init__(self, place: str, fields: Mapping[str, NDArray]):
-        """Keep the fields, and the file and the topic for messages."""
         super().__init__(fields)
         self.place = place
 
@@ -135,12 +134,12 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
         DamagedFileError: If it is no ULog, or a topic has no format.
     """
     data = path.read_bytes()
-    if len(data) < HEADER or not data.startswith(MAGIC):
+    if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
         raise DamagedFileError(
             f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again."
         )
     head, formats, ids, parts = struct.Struct("<HB"), {}, {}, {}
-    at, skipped, dropouts = HEADER, 0, 0
+    at, skipped, dropouts = HEADER_SIZE, 0, 0
     while at + head.size <= len(data):
         size, kind = head.unpack_from(data, at)
         start, end = at + head.size, at + head.size + size
@@ -186,7 +185,7 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
 def _layout(
     file: str, formats: Mapping[str, str], name: str, prefix: str = "", depth: int = 0
 ) -> list[tuple[str, str]]:
-    """Return names and types of the fields of a format, those of nested formats unrolled.
+    """Return names and types of the fields of a format, with nested formats unrolled.
 
     Padding at the end, which PX4 does not log, is left out.
 

@@ -4,7 +4,7 @@ from crazysim.lab.live.browser import Browser
 from crazysim.lab.live.client import DroneClient, StreamClient
 from crazysim.lab.live.commands import Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
 from crazysim.lab.live.crtp import CrtpDevice, CrtpServer, add_cflib_driver, remove_cflib_driver
-from crazysim.lab.live.fleet import Fleet
+from crazysim.lab.live.fleet import Fleet, RemoteCommands
 from crazysim.lab.live.gamepad import Gamepad
 from crazysim.lab.live.keyboard import Keyboard
 from crazysim.lab.live.link import Link, SimLink, TrainedPolicy, fly_policy
@@ -28,7 +28,6 @@ from crazysim.lab.live.mocap import (
 from crazysim.lab.live.pace import LiveReport
 from crazysim.lab.live.piloting import Pilot, keyboard_sticks
 from crazysim.lab.live.radio import Radio
-from crazysim.lab.live.remote import RemoteCommands
 from crazysim.lab.live.ros import RosBridge
 from crazysim.lab.live.server import CommandServer, StreamListener
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm

@@ -17,10 +17,12 @@ def rotate(quat: NDArray, vec: NDArray) -> NDArray:
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
     """Return cross products; ``np.cross`` takes five times as long for a few vectors. (..., 3)"""
-    return a.take(_NEXT, -1) * b.take(_AFTER, -1) - a.take(_AFTER, -1) * b.take(_NEXT, -1)
+    return a.take(_NEXT_AXIS, -1) * b.take(_SECOND_NEXT_AXIS, -1) - a.take(_SECOND_NEXT_AXIS, -1) * b.take(
+        _NEXT_AXIS, -1
+    )
 
 
-_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+_NEXT_AXIS, _SECOND_NEXT_AXIS = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def multiply(p: NDArray, q: NDArray) -> NDArray:

@@ -27,9 +27,9 @@ from crazysim.scene.visual_geoms import visual_geoms
 
 MAX_WORLDS = 64
 """Most worlds that are shown unless they are listed."""
-MARGIN = 1.0
+WORLD_MARGIN = 1.0
 """Free space between neighbouring worlds, m."""
-STOP = 0.5
+CLOSE_TIMEOUT = 0.5
 """Longest time for which ``close`` waits, s."""
 
 log = logging.getLogger(__name__)
@@ -126,7 +126,7 @@ class Browser(Viewer[Live]):
         scene = self._server.scene
         scene.set_up_direction("+z")
         drones = self._picture.drones
-        extent = float(np.nanmax(np.ptp(drones, axis=1)[..., :2])) + 2 * MARGIN
+        extent = float(np.nanmax(np.ptp(drones, axis=1)[..., :2])) + 2 * WORLD_MARGIN
         spacing = extent if self._spacing is None else self._spacing
         self._scene = BrowserScene(self._server, shapes, bodies, self._picture, spacing, self._trail)
         camera = self._server.initial_camera
@@ -170,7 +170,7 @@ class Browser(Viewer[Live]):
                 # viser waits for 6 s for connections that a browser has opened in advance and not used.
                 stop = threading.Thread(target=server.stop, daemon=True)
                 stop.start()
-                stop.join(STOP)
+                stop.join(CLOSE_TIMEOUT)
 
 
 def _require_free(host: str, port: int) -> int:

@@ -46,7 +46,7 @@ class BrowserPanel:
     """Quantity that is plotted; empty for none."""
 
     def __init__(self, server: Any, live: Live, scene: BrowserScene, bodies: SceneBodies, follow: bool, plot: str):
-        """Add the elements.
+        """Add the panel's elements to a server.
 
         Args:
             server: Server of viser.

@@ -20,7 +20,7 @@ class Trails:
     """The recent positions of all bodies, as one set of line segments of constant size."""
 
     def __init__(self, scene: Any, pos: NDArray, colors: NDArray, seconds: float):
-        """Begin with trails of length zero.
+        """Create trails of length zero.
 
         Args:
             scene: Scene of viser.

@@ -20,7 +20,7 @@ class Chart:
     """Lines of the values of one quantity."""
 
     def __init__(self, name: str):
-        """Begin empty.
+        """Create an empty chart.
 
         Args:
             name: Title; empty for no plot.

@@ -21,7 +21,7 @@ class Circles:
     """Process that lets drones rise and fly circles around where they stood."""
 
     def __init__(self, live: Live, piloted: bool):
-        """Take the places of the drones.
+        """Create circles around the drones' present positions.
 
         Args:
             live: Loop.

@@ -60,7 +60,7 @@ class Start:
     drone: int | None
     """ID of the drone; None for all."""
     relative: bool = False
-    """True where the trajectory is moved so that it begins at the present setpoint."""
+    """True where the trajectory is shifted to start at the present setpoint."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
 from crazysim.lab.live.commands import Command, Hover, Land, LoadShow, SetParameter, Start, StartShow, TakeOff, Upload
-from crazysim.lab.live.paths import HostTrajectory
+from crazysim.lab.live.host_trajectory import HostTrajectory
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.server import CommandQueue
 from crazysim.lab.show_files.lights import Lights
 from crazysim.plugins.follow import Follow
 from crazysim.sim.sim import Sim
@@ -90,7 +92,7 @@ class Fleet:
         sim.build_default_data()
 
     def apply(self, commands: Iterable[Command]) -> int:
-        """Carry out commands between two steps, and return the number of those that could be.
+        """Carry out commands between two steps, and return how many could be carried out.
 
         Args:
             commands: Commands, in their order; one that cannot be carried out is logged.
@@ -113,7 +115,7 @@ class Fleet:
             self._untouched[drone] = drone not in self._uploaded
 
     def colors(self) -> NDArray:
-        """Return the present colours of the LEDs, those of the received show once it has started. (n_drones, 3)"""
+        """Return the present colours of the LEDs, from the received show once it has started. (n_drones, 3)"""
         found = np.zeros((self.sim.n_drones, 3))
         if self._lights is not None and self._show_start is not None:
             shown = self._lights.colors([self._now() - self._show_start])[0]
@@ -235,3 +237,19 @@ def _without_padding(trajectory: Trajectory) -> Trajectory:
     n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)
     cut = jax.tree.map(np.asarray, trajectory)
     return cut.replace(ends=cut.ends[:n], coefficients=cut.coefficients[:n])
+
+
+class RemoteCommands:
+    """Process that carries out what has arrived in a queue: ``live.add(RemoteCommands(fleet, server))``."""
+
+    def __init__(self, fleet: Fleet, queue: CommandQueue):
+        self._fleet, self._queue = fleet, queue
+
+    def __call__(self, live: Live) -> None:
+        """Carry out the commands that have arrived since the last call, and show the lights of a show."""
+        self._fleet.apply(self._queue.commands())
+        live.lights[0] = self._fleet.colors()
+
+    def reset(self, live: Live) -> None:
+        """Let the drones hover at their positions after a reset or a jump in time."""
+        self._fleet.reset()

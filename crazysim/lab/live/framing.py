@@ -20,10 +20,10 @@ MAX_SHOW = 64 * 2**20
 """Largest show, bytes."""
 
 ZIP, ZIP_END = b"PK\x03\x04", b"PK\x05\x06"
-STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP)
-HEAD = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
-TOKEN = re.compile(rb'["\\{}]')
-SPACE = b" \r\n\t\0"
+MESSAGE_STARTS = (b"CMDSTART_", b"REQ_", b"START", ZIP)
+HEAD_PATTERN = re.compile(rb"(?:(\d{1,4})_)?CMDSTART_(?:(\d{1,4})_)?([a-z]{1,20})_")
+TOKEN_PATTERN = re.compile(rb'["\\{}]')
+SPACE_BYTES = b" \r\n\t\0"
 
 
 class FramingError(ValueError):
@@ -69,7 +69,6 @@ class Frames:
     """
 
     def __init__(self) -> None:
-        """Begin with an empty buffer."""
         self._buffer = bytearray()
         self._reset_scan()
 
@@ -95,8 +94,8 @@ class Frames:
 
     def _next(self) -> Message | Request | ShowFile | None:
         """Return the message at the front of the buffer and remove it; None if it is incomplete."""
-        if not self._at and self._buffer[:1] and self._buffer[0] in SPACE:
-            del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(SPACE))]
+        if not self._at and self._buffer[:1] and self._buffer[0] in SPACE_BYTES:
+            del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(SPACE_BYTES))]
         buffer = self._buffer
         if not buffer:
             return None
@@ -113,7 +112,7 @@ class Frames:
             if digits and not digits.isdigit():
                 raise FramingError(f"expected REQ_ and an ID of two digits, got {_shown(buffer)}")
             return None
-        head = HEAD.match(buffer)
+        head = HEAD_PATTERN.match(buffer)
         if head is not None:
             return self._message(head)
         if not self._may_begin(bytes(buffer[: MAX_TEXT + 1])):
@@ -122,7 +121,7 @@ class Frames:
 
     def _may_begin(self, front: bytes) -> bool:
         """Return True where these bytes may be the start of a message."""
-        if any(start.startswith(front[: len(start)]) for start in STARTS) and len(front) <= MAX_TEXT:
+        if any(start.startswith(front[: len(start)]) for start in MESSAGE_STARTS) and len(front) <= MAX_TEXT:
             rest = front[len(b"CMDSTART_") :]
             return not front.startswith(b"CMDSTART_") or bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest))
         after = re.sub(rb"^\d{1,4}", b"", front)
@@ -153,7 +152,7 @@ class Frames:
             if len(buffer) > MAX_JSON:
                 raise FramingError(f"expected JSON of at most {MAX_JSON} bytes, got more")
             return None
-        rest = bytes(buffer[end : end + 16]).lstrip(SPACE)
+        rest = bytes(buffer[end : end + 16]).lstrip(SPACE_BYTES)
         if not rest.startswith(b"_EOF"):
             if len(rest) >= 4 or not b"_EOF".startswith(rest) or len(buffer) - end >= 16:
                 raise FramingError(f"expected _EOF after the JSON, got {_shown(buffer[end:])}")
@@ -165,7 +164,7 @@ class Frames:
     def _end_of_json(self, brace: int) -> int | None:
         """Return the end of a JSON object; every byte is examined once, however it arrives."""
         self._at = max(self._at, brace)
-        while (token := TOKEN.search(self._buffer, self._at)) is not None:
+        while (token := TOKEN_PATTERN.search(self._buffer, self._at)) is not None:
             kind = token[0]
             if kind == b"\\":
                 if token.end() >= len(self._buffer):

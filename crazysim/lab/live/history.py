@@ -26,7 +26,7 @@ class History:
     """The first snapshot since a reset, and the latest ones."""
 
     def __init__(self, length: int):
-        """Begin empty.
+        """Create an empty history.
 
         Args:
             length: Most snapshots to keep beside the first.

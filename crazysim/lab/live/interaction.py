@@ -39,7 +39,6 @@ class Interaction:
     """Function that is called with the loop, a world and a point of its ground, m, that was clicked in a viewer."""
 
     def __init__(self, sim: Sim):
-        """Begin with the first drone selected."""
         self.sim = sim
         self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
         self.selected, self.on_click = (0, 0), None
@@ -124,7 +123,7 @@ class Interaction:
 
     @property
     def followed(self) -> tuple[int, str, int] | None:
-        """World, kind and index of the body that viewers mark and follow: the selected drone, or that of ``follow``."""
+        """World, kind and index of the body that viewers mark and follow: the selected drone, or ``follow``'s."""
         if self._followed is not None or self.selected is None:
             return self._followed
         return self.selected[0], DRONE, self.selected[1]
@@ -134,8 +133,8 @@ class Interaction:
 
         Args:
             world: Index of the world.
-            kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or that of a handle.
-            index: Number among those of its kind.
+            kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or a handle's name.
+            index: Number among the bodies of its kind.
 
         Raises:
             ConfigError: If it does not exist.

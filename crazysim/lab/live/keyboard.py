@@ -1,4 +1,4 @@
-"""Keys of a viewer: those that are held, and what those that were pressed do."""
+"""Keys of a viewer: which are held, and the functions that they call."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ class Keyboard(Generic[L]):
     """
 
     def __init__(self) -> None:
-        """Begin with all keys released and without functions."""
         self._held: dict[str, float] = {}
         self._pressed: deque[str] = deque(maxlen=100)
         self._calls: dict[str, Callable[[L], object]] = {}

@@ -42,7 +42,6 @@ class SimLink:
     """Link to a drone of a swarm."""
 
     def __init__(self, swarm: Swarm, drone: int | str = 0):
-        """Take a drone by its index or name."""
         self.swarm = swarm
         self.drone = swarm.index(drone) if isinstance(drone, str) else drone
         self.name = swarm.names[self.drone]

@@ -178,8 +178,8 @@ class Live(Interaction, Closing):
 
         Args:
             process: Function; must not wait. Its method ``reset(live)``, if it has one, is called after resets.
-            freq: Rate of the calls in simulated time, Hz, a divisor of that of control steps; None for every one.
-            name: Name in messages; None for that of the function.
+            freq: Rate of the calls in simulated time, Hz, a divisor of the rate of control steps; None for every one.
+            name: Name in messages; None for the name of the function.
             on_error: ``"raise"`` to end ``run`` with its errors, ``"report"`` to log them and continue, for sources
                 outside, such as motion capture.
 
@@ -226,7 +226,7 @@ class Live(Interaction, Closing):
 
         Args:
             path: Path of the file.
-            freq: Rate of samples in simulated time, Hz; a divisor of that of control steps.
+            freq: Rate of samples in simulated time, Hz; a divisor of the rate of control steps.
 
         Raises:
             ConfigError: If the file cannot be created, or the rate is invalid.
@@ -310,7 +310,7 @@ class Live(Interaction, Closing):
                 until_picture = viewers.next_at - perf_counter() if viewers else SLICE
                 sleep(max(min(wait, until_picture, SLICE), 0.0))
             return 0.0
-        late = self._pace.begin(self.time)
+        late = self._pace.record_step(self.time)
         if late > ALARM and self._may_warn():
             log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * late)
         self._control_step()

@@ -101,7 +101,7 @@ class Pace:
     steps: int
     """Number of control steps so far."""
     late: int
-    """Number of those that began more than ``TOLERANCE`` late."""
+    """Number of control steps that began more than ``TOLERANCE`` late."""
     worst: float
     """Greatest lateness, s."""
     worst_at: float
@@ -110,7 +110,7 @@ class Pace:
     """Time given up, s."""
 
     def __init__(self, dt: float, speed: Speed, clock: Callable[[], float] = perf_counter):
-        """Begin now.
+        """Create a pace whose first control step is due now.
 
         Args:
             dt: Simulated time between control steps, s.
@@ -142,8 +142,8 @@ class Pace:
         """Return the time until the next control step is due, s; not positive if it is."""
         return 0.0 if self._speed == "max" else self._due - self._clock()
 
-    def begin(self, time: float) -> float:
-        """Note that a control step begins, and return how late, s.
+    def record_step(self, time: float) -> float:
+        """Record the start of a control step, and return its lateness, s.
 
         Args:
             time: Simulated time, s.

@@ -66,7 +66,7 @@ class PictureSource:
     """Source of the pictures of one viewer."""
 
     def __init__(self, sim: Sim, bodies: SceneBodies, worlds: Sequence[int], contacts: bool, wind: bool):
-        """Prepare; functions are compiled at the first picture.
+        """Create a source whose functions are compiled at the first picture.
 
         Args:
             sim: Simulation.

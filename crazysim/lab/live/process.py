@@ -23,7 +23,7 @@ class RateLimit:
     """Permission to log one message in some time."""
 
     def __init__(self, period: float = MIN_LOG_INTERVAL):
-        """Begin with the permission.
+        """Create a limit that permits the first message.
 
         Args:
             period: Time from one message to the next, s.
@@ -93,12 +93,12 @@ def period_of(freq: float | None, control_freq: int, name: str) -> int:
     """Return the number of control steps from one call to the next.
 
     Args:
-        freq: Rate of the calls, Hz; None for that of the control steps.
+        freq: Rate of the calls, Hz; None for the rate of the control steps.
         control_freq: Rate of the control steps, Hz.
         name: Name of the process, for the message.
 
     Raises:
-        ConfigError: If the rate does not divide that of the control steps.
+        ConfigError: If the rate does not divide the rate of the control steps.
     """
     if freq is None:
         return 1

@@ -31,7 +31,7 @@ LOG = {
 }
 """Log variables of each part of the state."""
 UNITS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
-"""Units of log variables that are not those of ``DroneState``: degrees/s and multiples of the standard gravity."""
+"""Units of log variables that differ from ``DroneState``: degrees/s and multiples of the standard gravity."""
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +116,7 @@ class Radio(Closing):
         self._cf.commander.send_setpoint(0, 0, 0, 0)  # crtp_commander_rpyt.c ignores thrust until it was zero once
 
     def state(self) -> DroneState:
-        """Return the latest state that the drone has sent; its time is that of the drone.
+        """Return the latest state that the drone has sent, with the time on the drone's clock.
 
         Raises:
             ConfigError: If the link is not armed.
@@ -129,7 +129,7 @@ class Radio(Closing):
             return DroneState(self._stamp, v["pos"], quat, v["vel"], v["ang_vel"], v["acc"])
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command: that of ``sim.state_control``, ``attitude_control`` or ``body_rate_control`` of one drone.
+        """Send a command to one drone, as for ``sim.state_control``, ``attitude_control`` or ``body_rate_control``.
 
         Raises:
             ConfigError: If the link is not armed, the level is another one, or a number is invalid.

@@ -21,7 +21,7 @@ class Recordings:
     """Number of recordings that ended because they could not be written."""
 
     def __init__(self, sim: Sim, control_freq: int):
-        """Begin without a recording.
+        """Create a recorder without an open file.
 
         Args:
             sim: Simulation.

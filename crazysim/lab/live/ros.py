@@ -86,7 +86,7 @@ class RosBridge:
         Args:
             swarm: Swarm.
             node: Node, ``rclpy.node.Node`` or an object with its ``create_publisher`` and ``create_subscription``.
-            messages: Object with the classes of ``MESSAGES`` as attributes; None for those of ROS.
+            messages: Object with the classes of ``MESSAGES`` as attributes; None for ROS's own.
             objects: Names of movable objects of the scene, such as ``"cf1:0"``, whose poses are published too.
             freq: Messages per second of simulated time, Hz.
             frame: Name of the world frame.

@@ -27,9 +27,9 @@ class SceneBody(NamedTuple):
     """A body of every world."""
 
     kind: str
-    """``"drone"``, or the name of the objects in the scene, such as ``"cars"``, ``"load"`` or that of a handle."""
+    """``"drone"``, or the name of the objects in the scene, such as ``"cars"``, ``"load"`` or a handle's name."""
     index: int
-    """Number among those of its kind."""
+    """Number among the bodies of its kind."""
     name: str
     """Name in viewers."""
     mocap: int
@@ -98,7 +98,7 @@ class SceneBodies:
 
         Args:
             kind: Kind, see ``SceneBody``.
-            index: Number among those of its kind.
+            index: Number among the bodies of its kind.
 
         Raises:
             ConfigError: If there is none.

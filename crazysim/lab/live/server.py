@@ -37,7 +37,6 @@ class CommandQueue(Closing):
     """Commands that wait for the simulation."""
 
     def __init__(self) -> None:
-        """Begin with an empty queue."""
         self._queue: queue.Queue[Command] = queue.Queue(MAX_QUEUE)
 
     def commands(self) -> list[Command]:
@@ -48,7 +47,7 @@ class CommandQueue(Closing):
                 found.append(self._queue.get_nowait())
         return found
 
-    def _put(self, command: Command) -> None:
+    def _enqueue(self, command: Command) -> None:
         try:
             self._queue.put_nowait(command)
         except queue.Full:
@@ -163,7 +162,7 @@ class CommandServer(CommandQueue):
         try:
             if drone is not None and isinstance(frame, Message) and frame.drone not in (None, drone):
                 raise ConfigError(f"expected commands to drone {drone}, got one to drone {frame.drone}")
-            self._put(command_of(frame, drone))
+            self._enqueue(command_of(frame, drone))
         except ConfigError as error:
             log.warning("%s: command refused: %s", name, error)
             peer.sendall(b"ERR")
@@ -213,7 +212,7 @@ class StreamListener(CommandQueue):
                 if isinstance(frame, Request):
                     raise FramingError("expected commands, got a request")
                 try:
-                    self._put(command_of(frame))
+                    self._enqueue(command_of(frame))
                     self._peer.sendall(b"ACK")
                 except ConfigError as error:
                     log.warning("%s: command refused: %s", name, error)

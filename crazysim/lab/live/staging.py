@@ -18,7 +18,7 @@ class StagedCommands:
     """The command of every drone, as the simulation's command level has it; staged while it is in use."""
 
     def __init__(self, sim: Sim):
-        """Take the commands as they are staged now; drones with state commands stay where they are."""
+        """Create the commands that are in force; a drone without a state command hovers at its position."""
         self._sim = sim
         self._array: NDArray | None = None
         self._staged: NDArray | None = None

@@ -28,7 +28,7 @@ class Viewers(Generic[L]):
     """Time at which the next picture is due, s, by ``time.perf_counter``."""
 
     def __init__(self, fps: float, on_last_closed: Callable[[], object]):
-        """Begin without viewers.
+        """Create a set without viewers.
 
         Args:
             fps: Pictures per second.
@@ -68,7 +68,7 @@ class Viewers(Generic[L]):
         return True
 
     def update(self, live: L) -> None:
-        """Send a picture to every viewer, and remove those that are closed or fail."""
+        """Send a picture to every viewer, and remove viewers that are closed or fail."""
         for viewer in list(self._open):
             try:
                 if viewer.is_open:

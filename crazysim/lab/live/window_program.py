@@ -42,7 +42,6 @@ class Inbox:
     """The latest picture from the standard input, read by a thread."""
 
     def __init__(self, stream: BinaryIO):
-        """Begin to read."""
         self._stream = stream
         self.picture: Picture | None = None
         self.ended = False
@@ -68,7 +67,6 @@ class Leds:
     """Materials of the drones' LEDs in a model."""
 
     def __init__(self, model: mujoco.MjModel):
-        """Find the materials that airframes have: ``led_top:0``, ``led_bot:0``, ..."""
         self._model = model
         names = [model.material(k).name.partition(":") for k in range(model.nmat)]
         leds = [

@@ -13,7 +13,7 @@ from crazysim.storage import ZipReader, reading, write_file
 from crazysim.trajectories.files import checks
 
 MAX_MEMBERS = 20_100
-"""Most files of an archive: four for each of 5,000 drones, Skybrush's limit, and those of the show."""
+"""Most files of an archive: four for each of 5,000 drones, Skybrush's limit, and the show's own."""
 MAX_MEMBER = 16 * 2**20
 """Largest file of an archive that is unpacked, bytes."""
 MAX_TOTAL = 512 * 2**20

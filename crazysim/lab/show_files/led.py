@@ -21,9 +21,9 @@ MAX_BYTES = 2**20
 MAX_REPEATED = 200_000
 """Most commands that the loops and jumps of a program may repeat."""
 MAX_LOOPS = 4
-"""Deepest nesting of loops, that of libskybrush's ``CONFIG_MAX_LOOP_DEPTH``."""
+"""Deepest nesting of loops, libskybrush's ``CONFIG_MAX_LOOP_DEPTH``."""
 MAX_VARINT = 2**28 - 1
-"""Largest duration or address, that of pyledctrl's compiler."""
+"""Largest duration or address, as in pyledctrl's compiler."""
 
 END, NOP, SLEEP, WAIT_UNTIL = 0x00, 0x01, 0x02, 0x03
 SET_COLOR, SET_GRAY, SET_BLACK, SET_WHITE = 0x04, 0x05, 0x06, 0x07
@@ -184,7 +184,7 @@ def encode_lights(lights: Lights) -> bytes:
         lights: Lights of one drone.
 
     Raises:
-        ConfigError: If they are those of several drones.
+        ConfigError: If they belong to several drones.
     """
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if times.ndim != 1:

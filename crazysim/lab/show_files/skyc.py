@@ -1,6 +1,6 @@
 """Shows of Skybrush, ``.skyc`` files: zip archives of ``show.json``, ``cues.json``, trajectories and lights.
 
-The format is that of Skybrush's own reader (skybrush.js, ``packages/show-format``), with the additions of the
+The format follows Skybrush's own reader (skybrush.js, ``packages/show-format``), with the additions of the
 AIMotionLab: yaw as a fourth coordinate, the trajectory types of the Crazyflie, parameters, and ``colors``.
 """
 
@@ -26,7 +26,7 @@ from crazysim.trajectories.files import checks
 from crazysim.trajectories.trajectory import Trajectory
 
 MAX_DRONES = 5000
-"""Most drones of a show, that of Skybrush."""
+"""Most drones of a show, Skybrush's limit."""
 MAX_PIECES = 2_000_000
 """Most pieces of all trajectories, or all lights, padded to the longest."""
 MAX_LOOPED = 10_000_000
@@ -164,7 +164,7 @@ def _cues(archive: Archive, value: object, place: str) -> tuple[Cue, ...]:
 def _lights(
     archive: Archive, drone: dict[str, Any], until: float, max_looped: int, decoded: dict[str, Lights]
 ) -> Lights:
-    """Return the lights of one drone; those of equal programs are decoded once."""
+    """Return the lights of one drone; equal programs are decoded once."""
     if drone["lights"] is None:
         return Lights.constant()
     value, place = archive.resolve(drone["lights"], f"{drone['at']}, lights")

@@ -25,7 +25,7 @@ RATES = (50, 25, 10, 5)
 """Rates at which a flight may be recorded, Hz; the first that divides the physics' rate and fits is used."""
 MAX_RECORDED = 20_000_000
 """Most poses of a recording, which take 28 bytes each."""
-CHUNK = 250
+CHUNK_SAMPLES = 250
 """Samples that one compiled call flies."""
 
 Progress = Callable[[Iterable[int], str], Iterable[int]]
@@ -63,7 +63,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
 
     Args:
         show: Show.
-        seconds: Duration, s; None for that of the show.
+        seconds: Duration, s; None for the duration of the show.
         progress: Function that returns the items it gets, with a progress bar, ``progress(items, label)``; None for
             none.
         settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
@@ -85,7 +85,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     begin = time.perf_counter()
     data = sim.data
     recorded = [[np.asarray(x)[None, 0] for x in _pose(data)]]
-    chunks = range(0, n, CHUNK)
+    chunks = range(0, n, CHUNK_SAMPLES)
     for _ in chunks if progress is None else progress(chunks, "flying"):
         data, samples = fly_chunk(data)
         recorded.append([np.asarray(x)[:, 0] for x in samples])
@@ -132,14 +132,14 @@ def _rate(freq: int, seconds: float, n_drones: int) -> int:
 
 
 def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
-    """Return a compiled function from data to the data ``CHUNK`` samples later, and poses after every ``n_steps``."""
+    """Return a compiled function from data to the data of ``CHUNK_SAMPLES`` samples later, and poses of the samples."""
     step, zeros = sim.step_fn, sim.step_fn.zeros(sim.data)
 
     def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:
         data = step(data, n_steps, zeros)
         return data, _pose(data)
 
-    return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK)).lower(sim.data).compile()
+    return jax.jit(lambda data: jax.lax.scan(sample, data, length=CHUNK_SAMPLES)).lower(sim.data).compile()
 
 
 def _pose(data: SimData) -> tuple[Array, Array]:

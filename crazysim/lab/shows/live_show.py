@@ -17,7 +17,7 @@ class ShowLights:
     """Process that sets the LEDs of drones to the colours of a show: ``live.add(ShowLights(show))``."""
 
     def __init__(self, show: Show):
-        """Take the lights of a show; its k-th drone is the simulation's k-th.
+        """Create the process of a show, whose k-th drone is the simulation's k-th.
 
         Args:
             show: Show, which begins when the simulated time is zero.

@@ -17,7 +17,7 @@ N_LISTED = 5
 def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the least distance of every pair of drones, and the time at which it occurs.
 
-    Between samples the distance is that of drones at constant velocities: its square is a parabola of time, through the
+    Between samples the drones are taken to move at constant velocities: its square is a parabola of time, through the
     closest sample and its neighbours.
 
     Args:

@@ -158,7 +158,7 @@ def color_leds(sim: Sim, materials: tuple[str, ...], colors: NDArray) -> None:
 
 
 def darken(sim: Sim) -> None:
-    """Limit the lights and the sky of a simulation's scene to those of a night, before its first image."""
+    """Dim the lights and the sky of a simulation's scene to a night, before its first image."""
     model = sim.mj_model
     head = model.vis.headlight
     for light in (model.light_diffuse, model.light_ambient, head.ambient, head.diffuse):

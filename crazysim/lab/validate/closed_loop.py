@@ -21,8 +21,8 @@ FREQ = 100
 COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrltarget_z", "sp_ctrltarget_yaw")
 """Columns of a log of NanoBench (arXiv 2603.09908): time, s, motion capture, m, setpoint, m and degrees."""
 AIRBORNE_SHARE, SETTLING_TIME, LANDING_TIME = 0.9, 2.0, 0.5
-"""A flight is compared from SETTLED seconds after its setpoint has reached this share of its median height, until
-BEFORE_LANDING seconds before it leaves that height."""
+"""A flight is compared from ``SETTLING_TIME`` seconds after its setpoint has reached this share of its median height,
+until ``LANDING_TIME`` seconds before it leaves that height."""
 MAX_DISTANCE = 2.0
 """Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
 MAX_LAG = 1.2
@@ -36,7 +36,7 @@ class Flight:
     name: str
     """Name of the log."""
     setpoint: NDArray
-    """Commanded position, relative to the place of the tracked body at rest on the floor, m, and yaw, rad. (n, 4)"""
+    """Commanded position, relative to the tracked body at rest on the floor, m, and yaw, rad. (n, 4)"""
     pos: NDArray
     """Measured position, likewise, m. (n, 3)"""
 
@@ -170,7 +170,7 @@ def fly(flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimato
 def compare(
     flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimator: Estimator | None = None
 ) -> list[Comparison]:
-    """Return the tracking errors of flights beside those of their simulation; see ``fly`` for the arguments."""
+    """Return the tracking errors of flights and of their simulations; see ``fly`` for the arguments."""
     rows, flown = [], fly(flights, drone, estimator)
     for k, flight in enumerate(flights):
         pos = flown[: len(flight.pos), k]

@@ -24,7 +24,7 @@ from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import curve
 from crazysim.lab.validate.rows import Row
 
-RATE, POSITION_EVERY = 500, 5
+RATE, POSITION_PERIOD = 500, 5
 VECTORS = Path(crazysim.__file__).parents[1] / "tests"
 """Folder with the recorded outputs; it exists in a checkout of the sources only."""
 FILTERED_AIRFRAME = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
@@ -66,7 +66,7 @@ def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
 
 
 def compare_controllers() -> Iterable[Row]:
-    """Yield the largest differences of the motors from those of the compiled firmware."""
+    """Yield the largest differences of the motors from the compiled firmware's."""
     for name, (controller, mode, drone) in CASES.items():
         flown = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
         for whole, bound in ((False, MAX_TRUNCATION + FLOAT32), (True, 1.0 + FLOAT32)):
@@ -98,7 +98,7 @@ def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArra
     ang_vel = smooth(3, 10 * size, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
-        held = POSITION_EVERY * (np.arange(n_ticks) // POSITION_EVERY)
+        held = POSITION_PERIOD * (np.arange(n_ticks) // POSITION_PERIOD)
         desired_yaw = (yaw + smooth(1, size, 0.4))[held, :, 0]
         quat_des = np.stack([0 * desired_yaw, 0 * desired_yaw, np.sin(desired_yaw / 2), np.cos(desired_yaw / 2)], -1)
         parts = [pos + smooth(3, 1.5 * size, 0.6), vel + smooth(3, size, 0.4), smooth(3, 4 * size, 0.5)]
@@ -163,7 +163,7 @@ def _flight_pwm(controller: Any, mode: str, numbers: tuple, states: Any, command
         command = Setpoint.of_command(c) if mode == "state" else c
         if mode == "state" and controller.has_outer:
             after = controller.outer(data, command, memory, params)
-            memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_EVERY == 0, new, old), after, memory)
+            memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_PERIOD == 0, new, old), after, memory)
         rotor_vel, memory = controller.update(data, command, memory, params)
         thrust = jnp.where(rotor_vel > 0, curve(rotor_vel, thrust_curve), 0.0)
         return memory, 4 * thrust / newton

@@ -24,8 +24,8 @@ KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range"
 """Measurements of the recordings of the Kalman filter."""
 ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
 """Positions of the anchors, m."""
-DIODE = np.array([0.015, 0.0075, 0.0], np.float32)
-NOISE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
+DIODE_OFFSET = np.array([0.015, 0.0075, 0.0], np.float32)
+PROCESS_VARIANCE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4], np.float32))
 
 
 def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
@@ -44,7 +44,7 @@ def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: A
         estimate = error_state.select(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
         station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
         for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
-            after = updates.update_sweep(estimate, rot, jnp.asarray(DIODE), station, tilt, m[0], 0.001)
+            after = updates.update_sweep(estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, m[0], 0.001)
             estimate = error_state.select(k % 8 == first, after, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
@@ -74,7 +74,9 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
         (estimate, rot), (k, inert, m) = carry, x
         accel, gyro = inert[:3], inert[3:]
         predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
-        estimate = error_state.add_noise(error_state.select(k % 10 == 0, predicted, estimate), jnp.asarray(NOISE))
+        estimate = error_state.add_noise(
+            error_state.select(k % 10 == 0, predicted, estimate), jnp.asarray(PROCESS_VARIANCE)
+        )
         estimate = error_state.finalize(update_with_measurements(kind, k, m, gyro, estimate, rot, stations))
         state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
         return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
@@ -119,7 +121,7 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
 
 
 def compare_filters() -> Iterable[Row]:
-    """Yield the largest differences of states from those of the compiled firmware."""
+    """Yield the largest differences of states from the compiled firmware's."""
     for kind in KINDS:
         found, recorded = kalman_states(kind)
         difference = np.abs(found - recorded)

@@ -39,7 +39,7 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
     return found
 
 
-def compare_open_loop(folder: Path) -> Iterable[Row]:
+def open_loop(folder: Path) -> Iterable[Row]:
     """Yield mean errors of predictions of melon from measured rotor speeds, over ``HORIZONS``, and published ones."""
     path = find_logs(folder, "melon*")[0]
     log = read_log(path)
@@ -65,7 +65,7 @@ def compare_open_loop(folder: Path) -> Iterable[Row]:
                 yield Row(label, of, float(figure), unit, series=series.replace("`", ""), at=h)
 
 
-def compare_closed_loop(folder: Path) -> Iterable[Row]:
+def closed_loop(folder: Path) -> Iterable[Row]:
     """Yield simulated over logged tracking errors, flight by flight."""
     paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
     for row in compare([read_flight(path) for path in paths], estimator=laboratory_estimator()):

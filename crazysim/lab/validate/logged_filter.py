@@ -23,7 +23,7 @@ from crazysim.plugins.estimators.kalman import DEVIATIONS
 
 PERIOD, LOOPS = 0.01, 10
 """Time between samples of a log, s, and the firmware's loops in it, each of which adds process noise."""
-PROCESS = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
+PROCESS_NOISE = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
 """Deviations of the noise of a loop of 1 ms, m, m/s, rad: (0.5, 0.5, 1) m/s^2 and 0.1 rad/s of the firmware."""
 SETTLING_TIME = 2.0
 """Time from the first setpoint, s, after which estimates are compared and drones fly."""
@@ -83,7 +83,7 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
         pos: Measured position, world frame, m. (n, 3)
         quat: Measured attitude, body to world, xyzw. (n, 4)
     """
-    noise = jnp.asarray(LOOPS * PROCESS**2, accel.dtype)
+    noise = jnp.asarray(LOOPS * PROCESS_NOISE**2, accel.dtype)
 
     def tick(estimate: error_state.Estimate, x: Any) -> tuple[Any, Any]:
         force, rate, where, attitude = x
@@ -106,7 +106,7 @@ def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float,
 
 
 def compare_filter(folder: Path) -> Iterable[Row]:
-    """Yield errors of the filter over those of the filter on board, flight by flight, without crashed flights."""
+    """Yield errors of the filter over errors of the filter on board, flight by flight, without crashed flights."""
     flights = {}
     for path in find_logs(folder, "*"):
         try:

@@ -27,7 +27,7 @@ AIRFRAMES = ("cf21B_500", "cf2x_L250", "crazyflie", "bumblebee")
 STEP = 2
 """Step of both simulators, ms."""
 PERIODS = (10, STEP)
-"""Times between two calls of the policy, ms: that of its training, and one as on flight controllers.
+"""Times between two calls of the policy, ms: as in its training, and as on flight controllers.
 
 The authors' firmware calls it every 2.5 ms on PX4, 1 ms on the Crazyflie and 0.5 ms on Betaflight.
 """

@@ -94,7 +94,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "does not have, so that its prediction turns over. "
             "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
             "`cf21B_500_idsia` is off, too.",
-            (partial(flights.compare_open_loop, idsia),), absent=absent(idsia), logs=True,
+            (partial(flights.open_loop, idsia),), absent=absent(idsia), logs=True,
             axes=("prediction over, s", "mean error"),
         ),
         Section(
@@ -102,7 +102,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "A Crazyflie 2.1: NanoBench. The simulated drone `cf2x_L250` follows the logged setpoints with the "
             "firmware's controller and filter. The figure is its RMS distance from the setpoint over that of the real "
             "drone.",
-            (partial(flights.compare_closed_loop, nanobench),), absent=absent(nanobench), logs=True,
+            (partial(flights.closed_loop, nanobench),), absent=absent(nanobench), logs=True,
             axes=("", "error of the simulation over that of the flight"),
         ),
         Section(

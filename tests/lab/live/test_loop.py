@@ -334,7 +334,7 @@ def test_commands_of_the_network_and_resets():
     fleet, queue = Fleet(sim, teleport=False), CommandQueue()
     with Live(sim, speed="max") as live:
         live.add(RemoteCommands(fleet, queue))
-        live.at(0.1, lambda live: queue._put(TakeOff(None, 0.5)) if live.flown < 50 else None)
+        live.at(0.1, lambda live: queue._enqueue(TakeOff(None, 0.5)) if live.flown < 50 else None)
         live.run(3.0)
         np.testing.assert_allclose(sim.data.states.pos[0, :, 2], 0.5, atol=0.15)
         live.lights[:] = 1.0

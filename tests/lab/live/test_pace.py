@@ -25,7 +25,7 @@ def test_steps_are_due_at_their_times_whatever_the_work_takes(clock):
     for k in range(5):
         np.testing.assert_allclose(10.0 + 0.02 * k - clock.now, pace.due_in(), atol=1e-12)
         clock.now += max(pace.due_in(), 0.0)
-        pace.begin(0.01 * k)
+        pace.record_step(0.01 * k)
         clock.now += 0.013
     assert pace.steps == 5
     assert pace.late == 0
@@ -34,11 +34,11 @@ def test_steps_are_due_at_their_times_whatever_the_work_takes(clock):
 
 def test_a_late_step_is_counted_and_caught_up(clock):
     pace = Pace(0.01, 1.0, clock)
-    pace.begin(0.0)
+    pace.record_step(0.0)
     clock.now += 0.025
-    np.testing.assert_allclose(pace.begin(0.01), 0.015)
+    np.testing.assert_allclose(pace.record_step(0.01), 0.015)
     assert pace.due_in() < 0, "the next one is due at once"
-    np.testing.assert_allclose(pace.begin(0.02), 0.005)
+    np.testing.assert_allclose(pace.record_step(0.02), 0.005)
     assert pace.due_in() > 0
     assert (pace.late, pace.lost) == (2, 0.0)
     np.testing.assert_allclose((pace.worst, pace.worst_at), (0.015, 0.01))
@@ -46,9 +46,9 @@ def test_a_late_step_is_counted_and_caught_up(clock):
 
 def test_a_long_lag_is_given_up(clock):
     pace = Pace(0.01, 1.0, clock)
-    pace.begin(0.0)
+    pace.record_step(0.0)
     clock.now += 1.01
-    pace.begin(0.01)
+    pace.record_step(0.01)
     np.testing.assert_allclose(pace.lost, 1.0)
     np.testing.assert_allclose(pace.due_in(), 0.01)
     assert MAX_LAG < 1.0
@@ -59,7 +59,7 @@ def test_quantiles_of_lateness(clock):
     pace = Pace(1.0, 1.0, clock)
     for k in range(1000):
         clock.now = 10.0 + k + (0.007 if k == 500 else 0.0)
-        pace.begin(k)
+        pace.record_step(k)
     assert pace.quantile(0.999) <= BIN_WIDTH + 1e-9
     np.testing.assert_allclose(pace.quantile(1.0), 0.007, atol=1e-9)
 
@@ -69,17 +69,17 @@ def test_as_fast_as_possible_nothing_is_late(clock):
     for k in range(10):
         assert pace.due_in() == 0
         clock.now += 1.0
-        pace.begin(k)
+        pace.record_step(k)
     assert (pace.late, pace.worst, pace.quantile(0.999)) == (0, 0.0, 0.0)
 
 
 def test_a_change_of_speed_begins_now(clock):
     pace = Pace(0.01, 1.0, clock)
-    pace.begin(0.0)
+    pace.record_step(0.0)
     clock.now += 0.004
     pace.speed = 0.1
     assert pace.due_in() == 0
-    pace.begin(0.01)
+    pace.record_step(0.01)
     np.testing.assert_allclose(pace.due_in(), 0.1)
 
 

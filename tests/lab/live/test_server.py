@@ -186,13 +186,13 @@ def test_waiting_commands_are_bounded(monkeypatch):
 def test_commands_that_arrive_while_others_are_taken_wait_for_the_next_call():
     """A producer as fast as the consumer: each of the first nine commands that is taken is followed by another."""
     queue = CommandQueue()
-    queue._put(Land(1))
+    queue._enqueue(Land(1))
     take = queue._queue.get_nowait
 
     def take_and_refill():
         command = take()
         if command.drone < 10:
-            queue._put(Land(command.drone + 1))
+            queue._enqueue(Land(command.drone + 1))
         return command
 
     queue._queue.get_nowait = take_and_refill

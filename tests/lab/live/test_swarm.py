@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from crazysim import Sim
 from crazysim.control import Control
 from crazysim.errors import ConfigError, UnknownNameError
+from crazysim.lab.live.host_trajectory import HostTrajectory, host_trajectories
 from crazysim.lab.live.loop import Live
-from crazysim.lab.live.paths import HostTrajectory, host_trajectories
 from crazysim.lab.live.swarm import Commander, DroneState, Swarm
-from crazysim.lab.live.swarm.plan import PlannedMotion, move, nearest_yaw
+from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
 from crazysim.trajectories import Trajectory, circle, line, minimum_snap
 
 OFFSET = 0.02
@@ -104,7 +104,7 @@ def test_a_landing_goes_on_where_the_drone_is_still_too_high():
 def test_commands_are_in_the_frame_of_the_estimate():
     """A drone at (1, 2) with yaw 0.5 whose estimate is (5, 5) with yaw 0.5 + pi / 2: forward is to the left there."""
     commander = flying()
-    commander.place_estimate(np.array([1.0, 2.0, 1.0]), 0.5, np.array([5.0, 5.0, 0.0, 0.5 + np.pi / 2]))
+    commander.set_estimate(np.array([1.0, 2.0, 1.0]), 0.5, np.array([5.0, 5.0, 0.0, 0.5 + np.pi / 2]))
     commander.go_to([5.0, 6.0, 0.5], 0.5 + np.pi / 2, 1.0)
     tick(commander, 11.0)
     command = tick(commander, 13.0)
@@ -115,7 +115,7 @@ def test_commands_are_in_the_frame_of_the_estimate():
     np.testing.assert_allclose([*found.pos, *found.vel], [5, 6, 0, 0, 1, 0], atol=1e-9)
     assert found.rpy[2] == pytest.approx(0.5 + np.pi / 2)
     level = flying("attitude")
-    level.place_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
+    level.set_estimate(np.zeros(3), 0.0, np.array([0.0, 0.0, 0.0, 1.0]))
     level.command("attitude", [0.1, 0.2, 1.3, 0.4])
     np.testing.assert_allclose(tick(level, 10.1), [0.1, 0.2, 0.3, 0.4])
     commander.reset()

@@ -2,7 +2,7 @@
 
     from crazysim.lab.live.crazyflie_py import Crazyswarm      # instead of: from crazyflie_py import Crazyswarm
 
-Names, arguments, units and the meaning of commands are those of ``crazyflie_py``. Time is simulated:
+Names, arguments, units and the meaning of commands are as in ``crazyflie_py``. Time is simulated:
 ``timeHelper.sleep`` advances the simulation as fast as possible, so that a run can be repeated bit for bit.
 """
 

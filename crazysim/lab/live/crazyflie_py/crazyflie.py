@@ -20,7 +20,6 @@ class TimeHelper:
     """Simulated time of a script."""
 
     def __init__(self, node: Swarm):
-        """Take the time of a swarm."""
         self.node = node
         self.rateHz: float | None = None
         self.nextTime: float | None = None
@@ -49,7 +48,6 @@ class Crazyflie:
     """One drone."""
 
     def __init__(self, swarm: Swarm, name: str):
-        """Take a drone of a swarm."""
         self._swarm, self._index = swarm, swarm.index(name)
         self.prefix, self.uri = f"/{name}", f"sim://{name}"
         self.initialPosition = swarm.home(name)
@@ -152,8 +150,8 @@ class Crazyflie:
     def get_status(self) -> dict[str, Any]:
         """Return name, time, bits of the supervisor, battery voltage, V, state of the power management and radio.
 
-        The battery is that of the plugin ``Battery``, or never empty without it. There is no radio: its strength is
-        that of no loss, and no packets are counted.
+        The battery's values come from the plugin ``Battery``; without it the battery is never empty. There is no radio:
+        its strength is the one without loss, and no packets are counted.
         """
         now, c = self._swarm.time, self._commander
         supervisor = (0 if c.locked else 1) | c.armed << 1 | c.armed << 3 | c.motors_on << 4 | c.locked << 6
@@ -191,7 +189,6 @@ class CrazyflieServer:
     """Drones by number: that at the end of their names, or their place from 1 on."""
 
     def __init__(self, swarm: Swarm):
-        """Take the drones of a swarm."""
         self._swarm = swarm
         self.crazyflies = [Crazyflie(swarm, name) for name in swarm.names]
         self.crazyfliesByName = {cf.prefix[1:]: cf for cf in self.crazyflies}

@@ -16,13 +16,13 @@ from crazysim.sim.sim import Sim
 CONFIGURATION = Path("crazyflies.yaml")
 """File with the drones of ``Crazyswarm()``, where there is one in the working directory."""
 
-_chosen: Swarm | None = None
+_chosen_swarm: Swarm | None = None
 
 
 def use(swarm: Swarm | None) -> None:
     """Let the next ``Crazyswarm()`` of a script fly this swarm; None for one of its own."""
-    global _chosen
-    _chosen = swarm
+    global _chosen_swarm
+    _chosen_swarm = swarm
 
 
 class Crazyswarm:
@@ -46,9 +46,9 @@ class Crazyswarm:
         Raises:
             ConfigError: If the configuration is invalid.
         """
-        global _chosen
+        global _chosen_swarm
         if swarm is None:
-            swarm, _chosen = _chosen, None
+            swarm, _chosen_swarm = _chosen_swarm, None
         if swarm is None:
             swarm = CONFIGURATION if CONFIGURATION.is_file() else {}
         self.swarm = swarm if isinstance(swarm, Swarm) else Swarm(*_simulation(swarm))

@@ -10,14 +10,13 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.live.paths import HostTrajectory
+from crazysim.lab.live.host_trajectory import HostTrajectory
 
 
 class Polynomial:
     """Polynomial of time."""
 
     def __init__(self, p: ArrayLike):
-        """Take coefficients, constant term first."""
         self.p = np.asarray(p, float)
 
     def eval(self, t: float) -> float:
@@ -63,7 +62,6 @@ class Trajectory:
     """Trajectory of several pieces."""
 
     def __init__(self) -> None:
-        """Begin without pieces."""
         self.polynomials: list[Polynomial4D] = []
         self.duration = 0.0
 
@@ -88,7 +86,7 @@ class Trajectory:
         return len(self.polynomials)
 
     def eval(self, t: float) -> TrajectoryOutput:
-        """Return the point at a time, s; beyond the ends it is that of the end."""
+        """Return the point at a time, s; beyond the ends, the end point."""
         path = self.path()
         found = path.derivatives(t, 2)
         return TrajectoryOutput(found[0, :3], found[1, :3], found[2, :3], np.array([0, 0, found[1, 3]]), found[0, 3])

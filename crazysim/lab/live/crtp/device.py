@@ -1,6 +1,6 @@
 """A simulated Crazyflie at the other end of CRTP: answers to packets, and packets of its own.
 
-Ports, channels and layouts are those of cflib 0.1.34 and of crazyflie-firmware, protocol version 12. A packet is a byte
+Ports, channels and layouts are as in cflib 0.1.34 and crazyflie-firmware, protocol version 12. A packet is a byte
 with port and channel, and up to 30 more. Packets of another form are reported and ignored.
 """
 
@@ -72,7 +72,7 @@ class CrtpDevice:
     """One drone of a swarm, for one client."""
 
     def __init__(self, swarm: Swarm, drone: int | str, log: dict[str, tuple[str, Reading]] | None = None):
-        """Prepare tables and memory.
+        """Create the device's tables and memory.
 
         Args:
             swarm: Swarm.

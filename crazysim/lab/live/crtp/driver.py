@@ -67,7 +67,7 @@ def _driver(swarm: Swarm) -> type:
             """Hand a packet to the drone, and queue its answers."""
             if self._device is not None:
                 for answer in self._device.handle(bytes([pk.header, *pk.data])):
-                    self._put(answer)
+                    self._enqueue(answer)
 
         def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
             """Return the next packet; None if there is none within a time, s."""
@@ -98,9 +98,9 @@ def _driver(swarm: Swarm) -> type:
             device = self._device
             if device is not None:
                 for packet in device.due():
-                    self._put(packet)
+                    self._enqueue(packet)
 
-        def _put(self, packet: bytes) -> None:
+        def _enqueue(self, packet: bytes) -> None:
             self._queue.put(CRTPPacket(packet[0], packet[1:]))
 
     return SimDriver

@@ -28,7 +28,7 @@ class CrtpServer(Closing):
     """Drones of a swarm on UDP, answered by a thread."""
 
     def __init__(self, swarm: Swarm, host: str = "127.0.0.1", port: int = PORT):
-        """Compile a step of the swarm, since clients wait for less time than that takes, and listen.
+        """Listen, once a step of the swarm is compiled: clients do not wait that long.
 
         Args:
             swarm: Swarm, which something else advances, such as ``swarm.start()``.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.lab.live.paths import HostTrajectory
+from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.commander import Commander
 from crazysim.trajectories.bezier import power_of
 

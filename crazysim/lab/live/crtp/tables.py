@@ -51,7 +51,7 @@ class Table:
     """Variables with consecutive numbers, as the protocol transfers them."""
 
     def __init__(self, variables: list[Variable], types: Mapping[str, tuple[int, str]]):
-        """Number the variables.
+        """Create a table with numbered variables.
 
         Raises:
             ConfigError: If a name has no group, is there twice or is too long for a packet, or a type does not exist.
@@ -137,7 +137,7 @@ LOG: dict[str, tuple[str, Reading]] = {
 
 
 def log_of(swarm: Swarm, drone: int) -> dict[str, tuple[str, Reading]]:
-    """Return the log variables of a drone: those of every one, of its battery, and of its range finder."""
+    """Return the log variables of a drone, including its battery and its range finder."""
     sim = swarm.sim
 
     def distance(name: str) -> Reading:

@@ -24,9 +24,9 @@ from crazysim.lab.live.mocap.source import ThreadSource
 
 SYSTEMS = ("optitrack", "vicon", "qualisys", "vrpn", "nokov", "motionanalysis")
 """Systems by their names in the package; a release may have been built without some of them."""
-WORKER = Path(__file__).with_name("worker.py")
+WORKER_PROGRAM = Path(__file__).with_name("worker.py")
 """Program that runs the package."""
-LINE = 1 << 20
+MAX_LINE = 1 << 20
 """Longest line of the worker, characters."""
 
 
@@ -60,14 +60,14 @@ class MotionCaptureSource(ThreadSource):
         if command is None and find_spec("motioncapture") is None:
             raise ConfigError(not_installed("motion capture needs", "motioncapture", "mocap"))
         super().__init__(f"{system} at {hostname}", convention)
-        command = [sys.executable, str(WORKER)] if command is None else command
+        command = [sys.executable, str(WORKER_PROGRAM)] if command is None else command
         self._worker = subprocess.Popen([*command, system, hostname], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL)
         self.start()
 
     def stream(self, stopped: threading.Event) -> Iterator[Frame]:
         """Yield the frames that the worker prints."""
         while not stopped.is_set():
-            line = self._worker.stdout.readline(LINE)
+            line = self._worker.stdout.readline(MAX_LINE)
             if not line:
                 raise ConnectionError(f"the worker ended with code {self._worker.wait()}")
             message = json.loads(line)

@@ -92,11 +92,13 @@ class Playback(Plugin):
         objects = data.objects
         rows = {handle.rows[0]: i for i, handle in enumerate(self.handles)}
 
-        def placed(old: Array, new: Array) -> Array:
+        def replace_rows(old: Array, new: Array) -> Array:
             parts = [new[rows[k]] if k in rows else old[..., k, :].reshape(old.shape[-1]) for k in range(old.shape[-2])]
             return jnp.stack(parts).reshape(old.shape)
 
         moved = objects.replace(
-            pos=placed(objects.pos, pos), quat=placed(objects.quat, quat), vel=placed(objects.vel, vel)
+            pos=replace_rows(objects.pos, pos),
+            quat=replace_rows(objects.quat, quat),
+            vel=replace_rows(objects.vel, vel),
         )
         return data.replace(objects=moved)

@@ -18,11 +18,11 @@ from crazysim.lab.live.mocap.source import MocapSource, Poll
 from crazysim.media.journal import Journal, read_journal
 from crazysim.storage import Closing, reading
 
-NAMES, POLLED = b"NAME", b"POLL"
+NAMES_CHUNK, POLL_CHUNK = b"NAME", b"POLL"
 """Kinds of chunks: names of bodies that were not seen before, and a poll."""
-POLL = struct.Struct("<dII")
+POLL_LAYOUT = struct.Struct("<dII")
 """Time of a poll, s, number of frames, and number of frames lost."""
-FRAME = struct.Struct("<ddI")
+FRAME_LAYOUT = struct.Struct("<ddI")
 """Stamp and time of arrival of a frame, s, and number of bodies."""
 
 
@@ -44,13 +44,13 @@ class MocapRecorder(Closing):
         if new:
             new = list(dict.fromkeys(new))
             self._ids.update({name: k for k, name in enumerate(new, start=len(self._ids))})
-            self._journal.append(NAMES, json.dumps(new).encode())
-        parts = [POLL.pack(poll.now, len(poll.frames), poll.lost)]
+            self._journal.append(NAMES_CHUNK, json.dumps(new).encode())
+        parts = [POLL_LAYOUT.pack(poll.now, len(poll.frames), poll.lost)]
         for frame in poll.frames:
             ids = np.array([self._ids[name] for name in frame.names], "<u4")
             poses = np.concatenate([frame.pos, frame.quat], axis=1).astype("<f8")
-            parts += [FRAME.pack(frame.stamp, frame.received, len(ids)), ids.tobytes(), poses.tobytes()]
-        self._journal.append(POLLED, b"".join(parts))
+            parts += [FRAME_LAYOUT.pack(frame.stamp, frame.received, len(ids)), ids.tobytes(), poses.tobytes()]
+        self._journal.append(POLL_CHUNK, b"".join(parts))
 
     def close(self) -> None:
         """Close the file."""
@@ -68,20 +68,20 @@ def read_polls(path: str | Path) -> Iterator[Poll]:
     names: list[str] = []
     with reading(path, "a recording of motion capture", remedy):
         for kind, content in read_journal(path):
-            if kind == NAMES:
+            if kind == NAMES_CHUNK:
                 names += json.loads(content)
-            elif kind == POLLED:
+            elif kind == POLL_CHUNK:
                 yield _poll(content, names)
             else:
-                raise ValueError(f"expected chunks of kinds {NAMES!r} and {POLLED!r}, got {kind!r}")
+                raise ValueError(f"expected chunks of kinds {NAMES_CHUNK!r} and {POLL_CHUNK!r}, got {kind!r}")
 
 
 def _poll(content: bytes, names: list[str]) -> Poll:
-    now, n_frames, lost = POLL.unpack_from(content)
-    at, frames = POLL.size, []
+    now, n_frames, lost = POLL_LAYOUT.unpack_from(content)
+    at, frames = POLL_LAYOUT.size, []
     for _ in range(n_frames):
-        stamp, received, n = FRAME.unpack_from(content, at)
-        at += FRAME.size
+        stamp, received, n = FRAME_LAYOUT.unpack_from(content, at)
+        at += FRAME_LAYOUT.size
         ids = np.frombuffer(content, "<u4", n, at)
         poses = np.frombuffer(content, "<f8", 7 * n, at + 4 * n).reshape(n, 7)
         at += 60 * n
@@ -92,9 +92,10 @@ def _poll(content: bytes, names: list[str]) -> Poll:
 class ReplaySource(MocapSource):
     """Frames of a recording.
 
-    By ``"poll"``, each poll returns those of the recorded poll of the same number: a simulation that is stepped as the
-    recorded one gives the same run, bit for bit. By ``"time"``, each frame comes when as much simulated time has passed
-    since the start as there was between it and the first frame, for a simulation that is stepped in another way.
+    By ``"poll"``, each poll returns the frames of the recorded poll of the same number: a simulation that is stepped as
+    the recorded one gives the same run, bit for bit. By ``"time"``, each frame comes when as much simulated time
+    has passed since the start as there was between it and the first frame, for a simulation that is stepped in
+    another way.
     """
 
     def __init__(self, path: str | Path, by: str = "poll"):

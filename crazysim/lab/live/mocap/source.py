@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import from_yaw
+from crazysim.lab.live.host_trajectory import host_trajectories
 from crazysim.lab.live.mocap.frames import Convention, Frame
-from crazysim.lab.live.paths import host_trajectories
 from crazysim.storage import Closing
 from crazysim.trajectories import Trajectory
 
@@ -29,7 +29,7 @@ class Poll(NamedTuple):
     """Frames that have arrived since the last poll, and the time of the poll."""
 
     now: float
-    """Time of the poll, clock of this computer or of the simulation, s; that of ``Frame.received``."""
+    """Time of the poll, s, on the clock of ``Frame.received``: this computer's or the simulation's."""
     frames: list[Frame]
     """Frames, in the order of their arrival."""
     lost: int = 0
@@ -79,7 +79,7 @@ class FunctionSource(MocapSource):
         Args:
             function: Position and attitude of each body by name, as the convention has them, at a time, s.
             freq: Frames per second, Hz.
-            convention: Convention of the poses; None for that of crazysim.
+            convention: Convention of the poses; None for crazysim's.
             name: Name in reports.
 
         Raises:
@@ -107,7 +107,7 @@ class FunctionSource(MocapSource):
 def show_source(
     trajectories: Trajectory | Sequence[Trajectory], names: Sequence[str] | None = None, freq: float = 120.0
 ) -> FunctionSource:
-    """Return a source of level bodies that follow trajectories, such as those of ``load_show(path)``.
+    """Return a source of level bodies that follow trajectories, such as a show's from ``load_show(path)``.
 
     Args:
         trajectories: One trajectory for each body, or one record with a leading axis.
@@ -133,18 +133,18 @@ def show_source(
 
 
 class ThreadSource(MocapSource):
-    """Base of sources that wait for frames in a thread of their own, such as those of a network.
+    """Base of sources that wait for frames in a thread of their own, such as network clients.
 
     A subclass yields frames from ``stream`` in the convention of its system. An error there ends the source, not the
     simulation; ``ended`` has the reason.
     """
 
     def __init__(self, name: str, convention: Convention | None = None):
-        """Prepare; ``start`` starts the thread.
+        """Create a source; ``start`` starts its thread.
 
         Args:
             name: Name in reports.
-            convention: Convention of the frames; None for that of crazysim.
+            convention: Convention of the frames; None for crazysim's.
         """
         self.name, self._convention = name, convention or Convention()
         self._frames: deque[Frame] = deque(maxlen=CAPACITY)

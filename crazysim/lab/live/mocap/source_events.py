@@ -29,7 +29,6 @@ class Reports:
     """The latest reports, and counts of all. The first and every tenth, hundredth, ... of a kind and name is logged."""
 
     def __init__(self) -> None:
-        """Begin without reports."""
         self.latest: deque[Report] = deque(maxlen=MAX_REPORTS)
         self.counts: Counter[tuple[str, str]] = Counter()
 

@@ -71,7 +71,7 @@ class Tracker:
     """
 
     def __init__(self, names: Sequence[str], rules: Rules | None = None, source: str = "mocap"):
-        """Begin without poses.
+        """Create a tracker without poses.
 
         Args:
             names: Names of the bodies in the stream.

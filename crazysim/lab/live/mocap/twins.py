@@ -37,7 +37,7 @@ class Twin:
     """Object that stands for a real one.
 
     The body is turned by ``turn`` in the tracked frame, angles of ``fixed`` that are not None are replaced, and its
-    frame is then put at ``offset`` in the body's own axes. With a ``parent`` it is a part of a skeleton: its position
+    frame then stands at ``offset`` in the body's own axes. With a ``parent`` it is a part of a skeleton: its position
     follows from the parent's pose and its own measurement.
     """
 
@@ -80,7 +80,7 @@ class Twin:
 
 
 def twin_of(name: str, twins: Mapping[str, Twin]) -> Twin | None:
-    """Return the twin of the longest key with which a name of the stream begins; None if there is none."""
+    """Return the twin of the longest key that a name of the stream starts with; None if there is none."""
     keys = [key for key in twins if name.startswith(key)]
     return twins[max(keys, key=len)] if keys else None
 
@@ -112,7 +112,7 @@ class Twins(Closing):
         Args:
             sim: Simulation.
             source: Source of the poses.
-            twins: Twin of each name; a name takes that of the longest key with which it begins.
+            twins: Twins by the beginning of their names. A name takes the twin of the longest key that it starts with.
             names: Names of the bodies in the stream; ``discover`` finds them. Others are reported and ignored.
             rules: Limits of the rules; None for the defaults.
             record: Path of a recording to write; None for none.

@@ -22,7 +22,7 @@ PULSE_MIN, PULSE_MAX = 1000.0, 2000.0
 class ArduPilot(FirmwareLink):
     """A process of ArduPilot that was started with ``--model JSON:ADDRESS``; it waits for each answer.
 
-    The interface is that of ``libraries/SITL/examples/JSON`` of ArduPilot/ardupilot. ArduPilot has no HIL messages of
+    The interface follows ``libraries/SITL/examples/JSON`` of ArduPilot/ardupilot. ArduPilot has no HIL messages of
     MAVLink any more.
 
     It receives what the ``IMU`` measures. The interface has no fields for the others: ArduPilot simulates satellite
@@ -36,7 +36,7 @@ class ArduPilot(FirmwareLink):
     lockstep = True
 
     def __init__(self, host: str = "127.0.0.1", *, port: int = PORT):
-        """Listen.
+        """Listen for ArduPilot.
 
         Args:
             host: Address to listen at.

@@ -23,7 +23,7 @@ LARGEST_PULSE = 65535
 class Betaflight(FirmwareLink):
     """A process ``betaflight_SITL``, which runs in real time.
 
-    Packets are those of ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
+    Packets follow ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
     its clock to the simulation's but does not wait for it, and answers each packet of the state with at most one of the
     motors.
 
@@ -92,7 +92,7 @@ class Betaflight(FirmwareLink):
     def send(self, measured: Measurements) -> None:
         """Send the state, and the remote control when it is due."""
         gyro, (x, y, z, w) = frd(measured.gyro), measured.quat
-        latitude, longitude, altitude = self.origin.place(measured.gps_pos)
+        latitude, longitude, altitude = self.origin.geodetic_position(measured.gps_pos)
         if self.gazebo:
             quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
             self._start = self._start or (latitude, longitude)  # the bridge mirrors places at the first one

@@ -31,8 +31,8 @@ TIMEOUT = range_between(high=1e6, positive=True)
 class FirmwareLink(Closing):
     """Link to the process of a firmware that flies one quadrotor.
 
-    ``positions`` are signs of x (forward) and y (left) of motors 1 to 4, ``yaw_torque_signs`` those of the torque about
-    z (up) with which each acts on the body: positive for a rotor that turns clockwise, seen from above.
+    ``positions`` are signs of x (forward) and y (left) of motors 1 to 4, ``yaw_torque_signs`` the signs of the torque
+    about z (up) with which each acts on the body: positive for a rotor that turns clockwise, seen from above.
     """
 
     positions: ClassVar[tuple[tuple[int, int], ...]]
@@ -51,7 +51,7 @@ class FirmwareLink(Closing):
         """Return the newest motor commands from 0 to 1, or None if none arrived in time. (4,)
 
         Args:
-            timeout: Time to wait for one, s; 0 for those that are there.
+            timeout: Time to wait for one, s; 0 to read only what has arrived.
         """
 
 
@@ -59,7 +59,7 @@ class Rate:
     """Times at which something is due, at a rate in simulated time."""
 
     def __init__(self, name: str, freq: float):
-        """Begin at once.
+        """Create a rate whose first time is due at once.
 
         Args:
             name: Name of the rate, for messages.
@@ -128,7 +128,7 @@ class Datagrams(Closing):
         """Return the contents of the newest packet that has any, or None if none arrived in time.
 
         Args:
-            timeout: Time to wait for one, s; 0 for those that are there.
+            timeout: Time to wait for one, s; 0 to read only what has arrived.
             read: Function that returns the contents of a packet, or None for another format, which is skipped.
         """
         found, now = None, time.monotonic()

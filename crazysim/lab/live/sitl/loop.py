@@ -27,7 +27,7 @@ from crazysim.storage import Closing
 from crazysim.tables import NOT_NEGATIVE, read_number
 
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
-"""Magnetic field where there is no ``Magnetometer``, world frame, T: about that of central Europe."""
+"""Magnetic field where there is no ``Magnetometer``, world frame, T: about the field in central Europe."""
 SILENCE_LIMIT = 1.0
 """Time of a run from which a firmware that sends no motor commands in it is an error, s."""
 GPS_FREQ = 5
@@ -35,7 +35,7 @@ GPS_FREQ = 5
 SENSOR_KINDS = (IMU, Barometer, Magnetometer, GPS)
 """Sensors whose measurements firmware receives."""
 MOUNTED_SENSORS = (IMU, Magnetometer)
-"""Those that measure in a frame of their own, at an attitude in the body."""
+"""Sensors that measure in a frame of their own, at an attitude in the body."""
 
 
 class SoftwareInTheLoop(Closing):
@@ -60,7 +60,7 @@ class SoftwareInTheLoop(Closing):
 
         Args:
             sim: Simulation at the level ``rotor_vel``.
-            links: Links to the firmware, one for each drone, those of the first world first.
+            links: Links to the firmware, one for each drone, in the order of worlds.
             freq: Exchanges per second, Hz, a divisor of ``sim.freq``; None for one in every step.
             motors: Meaning of a motor command from 0 to 1: part of the largest speed of a rotor, or of its thrust.
             reversed: True for a firmware that is set up for rotors that turn the other way round.
@@ -123,7 +123,7 @@ class SoftwareInTheLoop(Closing):
         for k in range(round(seconds / dt)):
             if (due := pace.due_in()) > 0:
                 time.sleep(due)
-            pace.begin(k * dt)
+            pace.record_step(k * dt)
             self.exchange()
             self._check_heard(time.monotonic() - self.timeout, self.timeout)
             self.sim.step(self._n_steps)
@@ -131,7 +131,7 @@ class SoftwareInTheLoop(Closing):
             self._check_heard(began, passed)
 
     def exchange(self) -> None:
-        """Send measurements, and put the motor commands that come back in force."""
+        """Send measurements, and apply the motor commands that come back."""
         measured, self._taken = self._measurements()
         for link, each in zip(self.links, measured, strict=True):
             link.send(each)
@@ -187,7 +187,7 @@ class SoftwareInTheLoop(Closing):
     def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
         """Return the latest measurements of a sensor, vectors in the body frame, and when they were taken, in steps.
 
-        Before the first one they are those of a perfect sensor. Without the sensor there are none.
+        Before the first measurement they are a perfect sensor's. Without the sensor there are none.
         """
         sensor = self._sensors[kind]
         if sensor is None:
@@ -243,7 +243,7 @@ def _as_links(links: object) -> tuple[FirmwareLink, ...]:
 
 
 def _rows(values: Any) -> NDArray:
-    """Return values of all drones as one row for each, of those of the first world first. (n_links, k)"""
+    """Return values of all drones as one row for each drone, in the order of worlds. (n_links, k)"""
     values = np.asarray(values, float)
     return values.reshape(-1, values.shape[-1])
 

@@ -1,4 +1,4 @@
-"""Measurements of one drone for a firmware, in the axes of crazysim and in those of aviation."""
+"""Measurements of one drone for a firmware, in the axes of crazysim and of aviation."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Measurements(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """Place of the world's origin on the earth."""
+    """Position of the world's origin on the earth."""
 
     latitude: float = setting(low=-MAX_LATITUDE, high=MAX_LATITUDE)
     """Latitude, degrees."""
@@ -76,7 +76,7 @@ class Origin:
         """
         check_settings(self)
 
-    def place(self, pos: NDArray) -> tuple[float, float, float]:
+    def geodetic_position(self, pos: NDArray) -> tuple[float, float, float]:
         """Return latitude and longitude, degrees, and altitude, m, on the plane that touches the earth here.
 
         Args:
@@ -107,7 +107,7 @@ def as_origin(origin: object) -> Origin:
 
 
 ZURICH = Origin(47.397742, 8.545594, 488.0)
-"""Default place, at which simulations of PX4 start."""
+"""Default origin, at which simulations of PX4 start."""
 
 
 def frd(vector: NDArray) -> NDArray:
@@ -123,7 +123,7 @@ def ned(vector: NDArray) -> NDArray:
 def quat_ned(quat: NDArray) -> NDArray:
     """Return the attitude of the body's axes forward, right, down in the world's north, east, down, wxyz. (4,)
 
-    The quaternion of ENU to NED, ``(x + y) / sqrt(2)``, times the attitude, times that of FRD to FLU, ``x``.
+    The quaternion of ENU to NED, ``(x + y) / sqrt(2)``, times the attitude, times the quaternion of FRD to FLU, ``x``.
 
     Args:
         quat: Attitude of forward, left, up in east, north, up, xyzw. (4,)

@@ -41,7 +41,7 @@ class Px4(FirmwareLink):
 
     It receives what ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` measure, each when a measurement is new. It
     treats a sensor whose measurements never change as broken: give all of them noise. The true state in
-    ``HIL_STATE_QUATERNION`` is for its log; the accelerations there are those of the ``IMU``.
+    ``HIL_STATE_QUATERNION`` is for its log; its accelerations are the ``IMU``'s.
     """
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))
@@ -112,12 +112,12 @@ class Px4(FirmwareLink):
             north, east, down = (round(100 * v) for v in ned(measured.gps_vel))
             speed = round(float(np.hypot(north, east)))
             course = round(100 * np.degrees(np.arctan2(east, north)) % 36000)
-            place = self._place(measured.gps_pos)
+            place = self._geodetic_integers(measured.gps_pos)
             self._send(mav.MAVLink_hil_gps_message(micros, 3, *place, 30, 40, speed, north, east, down, course, 10))
         vel = [round(100 * v) for v in ned(measured.vel)]
         accel = [round(1e3 * v / 9.80665) for v in frd(measured.accel)]
         quat, rates = quat_ned(measured.quat).tolist(), frd(measured.ang_vel)
-        place = self._place(measured.pos)
+        place = self._geodetic_integers(measured.pos)
         self._send(mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *place, *vel, 0, 0, *accel))
 
     def receive(self, timeout: float) -> NDArray | None:
@@ -153,9 +153,9 @@ class Px4(FirmwareLink):
             now = time.monotonic()
         return found
 
-    def _place(self, pos: NDArray) -> tuple[int, int, int]:
+    def _geodetic_integers(self, pos: NDArray) -> tuple[int, int, int]:
         """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a position in the world, m. (3,)"""
-        latitude, longitude, altitude = self.origin.place(pos)
+        latitude, longitude, altitude = self.origin.geodetic_position(pos)
         return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
 
     def _connected(self) -> socket.socket:

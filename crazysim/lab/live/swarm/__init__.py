@@ -1,7 +1,7 @@
 """Swarms of simulated drones that take the commands of Crazyflies."""
 
 from crazysim.lab.live.swarm.commander import Commander
-from crazysim.lab.live.swarm.plan import PlannedMotion
+from crazysim.lab.live.swarm.motion import PlannedMotion
 from crazysim.lab.live.swarm.state import DroneState
 from crazysim.lab.live.swarm.swarm import Swarm
 

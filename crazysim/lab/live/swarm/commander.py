@@ -19,21 +19,21 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import yaw_of
-from crazysim.lab.live.paths import HostTrajectory
+from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.estimate import EstimateFrame
-from crazysim.lab.live.swarm.plan import PlannedMotion, move, nearest_yaw
+from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
 from crazysim.lab.live.swarm.state import DroneState
 
 STABILIZE, SHUTDOWN = 0.5, 2.0
-"""Time without a streamed setpoint after which the drone stays in its place, and after which its motors stop, s."""
+"""Time without a streamed setpoint after which the drone holds its position, and after which its motors stop, s."""
 MAX_COORDINATE = 1e3
 """Largest coordinate of a command, m, and largest number of any command."""
-SINK, DEEPEST = 0.3, 1.0
+SINK_SPEED, MAX_SINK = 0.3, 1.0
 """Speed at which the setpoint continues down where a landing has ended above its height, m/s, and its distance, m."""
-REACHED, RESTING, REST_TIME = 0.01, 0.02, 0.5
-"""Height above that of a landing at which the motors stop, m; or vertical speed below which a drone stands on ground,
-m/s, some time, s, after the end of the landing."""
-SHORTEST, LONGEST = 1e-3, 1e4
+LANDED_HEIGHT, RESTING_SPEED, REST_TIME = 0.01, 0.02, 0.5
+"""Height above the target of a landing at which the motors stop, m; or vertical speed, m/s, below which a drone counts
+as standing, and the time after the end of the landing from which it does, s."""
+MIN_DURATION, MAX_DURATION = 1e-3, 1e4
 """Limits of durations, s, and of factors of durations, 1."""
 N_TRAJECTORIES = 256
 """Number of trajectories that a drone holds; their IDs are one byte."""
@@ -43,7 +43,7 @@ class Commander:
     """Setpoints of one drone from commands; all times are simulated, s."""
 
     def __init__(self, control: Control = Control.state, report: Callable[[str], None] | None = None):
-        """Begin on the floor with motors off.
+        """Create the commander of a drone on the floor with motors off.
 
         Args:
             control: Command level of the simulation.
@@ -88,7 +88,7 @@ class Commander:
         if self._plan is not None:
             point = self._plan.at(self.now)
             if self._plan.lands and self._plan.finished(self.now):  # the setpoint sinks until the drone has landed
-                point[:2, 2] += -min(SINK * (self.now - self._plan.end), DEEPEST), -SINK
+                point[:2, 2] += -min(SINK_SPEED * (self.now - self._plan.end), MAX_SINK), -SINK_SPEED
             return point
         return self._motion()
 
@@ -112,7 +112,7 @@ class Commander:
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
         """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
         goal, (yaw,) = _numbers("goal", goal, 3), _numbers("yaw", [yaw], 1)
-        begin = self._begin("go_to")
+        begin = self._motion_start("go_to")
         if relative:
             goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
         end = [*goal, nearest_yaw(begin[0, 3], yaw)]
@@ -163,15 +163,15 @@ class Commander:
             raise ConfigError(
                 f"expected one of the trajectories {sorted(self.trajectories)}, got {identity}. Upload it."
             )
-        if not SHORTEST <= timescale <= LONGEST:
-            raise ConfigError(f"expected a timescale from {SHORTEST:g} to {LONGEST:g}, got {timescale}")
+        if not MIN_DURATION <= timescale <= MAX_DURATION:
+            raise ConfigError(f"expected a timescale from {MIN_DURATION:g} to {MAX_DURATION:g}, got {timescale}")
         if identity in self._compressed and (timescale != 1 or reversed):
             raise ConfigError(
                 f"expected a compressed trajectory at its own speed and direction, got timescale {timescale:g}, "
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
         plan = PlannedMotion(self.trajectories[identity], self.now, timescale, bool(reversed))
-        begin, first = self._begin("start_trajectory")[0], plan.at(self.now)[0]
+        begin, first = self._motion_start("start_trajectory")[0], plan.at(self.now)[0]
         shift = np.zeros(4)
         if relative:
             shift[:3] = begin[:3] - first[:3]
@@ -190,7 +190,7 @@ class Commander:
         level = Control(level)
         self._require(level)
         size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
-        self._put("command", _numbers(f"{level.value} command", values, size, limit=math.inf))
+        self._stream_setpoint("command", _numbers(f"{level.value} command", values, size, limit=math.inf))
 
     def full_state(self, pos: ArrayLike, vel: ArrayLike, acc: ArrayLike, quat: ArrayLike, ang_vel: ArrayLike) -> None:
         """Stream a state: position, m, velocity, m/s, acceleration, m/s^2, attitude, xyzw, body rates, rad/s."""
@@ -200,27 +200,27 @@ class Commander:
             raise ConfigError(f"expected a unit quaternion, xyzw, got {list(parts[3])}")
         parts[3] = parts[3] / norm
         self._require(Control.state)
-        self._put("command", np.concatenate(parts))
+        self._stream_setpoint("command", np.concatenate(parts))
 
     def position(self, pos: ArrayLike, yaw: float) -> None:
         """Stream a position, m (3,), and yaw, rad."""
         self._require(Control.state)
-        self._put("position", np.append(_numbers("position", pos, 3), _numbers("yaw", [yaw], 1)))
+        self._stream_setpoint("position", np.append(_numbers("position", pos, 3), _numbers("yaw", [yaw], 1)))
 
     def velocity(self, vel: ArrayLike, yaw_rate: float) -> None:
         """Stream a velocity, world frame, m/s (3,), and yaw rate, rad/s; a reference position moves with it."""
         self._require(Control.state)
-        self._put("velocity", np.append(_numbers("velocity", vel, 3), _numbers("yaw rate", [yaw_rate], 1)))
+        self._stream_setpoint("velocity", np.append(_numbers("velocity", vel, 3), _numbers("yaw rate", [yaw_rate], 1)))
 
     def hover(self, vx: float, vy: float, yaw_rate: float, height: float) -> None:
         """Stream a horizontal velocity in the axes of the drone's yaw, m/s, yaw rate, rad/s, and height, m."""
         self._require(Control.state)
-        self._put("hover", _numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
+        self._stream_setpoint("hover", _numbers("hover setpoint", [vx, vy, yaw_rate, height], 4))
 
     def attitude(self, roll: float, pitch: float, yaw_rate: float, thrust: float) -> None:
         """Stream roll, pitch, rad, yaw rate, rad/s, and collective thrust, N."""
         self._require(Control.attitude)
-        self._put("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
+        self._stream_setpoint("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
 
     def notify_setpoints_stop(self, remain_valid: float = 0.0) -> None:
         """Let high-level commands take over after some time, s, in which the last setpoint stays in force."""
@@ -241,7 +241,7 @@ class Commander:
 
     # The estimate ---------------------------------------------------------------------------------------------------
 
-    def place_estimate(self, pos: NDArray, yaw: float, pose: NDArray) -> None:
+    def set_estimate(self, pos: NDArray, yaw: float, pose: NDArray) -> None:
         """Set the pose of the drone's estimate; commands are in the frame of that estimate from now on.
 
         Args:
@@ -299,8 +299,8 @@ class Commander:
 
     def _has_landed(self, plan: PlannedMotion) -> bool:
         """Return True if the drone is as low as its landing goes, or stands on something."""
-        stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING
-        return stands or self.pos[2] <= plan.at(self.now)[0, 2] + REACHED
+        stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
+        return stands or self.pos[2] <= plan.at(self.now)[0, 2] + LANDED_HEIGHT
 
     def _streamed(self, dt: float) -> NDArray:
         kind, x = self._stream  # type: ignore[misc]
@@ -330,7 +330,7 @@ class Commander:
             return np.array([0.0, 0.0, self._reference[3] if self.control == Control.attitude else 0.0, self._thrust])
         return x
 
-    def _put(self, kind: str, values: NDArray) -> None:
+    def _stream_setpoint(self, kind: str, values: NDArray) -> None:
         if self._stream is None:
             self._last = self.goal()
             self._reference = self._last[0].copy()
@@ -339,7 +339,7 @@ class Commander:
 
     def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
         (height,) = _numbers("height", [height], 1)
-        here = self._begin("land" if lands else "take_off")[0]
+        here = self._motion_start("land" if lands else "take_off")[0]
         goal = here.copy()
         goal[2] = height
         if yaw is not None:
@@ -351,7 +351,7 @@ class Commander:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""
         return np.array([[*self.pos, self.yaw], [*self.vel, 0.0], [0.0] * 4])
 
-    def _begin(self, command: str) -> NDArray:
+    def _motion_start(self, command: str) -> NDArray:
         """Return where a high-level command begins: at the setpoint in force, or at the drone while setpoints stream.
 
         One that the stream keeps from taking effect is reported.
@@ -390,9 +390,9 @@ def _numbers(name: str, values: ArrayLike, n: int, limit: float = MAX_COORDINATE
 
 
 def _duration(value: float) -> float:
-    (value,) = _numbers("duration", [value], 1, LONGEST)
-    if value < SHORTEST:
-        raise ConfigError(f"expected a positive duration of at least {SHORTEST:g} s, got {value} s")
+    (value,) = _numbers("duration", [value], 1, MAX_DURATION)
+    if value < MIN_DURATION:
+        raise ConfigError(f"expected a positive duration of at least {MIN_DURATION:g} s, got {value} s")
     return value
 
 

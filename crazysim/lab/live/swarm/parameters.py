@@ -64,7 +64,7 @@ PARAMETERS: dict[str, Parameter] = {
 
 
 def parameters_of(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter]:
-    """Return the parameters of a drone: those of every one, its deck of ranges, and its gains of attitude.
+    """Return the parameters of a drone, including its deck of ranges and its attitude gains.
 
     Args:
         airframe: Airframe; one without the gains of ``controller="pid"`` has no group ``pid_attitude``.
@@ -83,7 +83,6 @@ class Parameters(Mapping[str, float]):
     """Values of the parameters of one drone."""
 
     def __init__(self, kinds: Mapping[str, Parameter]):
-        """Take the parameters, with their values at the start."""
         self.kinds = dict(kinds)
         self._values = {name: float(kind.value) for name, kind in kinds.items()}
         self.light = Light()
@@ -147,10 +146,9 @@ PAGE = 'The guide "Real drones and their scripts" lists the parameters.'
 
 
 class Light:
-    """Colour of the LED ring or of the colour LED deck; that which was set last shines."""
+    """Colour of the LED ring or of the colour LED deck, whichever was set last."""
 
     def __init__(self) -> None:
-        """Begin dark."""
         self.memory = np.zeros((12, 3))
         self._begin, self._target = np.zeros(3), np.zeros(3)
         self._start, self._duration = 0.0, 0.0

@@ -34,7 +34,7 @@ class BatteryState(NamedTuple):
 
 
 def battery_of(sim: Sim, drone: int) -> BatteryState:
-    """Return the state of a drone's ``Battery``; without one, that of a battery which is never empty."""
+    """Return the state of a drone's ``Battery``; without the plugin, of a battery that is never empty."""
     plugin = _plugin(sim, Battery)
     if plugin is None:
         return BatteryState(IDEAL_VOLTAGE, 1.0, ON_BATTERY)

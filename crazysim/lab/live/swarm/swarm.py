@@ -40,7 +40,7 @@ class Swarm(Closing):
         swarm["cf1"].take_off(1.0, 2.0)
         swarm.advance(3.0)
 
-    States are those of the filter of ``Sim(estimator=...)`` and of its ``IMU``, or the true ones without a filter.
+    States come from the filter of ``Sim(estimator=...)`` and its ``IMU``; without a filter they are the true ones.
     Commands come from other threads or from the same one; ``lock`` protects them. The simulation advances by
     ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
     that ``advance`` runs, after ``run_in(live)``.
@@ -133,7 +133,7 @@ class Swarm(Closing):
             if name == "hlCommander.groupmask":
                 self.commanders[k].group = int(value)
             elif name == "kalman.resetEstimation" and value and parameters.has_initial_pose:
-                self.commanders[k].place_estimate(self._states[k].pos, self._yaws[k], parameters.initial_pose)
+                self.commanders[k].set_estimate(self._states[k].pos, self._yaws[k], parameters.initial_pose)
             elif name.startswith(LIGHT_GROUPS):
                 self.colors[k] = parameters.light.color(self.time)
 

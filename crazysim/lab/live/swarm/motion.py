@@ -1,4 +1,4 @@
-"""Plans of the high-level commander: smooth moves and uploaded trajectories, as in the firmware of the Crazyflie."""
+"""Motions of the high-level commander: smooth moves and uploaded trajectories, as in the firmware of the Crazyflie."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.lab.live.paths import HostTrajectory
+from crazysim.lab.live.host_trajectory import HostTrajectory
 
 NO_JERK_INVERSE = np.linalg.inv(
     [[k * (k - 1) * (k - 2) if d == 3 else [1, k, k * (k - 1)][d] for k in range(4, 8)] for d in range(4)]
@@ -16,7 +16,7 @@ NO_JERK_INVERSE = np.linalg.inv(
 
 
 class PlannedMotion(NamedTuple):
-    """A path with its start, speed, direction and place."""
+    """A trajectory with its start time, speed, direction and offset."""
 
     path: HostTrajectory
     """Path."""
