@@ -97,3 +97,31 @@ class Tying(Springs):
 
         placed = [Placement(pull, name=f"{self.name}_pull"), Placement(exchange, name=f"{self.name}_exchange")]
         return [*placed, *super().stages(sim)]
+
+
+KINDS = (Springs, Crowd, Tied, Tying)
+
+
+def build(kinds, n_worlds=2, n_drones=2, n_members=3, **settings):
+    """Return a simulation of drones in the air, different ones, with a population.
+
+    Args:
+        kinds: Class of the population, which is added as "springs", or several, each added under the name of its class.
+        n_worlds: Number of worlds.
+        n_drones: Number of drones in each.
+        n_members: Number of members of each population.
+        **settings: Other settings of the simulation.
+    """
+    sim = cs.Sim(n_worlds, n_drones, control="rotor_vel", **settings)
+    for kind in (kinds,) if isinstance(kinds, type) else kinds:
+        name = "springs" if kind is kinds else kind.__name__.lower()
+        sim.add(kind([f"{name}_{k}" for k in range(n_members)], name=name))
+    rng = np.random.default_rng(0)
+    pos = np.float32(rng.uniform(1, 2, (n_worlds, n_drones, 3)))
+    sim.data = sim.data.replace(states=sim.data.states.replace(pos=pos))
+    cmd = np.random.default_rng(1).uniform(-1, 1, (n_worlds, n_members, 3))
+    for population in sim.plugins.values():
+        sim.data = population.commanded(sim.data, cmd)
+    sim.build_default_data()
+    sim.rotor_vel_control(np.tile([15000.0, 15000.0, 15100.0, 15000.0], (n_worlds, n_drones, 1)))
+    return sim

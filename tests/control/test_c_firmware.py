@@ -132,9 +132,9 @@ class Height(Controller):
         return jnp.broadcast_to(jnp.where(thrust > 0, speed, 0.0), (4,)), HeightMemory(throttle)
 
 
-def flown(controller, n_steps=1000, engine="auto"):
+def flown(controller, n_steps=1000):
     """Return a simulation whose drones rise to heights of their own."""
-    sim = Sim(WORLDS, DRONES, control="state", controller=controller, engine=engine)
+    sim = Sim(WORLDS, DRONES, control="state", controller=controller)
     pos = np.array(sim.data.states.pos)
     pos[..., 2] = np.linspace(0.5, 2.0, WORLDS * DRONES).reshape(WORLDS, DRONES)
     sim.state_control(pos=pos)
@@ -142,10 +142,9 @@ def flown(controller, n_steps=1000, engine="auto"):
     return sim
 
 
-@pytest.mark.parametrize("engine", ["fused", "plain"])
-def test_a_law_in_c_flies_as_the_same_law_in_jax(library, engine):
-    found = flown(CFirmware(library("hover", HOVER)), engine=engine)
-    expected = flown(Height(), engine=engine)
+def test_a_law_in_c_flies_as_the_same_law_in_jax(library):
+    found = flown(CFirmware(library("hover", HOVER)))
+    expected = flown(Height())
     assert np.ptp(expected.data.states.pos[..., 2]) > 1.0
     # The two round differently at each of 1,000 steps, by parts of 1e-7.
     np.testing.assert_allclose(found.data.states.pos, expected.data.states.pos, atol=1e-5)
@@ -258,9 +257,8 @@ def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
     assert words.tolist() == [[101]]
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain"])
-def test_a_derivative_is_an_error_that_names_the_library(library, engine):
-    sim = Sim(control="state", controller=CFirmware(library("hover", HOVER)), engine=engine)
+def test_a_derivative_is_an_error_that_names_the_library(library):
+    sim = Sim(control="state", controller=CFirmware(library("hover", HOVER)))
     data, step = sim.data, sim.step_fn
 
     def height(z):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import by_stages, with_states
+from sweep import FLEET, HEXAROTOR
 
 import crazysim as cs
 from crazysim import ConfigError, Sim, load_airframe
@@ -13,18 +14,6 @@ from crazysim.dynamics import first_principles
 from crazysim.errors import UnknownNameError
 from crazysim.pytree import check_axes
 
-ANGLES = np.pi / 3 * np.arange(6) + np.pi / 6
-CRAZYFLIE = load_airframe("cf21B_500").tables
-HEXAROTOR = {
-    **CRAZYFLIE,
-    "name": "hexarotor",
-    "rotors": {
-        **CRAZYFLIE["rotors"],
-        "position": np.stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), 0 * ANGLES], axis=-1),
-        "yaw_torque_sign": [1, -1, 1, -1, 1, -1],
-    },
-}
-FLEET = ("cf21B_500", "bumblebee", HEXAROTOR, "cf2x_L250")
 FIRMWARE = (HEXAROTOR, "cf2x_L250")
 UNLIKE = ("bumblebee", HEXAROTOR)
 STATES = ("pos", "quat", "vel", "ang_vel")
@@ -81,21 +70,6 @@ def test_each_drone_flies_as_in_a_simulation_of_its_own(control, controller, fle
         expected, got = alone.rotor_vel[0, 0], flown.rotor_vel[0, k]
         np.testing.assert_allclose(got[:n], expected, rtol=1e-3)
         np.testing.assert_array_equal(got[n:], 0)
-
-
-@pytest.mark.parametrize("integrator", ["euler", "symplectic_euler", "rk4"])
-def test_engines_agree_on_a_mixed_fleet(integrator):
-    """All engines with one scheme; kernels with all of them."""
-    found = {}
-    for engine in ("interpret", "fused", *(("plain", "lanes") if integrator == "euler" else ())):
-        sim = in_flight(Sim(2, drone=FLEET, control="attitude", integrator=integrator, engine=engine), positions(2, 4))
-        sim.step(50)
-        assert sim.step_fn.engines == [engine]
-        found[engine] = sim.data.states
-    for engine, states in found.items():
-        for name in STATES:
-            expected, got = getattr(found["interpret"], name), getattr(states, name)
-            np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5, err_msg=f"{engine} {name}")
 
 
 @pytest.mark.parametrize("dynamics", ["so_rpy", "so_rpy_rotor"])

@@ -94,11 +94,10 @@ WRITES = {
 }
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain"])
 @pytest.mark.parametrize("case", WRITES)
-def test_law_09_an_influence_writes_what_the_dynamics_use_alone(case, engine):
+def test_law_09_an_influence_writes_what_the_dynamics_use_alone(case):
     act, words = WRITES[case]
-    sim = Sim(control="attitude", engine=engine)
+    sim = Sim(control="attitude")
     sim.add(Tilt(act))
     with pytest.raises(ConfigError, match=rf"expected influence of plugin 'tilt' \(Tilt\) .*{words}"):
         sim.step()
@@ -158,13 +157,12 @@ def test_law_09_rates_without_a_record():
         sim.step()
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain"])
 @pytest.mark.parametrize("method", ["influence", "derivative"])
-def test_errors_in_a_method_name_plugin_and_method(method, engine):
+def test_errors_in_a_method_name_plugin_and_method(method):
     def broken(data):
         return data.states.force[5, 5]
 
-    sim = Sim(engine=engine)
+    sim = Sim()
     sim.add(Tilt(broken if method == "influence" else None, broken if method == "derivative" else None))
     with pytest.raises(IndexError) as info:
         sim.step()

@@ -1,17 +1,15 @@
-"""Reductions over the drones of a world: against all pairs written out, and on every engine."""
+"""Reductions over the drones of a world, against all pairs written out."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, with_states
+from cases import with_states
 
 from crazysim import ConfigError, Downwash, Plugin, Sim, reduce_over_others, stage
 from crazysim.core import insert_fn_before
 from crazysim.engine import Step
 from crazysim.engine.ir.program import UnfusedStage
-
-ENGINES = ("interpret", *FAST)
 
 
 @stage("drone")
@@ -76,50 +74,37 @@ def simulation(n_worlds, n_drones, *plugins):
 
 
 @pytest.mark.parametrize("n_drones", [1, 2, 3, 9, 17])
-def test_all_engines_compute_all_pairs(n_drones):
+def test_all_pairs_are_computed(n_drones):
     """Counts below, at and above the lanes of a vector and of a warp; rounding of float32 alone."""
     sim = simulation(3, n_drones)
     expected = np.stack([crowd_by_hand(pos) for pos in np.asarray(sim.data.states.pos, np.float64)])
     assert np.abs(expected).max() > 1e-4 or n_drones == 1
-    for engine in ["plain", *ENGINES]:
-        step = Step(sim.step_pipeline, engine, strict=True)
-        found = step(sim.data, jnp.int32(1))
-        np.testing.assert_allclose(found.states.force, expected, rtol=2e-5, atol=1e-9, err_msg=engine)
-        if engine != "plain":
-            assert not step.plan(sim.data).program.unfused_stages
+    step = Step(sim.step_pipeline, strict=True)
+    found = step(sim.data, jnp.int32(1))
+    np.testing.assert_allclose(found.states.force, expected, rtol=2e-5, atol=1e-9)
+    assert not step.plan(sim.data).program.unfused_stages
 
 
 @pytest.mark.parametrize("n_drones", [3, 9])
 def test_law_08_gradients_equal_central_differences(n_drones, x64):
-    """In float64 engines agree to its rounding, and the slope of a sum over velocities is that of differences.
-
-    In reverse on lanes, on which a kernel's derivative is computed as well, and forwards on the others.
-    """
+    """In float64, in both directions."""
     sim = simulation(2, n_drones, Downwash())
     data = as_float64(sim.data)
     pos, way = np.asarray(data.states.pos), np.random.default_rng(2).normal(size=data.states.pos.shape)
-    ends = {}
+    step = Step(sim.step_pipeline)
 
-    @jax.jit
     def score(after):
         return jnp.sum(after.states.vel[..., 2]) * 1e3 + jnp.sum(after.plugins["downwash"].air_vel ** 2)
 
-    for engine in ["plain", *ENGINES]:
-        step = Step(sim.step_pipeline, engine)
+    def loss(size):
+        return score(step(data.replace(states=data.states.replace(pos=pos + size * way)), 2))
 
-        def loss(size, step=step):
-            return score(step(data.replace(states=data.states.replace(pos=pos + size * way)), 2))
-
-        forward = lambda size, loss=loss: jax.jvp(loss, (size,), (1.0,))  # noqa: E731
-        is_reverse = engine == "lanes" or (engine, n_drones) == ("plain", 3)
-        value_and_slope = jax.jit(jax.value_and_grad(loss) if is_reverse else forward)
-        ends[engine] = float(value_and_slope(0.0)[0] if engine in ("plain", "lanes") else loss(0.0))
-        np.testing.assert_allclose(ends[engine], ends["plain"], rtol=1e-12)
-        if engine != "interpret":
-            slope, h = float(value_and_slope(0.0)[1]), 1e-6
-            difference = (float(value_and_slope(h)[0]) - float(value_and_slope(-h)[0])) / (2 * h)
-            assert abs(slope) > 1e-3
-            np.testing.assert_allclose(slope, difference, rtol=1e-6)
+    forward, reverse = (jax.jit(fn) for fn in (lambda size: jax.jvp(loss, (size,), (1.0,)), jax.value_and_grad(loss)))
+    slope, h = float(forward(0.0)[1]), 1e-6
+    difference = (float(forward(h)[0]) - float(forward(-h)[0])) / (2 * h)
+    assert abs(slope) > 1e-3
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+    np.testing.assert_allclose(reverse(0.0)[1], slope, rtol=1e-9)
 
 
 def test_the_order_of_the_drones_does_not_matter():
@@ -127,10 +112,9 @@ def test_the_order_of_the_drones_does_not_matter():
     order = np.random.default_rng(1).permutation(17)
     sim = simulation(2, 17)
     turned = with_states(sim.data, pos=np.asarray(sim.data.states.pos)[:, order])
-    for engine in FAST:
-        step = Step(sim.step_pipeline, engine)
-        a, b = step(sim.data, jnp.int32(1)), step(turned, jnp.int32(1))
-        np.testing.assert_allclose(b.states.force, np.asarray(a.states.force)[:, order], rtol=2e-5, atol=1e-9)
+    step = Step(sim.step_pipeline)
+    a, b = step(sim.data, jnp.int32(1)), step(turned, jnp.int32(1))
+    np.testing.assert_allclose(b.states.force, np.asarray(a.states.force)[:, order], rtol=2e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("n_drones", [3, 9])
@@ -139,12 +123,11 @@ def test_law_07_a_bad_world_does_not_touch_another(n_drones):
     pos = np.array(sim.data.states.pos)
     pos[1, 0] = np.nan
     bad = with_states(sim.data, pos=pos)
-    for engine in ENGINES:
-        step = Step(sim.step_pipeline, engine)
-        a, b = step(sim.data, jnp.int32(2)), step(bad, jnp.int32(2))
-        np.testing.assert_array_equal(np.asarray(b.states.pos)[[0, 2]], np.asarray(a.states.pos)[[0, 2]])
-        assert np.asarray(b.core.nonfinite).ravel().tolist() == [False, True, False]
-        assert np.isnan(np.asarray(b.states.force)[1, :, 0]).all()
+    step = Step(sim.step_pipeline)
+    a, b = step(sim.data, jnp.int32(2)), step(bad, jnp.int32(2))
+    np.testing.assert_array_equal(np.asarray(b.states.pos)[[0, 2]], np.asarray(a.states.pos)[[0, 2]])
+    assert np.asarray(b.core.nonfinite).ravel().tolist() == [False, True, False]
+    assert np.isnan(np.asarray(b.states.force)[1, :, 0]).all()
 
 
 def test_a_condition_selects_what_a_stage_computes():
@@ -153,17 +136,14 @@ def test_a_condition_selects_what_a_stage_computes():
     rare = stage("drone", when=lambda data: data.core.steps % 3 == 0)(crowd.fn)
     rare.__name__ = "crowd"
     sim.step_pipeline["crowd"] = rare
-    moved = {}
-    for engine in ["plain", *ENGINES]:
-        data = sim.data
-        step, seen = Step(sim.step_pipeline, engine), []
-        for _ in range(4):
-            data = step(data, jnp.int32(1))
-            seen.append(np.asarray(data.states.force))
-        moved[engine] = seen
-        np.testing.assert_array_equal(seen[0], seen[2])
-        assert np.any(seen[3] != seen[2])
-        np.testing.assert_allclose(seen[3], moved["plain"][3], rtol=1e-4, atol=1e-9)
+    data, step, seen = sim.data, Step(sim.step_pipeline), []
+    for _ in range(4):
+        before, data = data, step(data, jnp.int32(1))
+        seen.append(np.asarray(data.states.force))
+    np.testing.assert_array_equal(seen[0], seen[2])
+    assert np.any(seen[3] != seen[2])
+    expected = np.stack([crowd_by_hand(pos) for pos in np.asarray(before.states.pos, np.float64)])
+    np.testing.assert_allclose(seen[3], expected, rtol=1e-4, atol=1e-9)
 
 
 class Push(Plugin):
@@ -177,25 +157,19 @@ class Push(Plugin):
         return data.replace(states=data.states.replace(force=data.states.force + both.sum(0)))
 
 
-@pytest.mark.long("compiles RK4 of two numbers of drones in every engine")
 def test_an_inner_vmap_and_an_influence_may_reduce():
     """RK4 evaluates an influence four times a step, each time at the places of that time."""
-    for n_drones, engines in ((3, ["plain", *ENGINES]), (9, ("interpret", *FAST[1:]))):
+    for n_drones in (3, 9):
         sim = Sim(n_worlds=2, n_drones=n_drones, control="rotor_vel", integrator="rk4")
         sim.data = with_states(sim.data, pos=random_places(2, n_drones), vel=random_places(2, n_drones, 1) - [0, 0, 2])
         sim.add(Push())
-        expected = Step(sim.step_pipeline, "interpret")(sim.data, jnp.int32(3)).states
+        found = Step(sim.step_pipeline)(sim.data, jnp.int32(3)).states
         pos = np.asarray(sim.data.states.pos, np.float64)
         still = Sim(n_worlds=2, n_drones=n_drones, control="rotor_vel", integrator="rk4")
         still.data = sim.data.replace(plugins={})
-        free = Step(still.step_pipeline, "interpret")(still.data, jnp.int32(3)).states
+        free = Step(still.step_pipeline)(still.data, jnp.int32(3)).states
         pull = 3e-3 * (n_drones * pos - pos.sum(1, keepdims=True)) / 0.0434
-        np.testing.assert_allclose(
-            np.asarray(expected.vel) - np.asarray(free.vel), 3 * 0.002 * pull, rtol=0.02, atol=2e-5
-        )
-        for engine in set(engines) - {"interpret"}:
-            found = Step(sim.step_pipeline, engine)(sim.data, jnp.int32(3)).states
-            np.testing.assert_allclose(found.vel, expected.vel, rtol=1e-5, atol=1e-6, err_msg=engine)
+        np.testing.assert_allclose(np.asarray(found.vel) - np.asarray(free.vel), 3 * 0.002 * pull, rtol=0.02, atol=2e-5)
 
 
 def test_law_09_wrong_uses_are_errors():

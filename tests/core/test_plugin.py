@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, hover_command, hovering, to_all, trees_equal, with_states
+from cases import hover_command, hovering, to_all, trees_equal, with_states
 from jax import Array
 from scipy.linalg import expm
 
@@ -37,7 +37,6 @@ from crazysim.core.pipeline import replace_fn
 from crazysim.core.plugin import FunctionPlugin
 from crazysim.core.stage import is_first_step
 from crazysim.core.stages import first_principles_derivative
-from crazysim.engine import Step
 from crazysim.errors import UnknownNameError
 from crazysim.plugins.effects.grid import Grid
 from crazysim.plugins.estimators import Complementary
@@ -120,21 +119,6 @@ def fly_on(sim, n_steps=20):
     sim.attitude_control(to_all(sim.data, hover_command(sim.data) + [0.1, -0.1, 0.2, 0.05]))
     sim.step(n_steps)
     return sim.data
-
-
-@pytest.mark.parametrize("integrator", list(Integrator))
-def test_states_of_a_plugin_are_the_same_on_every_engine(integrator):
-    """All engines with one scheme; the interpreter and kernels with all of them; the tests above are of "plain"."""
-    sim = hovering(integrator=integrator, control="rotor_vel")
-    sim.add(Wake())
-    assert "not fused" not in sim.explain()
-    expected = Step(sim.step_pipeline, "interpret")(sim.data, jnp.int32(20))
-    assert np.abs(expected.plugins["wake"].vel).max() > 1e-4
-    for engine in ("plain", *FAST) if integrator == "euler" else FAST[1:]:
-        found = Step(sim.step_pipeline, engine)(sim.data, jnp.int32(20))
-        # float32 over 20 steps
-        np.testing.assert_allclose(found.plugins["wake"].vel, expected.plugins["wake"].vel, rtol=1e-4, atol=2e-6)
-        np.testing.assert_allclose(found.states.vel, expected.states.vel, rtol=1e-4, atol=2e-5)
 
 
 EVERYTHING = [
@@ -412,10 +396,10 @@ def test_law_01_methods_get_one_drone():
             shapes.append((data.states.pos.shape, data.core.steps.shape))
             return {}
 
-    for engine in ("plain", "lanes"):
-        sim = Sim(n_worlds=3, n_drones=2, engine=engine)
-        sim.add(Probe())
-        assert sim.step_fn.plan(sim.data).engine == engine
+    sim = Sim(n_worlds=3, n_drones=2)
+    sim.add(Probe())
+    sim.step_fn.plan(sim.data)
+    assert shapes
     sim.plugins.observations(sim.data)
     assert set(shapes) == {((3,), ())}
 

@@ -50,18 +50,16 @@ def test_numbers_depend_neither_on_blocks_nor_on_threads(n_drones, control):
     shapes = {"pos": 3, "vel": 3, "ang_vel": 3, "rotor_vel": 4}
     start = {name: rng.normal(1, 0.3, (n_worlds, n_drones, k)).astype(np.float32) for name, k in shapes.items()}
     start["rotor_vel"] *= 15_000
-    for n, engine in ((n_worlds, "fused"), (13, "fused"), (13, "plain")):
-        sim = Sim(n, n_drones, control=control, engine=engine)
+    for n in (n_worlds, 13):
+        sim = Sim(n, n_drones, control=control, engine="fused")
         if n_drones > 1:
             sim.add(Downwash())
         states = {name: jnp.asarray(x[:n]) for name, x in start.items()}
         sim.data = sim.data.replace(states=sim.data.states.replace(**states))
         sim.step(3)
         after.append(sim.data.states)
-    many, few, plain = after
+    many, few = after
     assert trees_equal(jax.tree.map(lambda x: x[:13], many), few)
-    for x, y in zip(jax.tree.leaves(few), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)  # rounding: products and sums are contracted
 
 
 def test_two_threads_of_python_may_step_at_once():

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST
 from fuzz import Case, Fuzzer
 from programs import Program
 
@@ -12,8 +11,6 @@ from crazysim import PyTree, Sim, leaf
 from crazysim.core.stage import stage
 from crazysim.engine import Step
 from crazysim.errors import EngineWarning
-
-ENGINES = ("plain", "auto", *FAST)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +47,7 @@ WRITES = [
 """Functions of a zero vector and the number of the step, which is zero, and their results."""
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_writes_at_places(sim, engine):
+def test_writes_at_places(sim):
     """All functions are lines of one stage of a drone."""
 
     @stage("drone")
@@ -61,7 +57,7 @@ def test_writes_at_places(sim, engine):
 
     expected = np.float32([row for _, row in WRITES])
     data = sim.data.replace(plugins={"written": Written(np.full((2, 2, *expected.shape), -1, np.float32))})
-    found = np.asarray(Step({"write": write}, engine, strict=True)(data).plugins["written"].rows)
+    found = np.asarray(Step({"write": write}, strict=True)(data).plugins["written"].rows)
     for k, row in enumerate(expected):
         np.testing.assert_array_equal(found[:, :, k], np.broadcast_to(row, (2, 2, 3)), err_msg=f"function {k}")
 

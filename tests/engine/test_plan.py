@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, needs_compiler, shared_sim
+from cases import needs_compiler, shared_sim
 from waiting import wait_for
 
 from crazysim import ConfigError, Sim
@@ -122,15 +122,13 @@ def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
 
 def test_planning_traces_what_the_first_call_runs(sim):
     """Law 6: the trace of planning is that of the call."""
-    for engine in ("plain", *FAST):
-        for n_steps in (jnp.int32(2), 2):
-            step = Step(sim.step_pipeline, engine)
-            step(sim.data, n_steps)
-            assert step._cache_size() == 1
+    for n_steps in (jnp.int32(2), 2):
+        step = Step(sim.step_pipeline)
+        step(sim.data, n_steps)
+        assert step._cache_size() == 1
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain", "lanes"])
-def test_an_error_of_the_stage_is_its_own(sim, engine):
+def test_an_error_of_the_stage_is_its_own(sim):
     """No engine could run it: it is raised as it is, without a warning."""
 
     @stage("drone")
@@ -138,7 +136,7 @@ def test_an_error_of_the_stage_is_its_own(sim, engine):
         raise KeyError("of the user")
 
     with pytest.raises(KeyError, match="of the user"):
-        Step(pipeline(sim, mine), engine).plan(sim.data)
+        Step(pipeline(sim, mine)).plan(sim.data)
 
 
 def test_documented_limits_are_explained_and_warn_of_nothing(sim, monkeypatch):
@@ -239,15 +237,12 @@ def test_small_integers_run_on_lanes_and_kernels_refuse_them_by_the_stage(sim, d
     record = Bytes(jnp.full((3, 2, 2), 90, dtype), jnp.zeros((3, 2), dtype))
     data = sim.data.replace(plugins={"bytes": record})
     stages = {"sway": sway, writes.__name__: writes}
-    found = {
-        engine: Step(stages, engine)(data, jnp.int32(2)).plugins["bytes"] for engine in ("plain", "lanes", "interpret")
-    }
-    for after in found.values():
-        assert after.counts.dtype == after.names.dtype == dtype
-        np.testing.assert_array_equal(
-            after.counts, np.full((3, 2, 2), (290 if writes is count else 90) % 256).astype(dtype)
-        )
-        np.testing.assert_array_equal(after.names, 0 if writes is count else 7)
+    after = Step(stages, "lanes")(data, jnp.int32(2)).plugins["bytes"]
+    assert after.counts.dtype == after.names.dtype == dtype
+    np.testing.assert_array_equal(
+        after.counts, np.full((3, 2, 2), (290 if writes is count else 90) % 256).astype(dtype)
+    )
+    np.testing.assert_array_equal(after.names, 0 if writes is count else 7)
     if native.compiler() is not None:
         name = np.dtype(dtype).name
         with pytest.raises(

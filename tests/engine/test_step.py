@@ -1,4 +1,4 @@
-"""The engines against each other: one source of physics, several ways to run it."""
+"""The compiled step: parameters, stages of the user, transformations, rollouts and the choice of the engine."""
 
 import functools
 
@@ -25,9 +25,6 @@ SLOW = {"state": {"state_freq": 100}, "attitude": {"attitude_freq": 250}}
 PAIRS = [("first_principles", c.value) for c in Control] + [
     (d.value, c) for d in Dynamics if d != Dynamics.first_principles for c in ("attitude", "state")
 ]
-
-LONGEST = [("first_principles", "state"), ("first_principles", "body_rate"), ("so_rpy_rotor_drag", "state")]
-"""Pairs that have the stages of all others: every engine runs them."""
 
 
 def scattered(sim, extreme=False, dtype=np.float32):
@@ -62,44 +59,6 @@ def scattered(sim, extreme=False, dtype=np.float32):
     return getattr(F, f"{sim.control.value}_control")(data, dtype(command))
 
 
-def drift(found, expected, ulp):
-    """Return how far two records of states are apart, in units in the last place of each field's size."""
-    out = {}
-    for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
-        a, b = (np.asarray(getattr(x.states, name), np.float64) for x in (found, expected))
-        assert np.isfinite(b).all()
-        size = np.maximum(np.abs(b).max(axis=-1, keepdims=True), 1e-30)
-        out[name] = float(np.max(np.abs(a - b) / size) / ulp)
-    return out
-
-
-# Rounding of one step, in units in the last place of the largest component of a field. A product and a sum may be one
-# rounding or two, and a division a product with the inverse; the derivative gains of the attitude controller multiply
-# what differs in a rate by 500 Hz and more before the allocation divides it down again.
-ULPS = {"pos": 4, "quat": 8, "vel": 64, "ang_vel": 512, "rotor_vel": 512}
-
-
-@pytest.mark.long("compiles a step in every engine")
-@pytest.mark.parametrize("dynamics, control", PAIRS)
-def test_one_step_agrees_with_plain(dynamics, control):
-    """7 worlds of 3 drones, 21 lanes: no multiple of a vector's or a block's length, so that tails are masked."""
-    sim = shared_sim(n_worlds=7, n_drones=3, dynamics=dynamics, control=control, **SLOW.get(control, {}))
-    engines = FAST if (dynamics, control) in LONGEST else FAST[-1:]
-    plain, fast = Step(sim.step_pipeline, "plain"), {engine: Step(sim.step_pipeline, engine) for engine in engines}
-    for extreme in (False, True):
-        data = scattered(sim, extreme)
-        expected = plain(data, jnp.int32(1))
-        for engine, step in fast.items():
-            assert step.plan(data).engine == engine
-            found = step(data, jnp.int32(1))
-            apart = drift(found, expected, 2.0**-23)
-            assert all(apart[name] <= ULPS[name] for name in apart), (engine, extreme, apart)
-            np.testing.assert_array_equal(found.core.steps, expected.core.steps)
-            np.testing.assert_array_equal(found.core.nonfinite, expected.core.nonfinite)
-            for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-                assert (x.shape, x.dtype) == (y.shape, y.dtype)
-
-
 @pytest.mark.long("compiles every integrator in every engine, in float64")
 @pytest.mark.parametrize("dynamics, control, integrator", [
     ("first_principles", "state", "euler"), ("first_principles", "attitude", "symplectic_euler"),
@@ -119,23 +78,21 @@ def test_long_runs_agree_in_float64(x64, dynamics, control, integrator):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9, err_msg=f"{engine} {name}")
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain", *FAST])
-def test_a_parameter_of_each_drone_is_its_own(engine):
+def test_a_parameter_of_each_drone_is_its_own():
     """Randomised parameters widen to lanes: each drone falls under its own gravity and flies with its own mass."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     g = np.float32(-9.81 * np.linspace(0.5, 1.5, 6).reshape(3, 2, 1) * [0, 0, 1.0])
     data = with_params(sim.data, gravity_vec=g, drag_matrix=np.zeros((3, 3), np.float32))
     data = with_states(data, pos=[0.0, 0.0, 9.0])
-    vel = np.asarray(Step(sim.step_pipeline, engine)(data, jnp.int32(10)).states.vel)
+    vel = np.asarray(Step(sim.step_pipeline)(data, jnp.int32(10)).states.vel)
     np.testing.assert_allclose(vel[..., 2], 0.02 * g[..., 2], rtol=1e-5)  # ten roundings
     assert len(np.unique(vel[..., 2])) == 6
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain", *FAST])
-def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes(engine):
+def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes():
     """A diagonal inertia is computed with as one only as long as it is one."""
     sim = shared_sim(n_worlds=1, n_drones=1, control="rotor_vel")
-    step = Step(sim.step_pipeline, engine)
+    step = Step(sim.step_pipeline)
     data = with_states(sim.data, pos=[0.0, 0.0, 1.0], torque=[1e-5, 0.0, 0.0])
     assert pitch_rate(step(data, jnp.int32(1))) == 0.0
     J_inv = np.array(data.params.J_inv)
@@ -146,8 +103,7 @@ def test_zeros_of_parameters_are_seen_anew_when_a_parameter_changes(engine):
     np.testing.assert_allclose(pitch_rate(inside), 0.002 * 1e4 * 1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("engine", FAST)
-def test_a_parameter_that_a_stage_writes_is_not_taken_for_zero(engine):
+def test_a_parameter_that_a_stage_writes_is_not_taken_for_zero():
     """Gravity that turns in every step: its component along x is zero only where a call begins."""
     sim = shared_sim(n_worlds=2, n_drones=1, control="rotor_vel")
 
@@ -155,9 +111,7 @@ def test_a_parameter_that_a_stage_writes_is_not_taken_for_zero(engine):
         return data.replace(params=data.params.replace(gravity_vec=data.params.gravity_vec.at[0].add(0.1)))
 
     data = with_states(sim.data, pos=[0.0, 0.0, 9.0])
-    step = Step({"turn": turn, **sim.step_pipeline}, engine)
-    after = step(data, jnp.int32(5))
-    assert step.engines == [engine]
+    after = Step({"turn": turn, **sim.step_pipeline})(data, jnp.int32(5))
     np.testing.assert_allclose(after.params.gravity_vec[0], 0.5, rtol=1e-6)
     np.testing.assert_allclose(after.states.vel[..., 0], 0.002 * (0.1 + 0.2 + 0.3 + 0.4 + 0.5), rtol=0.01)
 
@@ -178,12 +132,11 @@ def pitch_rate(data):
     return np.asarray(data.states.ang_vel)[0, 0, 1]
 
 
-@pytest.mark.parametrize("engine", FAST)
-def test_a_nan_in_one_drone_stays_in_that_drone(engine):
+def test_a_nan_in_one_drone_stays_in_that_drone():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
     data = scattered(sim)
     bad = data.replace(states=data.states.replace(vel=data.states.vel.at[1, 0].set(jnp.nan)))
-    step = Step(sim.step_pipeline, engine)
+    step = Step(sim.step_pipeline)
     good, after = step(data, jnp.int32(5)), step(bad, jnp.int32(5))
     np.testing.assert_array_equal(np.asarray(after.core.nonfinite)[:, 0], [False, True, False])
     for name in ("pos", "quat", "vel", "ang_vel", "rotor_vel"):
@@ -254,31 +207,14 @@ def with_stages(n_drones, *stages):
     return sim, scattered(sim)
 
 
-@pytest.mark.long("compiles a step in every engine")
 @pytest.mark.parametrize("stages, n_segments", [
     ((gust,), 1), ((separation,), 3), ((undeclared,), 3), ((gust, separation, undeclared), 4),
 ])  # fmt: skip
-def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
-    """A stage of one drone or one world fuses; an undeclared one splits the step."""
+def test_a_stage_of_one_drone_or_one_world_fuses_and_an_undeclared_one_splits_the_step(stages, n_segments):
     sim, data = with_stages(4, *stages)
-    expected = Step(sim.step_pipeline, "plain")(data, jnp.int32(6))
-    everything = len(stages) == 3
-    for engine in FAST if everything else FAST[-1:]:
-        step = Step(sim.step_pipeline, engine)
-        plan = step.plan(data)
-        assert plan.engine == engine
-        assert len(plan.program.segments) == n_segments
-        for n in (jnp.int32(6), 6) if everything else (jnp.int32(6),):
-            found = step(data, n)
-            for name in ("pos", "quat", "vel", "force", "torque"):
-                np.testing.assert_allclose(
-                    getattr(found.states, name), getattr(expected.states, name), rtol=2e-5, atol=2e-6, err_msg=name
-                )
-            for name in ("met", "count"):
-                now = getattr(found.plugins["gust"], name)
-                np.testing.assert_array_equal(now, getattr(expected.plugins["gust"], name))
-            assert (gust in stages) == bool(now.any())
-    text = explain(Step(sim.step_pipeline, "auto"), data)
+    step = Step(sim.step_pipeline)
+    assert len(step.plan(data).program.segments) == n_segments
+    text = explain(step, data)
     assert ("'undeclared' is not fused: it is not declared for one drone or one world" in text) == (
         undeclared in stages
     )
@@ -286,24 +222,18 @@ def test_stages_of_the_user_mean_the_same_on_every_engine(stages, n_segments):
 
 @pytest.mark.parametrize("n_drones", [1, 3, MAX_UNROLLED_DRONES])
 def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
-    """Worlds that fill a vector, and worlds that do not; more of them than one vector has."""
-    sim, data = with_stages(n_drones, separation)
-    step = Step(sim.step_pipeline, FAST[-1])
+    """Worlds that fill a vector, and worlds that do not: its force is that of the stage as it is written."""
+    _, data = with_stages(n_drones, separation)
+    step = Step({"separation": separation})
     assert step.plan(data).program.fused
-    found, expected = step(data, jnp.int32(5)), Step(sim.step_pipeline, "plain")(data, jnp.int32(5))
-    assert n_drones == 1 or np.abs(found.states.force).max() > 1e-4
-    for name in ("pos", "vel", "force"):
-        np.testing.assert_allclose(
-            getattr(found.states, name), getattr(expected.states, name), rtol=2e-5, atol=2e-6, err_msg=name
-        )
+    found = step(data, jnp.int32(1)).states.force
+    assert n_drones == 1 or np.abs(found).max() > 1e-4
+    np.testing.assert_allclose(found, separation(data).states.force, rtol=2e-5, atol=2e-6)
 
 
 def test_a_stage_of_one_world_splits_a_large_swarm():
     sim, data = with_stages(MAX_UNROLLED_DRONES + 1, separation)
-    step = Step(sim.step_pipeline, "lanes")
-    assert f"unrolled for at most {MAX_UNROLLED_DRONES} drones" in explain(step, data)
-    found, expected = step(data, jnp.int32(3)), Step(sim.step_pipeline, "plain")(data, jnp.int32(3))
-    np.testing.assert_allclose(found.states.vel, expected.states.vel, rtol=2e-5, atol=2e-6)
+    assert f"unrolled for at most {MAX_UNROLLED_DRONES} drones" in explain(Step(sim.step_pipeline), data)
 
 
 @pytest.mark.parametrize("fn, words", [
@@ -311,11 +241,10 @@ def test_a_stage_of_one_world_splits_a_large_swarm():
     (lambda d: d.replace(core=d.core.replace(steps=d.core.steps + 1)), "writes core.steps, which is world"),
     (lambda d: d.replace(states=d.states.replace(pos=d.states.pos[:2])), "of shape (3,) and type float32 into"),
 ])  # fmt: skip
-@pytest.mark.parametrize("engine", ["auto", "plain", *FAST])
-def test_law_09_a_stage_writes_within_its_scope(engine, fn, words):
+def test_law_09_a_stage_writes_within_its_scope(fn, words):
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     with pytest.raises(ConfigError) as error:
-        Step(sim.step_pipeline | {"mine": stage("drone")(fn)}, engine)(sim.data, jnp.int32(1))
+        Step(sim.step_pipeline | {"mine": stage("drone")(fn)})(sim.data, jnp.int32(1))
     assert "stage 'mine'" in str(error.value)
     assert words in str(error.value)
 
@@ -324,17 +253,16 @@ def test_law_06_a_stage_is_traced_once(x64):
     """Law 6: whatever is called afterwards."""
     del x64
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
-    for engine in FAST:
-        traces = []
+    traces = []
 
-        def count(data, traces=traces):
-            traces.append(1)
-            return data.replace(states=data.states.replace(force=0.5 * data.states.force))
+    def count(data):
+        traces.append(1)
+        return data.replace(states=data.states.replace(force=0.5 * data.states.force))
 
-        step = Step(sim.step_pipeline | {"count": stage("drone")(count)}, engine)
-        for n in (1, 2, 3):
-            step(sim.data, jnp.int32(n))
-        assert len(traces) == 1, engine
+    step = Step(sim.step_pipeline | {"count": stage("drone")(count)})
+    for n in (1, 2, 3):
+        step(sim.data, jnp.int32(n))
+    assert len(traces) == 1
 
 
 # Transformations -----------------------------------------------------------------------------------------------------
@@ -401,10 +329,9 @@ def test_a_loop_has_the_derivative_of_its_steps(monkeypatch, n):
     np.testing.assert_allclose([value, *slopes], [2 * 1.1**n, 2 * n * 1.1 ** (n - 1), 1.1**n], rtol=1e-5)
 
 
-@pytest.mark.parametrize("engine", FAST)
-def test_vmap_over_commands_and_parameters_is_a_loop(engine):
+def test_vmap_over_commands_and_parameters_is_a_loop():
     sim = shared_sim(n_worlds=3, n_drones=2, control="attitude")
-    data, step = scattered(sim), Step(sim.step_pipeline, engine)
+    data, step = scattered(sim), Step(sim.step_pipeline)
     commands = (
         np.asarray(data.controls.attitude.staged_cmd) * np.linspace(0.5, 1.5, 4, dtype=np.float32)[:, None, None, None]
     )
@@ -414,9 +341,7 @@ def test_vmap_over_commands_and_parameters_is_a_loop(engine):
         ready = F.attitude_control(data.replace(params=data.params.replace(mass=mass)), command)
         return step(ready, jnp.int32(7)).states
 
-    # One mass for all too, where that makes a difference: XLA knows batches, a kernel does not.
-    cases = [(jax.vmap(fly), masses)]
-    cases += [(jax.vmap(fly, (0, None)), np.asarray(data.params.mass))] if engine == "fused" else []
+    cases = [(jax.vmap(fly), masses), (jax.vmap(fly, (0, None)), np.asarray(data.params.mass))]
     one = jax.jit(fly)
     for batched, mass in cases:
         many = jax.device_get(jax.jit(batched)(commands, mass))
@@ -444,14 +369,13 @@ def speed_up(data):
     return data.replace(plugins={"twins": twins.replace(speeds=twins.speeds + jnp.inf)})
 
 
-@pytest.mark.parametrize("engine", ["plain", "interpret", *FAST])
-def test_leaves_that_share_an_array_are_not_confused(engine):
+def test_leaves_that_share_an_array_are_not_confused():
     """The flags of worlds and of the scene are found by their paths, and so are states, whose NaN flag a world."""
     sim = shared_sim(n_worlds=3, n_drones=2, control="rotor_vel")
     data = with_states(sim.data, pos=np.array([0.0, np.nan, 0.0])[:, None, None])
     data = data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True)))
     twins = Twins(flags=data.core.nonfinite, speeds=data.states.vel, synced=data.core.mjx_synced)
-    after = Step({"speed_up": speed_up}, engine)(data.replace(plugins={"twins": twins}), jnp.int32(1))
+    after = Step({"speed_up": speed_up})(data.replace(plugins={"twins": twins}), jnp.int32(1))
     np.testing.assert_array_equal(after.core.nonfinite, [[False], [True], [False]])
     assert not after.core.mjx_synced
     assert not np.any(after.plugins["twins"].flags)

@@ -1,6 +1,5 @@
 """Tables: shared arrays and constants that stages read at computed places, from memory, in every engine."""
 
-import contextlib
 import functools
 
 import jax
@@ -144,30 +143,32 @@ def pipeline(names, scope="drone"):
     return {name: of_case(name, scope) for name in names}
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("scope", ["drone", "world"])
-def test_every_engine_reads_what_plain_reads(engine, scope):
-    """Each case by itself in the interpreter; all of them, summed up, in what has to be compiled."""
-    chosen = list(CASES) if engine != "fused" else IN_KERNELS
-    chosen = chosen if scope == "drone" else ["a matrix, then a row of it", "constants", "places from a table"]
-    if engine == "interpret":
+OF_WORLDS = ["a matrix, then a row of it", "constants", "places from a table"]
+"""Cases that are read by a stage of one world, too."""
 
-        def each(data):
-            return {name: read(data).plugins["tables"].out for name, read in pipeline(chosen, scope).items()}
 
-        for name, expected in jax.jit(each)(data()).items():
-            program = optimise(lower_stages(as_stages(pipeline([name], scope)), data()))
-            verify(program)
-            assert program.fused, program.unfused_stages[0].unfused
-            leaves = jax.tree.leaves(data())
-            (out,), _ = interpret.steps(program, [*leaves, _packed(program, leaves)], 1)
-            np.testing.assert_array_equal(out, expected, err_msg=name)
-        return
+@pytest.mark.parametrize(("scope", "chosen"), [("drone", list(CASES)), ("world", OF_WORLDS)])
+def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, chosen):
+    """Each case by itself, in the interpreter."""
 
-    total = {"total": sum_of(chosen, scope)}
-    expected = Step(total, "plain")(data(), jnp.int32(1)).plugins["tables"].out
-    found = Step(total, engine)(data(), jnp.int32(1)).plugins["tables"].out
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)
+    def each(data):
+        return {name: read(data).plugins["tables"].out for name, read in pipeline(chosen, scope).items()}
+
+    for name, expected in jax.jit(each)(data()).items():
+        program = optimise(lower_stages(as_stages(pipeline([name], scope)), data()))
+        verify(program)
+        assert program.fused, program.unfused_stages[0].unfused
+        leaves = jax.tree.leaves(data())
+        (out,), _ = interpret.steps(program, [*leaves, _packed(program, leaves)], 1)
+        np.testing.assert_array_equal(out, expected, err_msg=name)
+
+
+@pytest.mark.parametrize(("scope", "chosen"), [("drone", IN_KERNELS), ("world", OF_WORLDS)])
+def test_a_kernel_reads_what_a_stage_reads_as_it_is_written(scope, chosen):
+    """All cases in one stage, summed up."""
+    total = sum_of(chosen, scope)
+    found = Step({"total": total})(data(), jnp.int32(1)).plugins["tables"].out
+    np.testing.assert_allclose(found, jax.jit(total)(data()).plugins["tables"].out, rtol=1e-5, atol=1e-3)
 
 
 def _packed(program, leaves):
@@ -197,8 +198,7 @@ def test_the_source_for_gpus_is_well_formed():
     assert cuda._compile(text, cuda.DEFAULT_ARCHITECTURE, "PTX")
 
 
-@pytest.mark.parametrize("engine", FAST)
-def test_gradients_by_states_and_entries_are_those_of_plain(engine):
+def test_gradients_by_states_and_entries_are_those_of_the_stage():
     @stage("drone")
     def read(data):
         tables, vel = data.plugins["tables"], data.states.vel
@@ -211,12 +211,9 @@ def test_gradients_by_states_and_entries_are_those_of_plain(engine):
         return jnp.sum(step(start, 2).states.vel ** 2)
 
     numbers, vel = data().plugins["tables"].numbers, data().states.vel + jnp.asarray([1.0, 2.0, 3.0])
-    warns = pytest.warns(EngineWarning, match="read as a table") if engine == "fused" else contextlib.nullcontext()
-    with warns:
-        found, expected = (
-            jax.grad(functools.partial(loss, Step({"read": read}, e)), argnums=(0, 1))(numbers, vel)
-            for e in (engine, "plain")
-        )
+    with pytest.warns(EngineWarning, match="read as a table"):
+        found = jax.grad(functools.partial(loss, Step({"read": read})), argnums=(0, 1))(numbers, vel)
+    expected = jax.grad(functools.partial(loss, lambda data, _: read(read(data))), argnums=(0, 1))(numbers, vel)
     for a, b in zip(found, expected, strict=True):
         assert float(jnp.abs(b).max()) > 0.1
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)

@@ -5,7 +5,8 @@ import jax
 import numpy as np
 import pytest
 from env_cases import random_action
-from on_devices import ACCELERATOR, DEVICES, NAMES, agree, on
+from on_devices import ACCELERATOR, DEVICES, NAMES, on
+from sweep import agree
 
 import crazysim
 from crazysim.envs import TASKS, AutoReset, make

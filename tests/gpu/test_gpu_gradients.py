@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import centre, gap, repulsion, trees_equal
-from on_devices import ACCELERATOR, DEVICES, NAMES, agree, flying, on
+from on_devices import ACCELERATOR, DEVICES, NAMES, on
+from sweep import agree, flying
 
 from crazysim import Battery, Wind
 from crazysim.core import functional as F

@@ -4,50 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import INTEGRATORS, PAIRS, send, trees_equal, with_states
-from on_devices import ACCELERATOR, LOADS, NAMES, agree, flying, on
+import sweep
+from cases import send, trees_equal
+from on_devices import ACCELERATOR, NAMES, on
+from sweep import ROUNDING, agree, flying
 
-from crazysim import (
-    Battery,
-    Bicycles,
-    Cars,
-    ContactLog,
-    ContactResponse,
-    Downwash,
-    DroneCollisions,
-    Follow,
-    FreeBodies,
-    GroundEffect,
-    Hook,
-    Kalman,
-    Latency,
-    MotorFailure,
-    Radar,
-    RangeFinder,
-    RotorJet,
-    SharedLoad,
-    Sim,
-    SlungLoad,
-    Terrain,
-    Wind,
-    WindField,
-)
-from crazysim.plugins import vehicles
-from crazysim.plugins.effects import Grid
-from crazysim.trajectories import figure_eight
+from crazysim import Downwash, Kalman, Sim, Wind
 
 N_STEPS = 100
-ROUNDING = 1e-4
-"""Tolerance after 100 steps in float32: some 1,000 roundings of 1e-7, since errors in the speeds of rotors and in
-angular velocities add up in attitudes and positions. Two engines of the CPU differ by 2e-5 at most."""
-
-STEPS = [
-    {"dynamics": dynamics, "control": control, "integrator": INTEGRATORS[i % 3]}
-    for i, (dynamics, control) in enumerate(PAIRS)
-]
-STEPS += [{"control": "attitude", "integrator": integrator} for integrator in INTEGRATORS]
-STEPS += [{"control": "state", "controller": name} for name in ("pid", "mellinger", "geometric", "indi", "lqr")]
-"""Every dynamics and command level, every integrator, and controllers."""
 
 
 def both(run):
@@ -56,24 +20,25 @@ def both(run):
     return found, expected
 
 
-@pytest.mark.parametrize("settings", STEPS, ids=lambda s: "-".join(s.values()))
-def test_steps_are_those_of_the_cpu(settings):
+@pytest.mark.parametrize("name", sweep.CASES)
+def test_simulations_are_those_of_the_cpu(name):
     def run(device):
-        sim = flying(device, **settings)
-        assert sim.explain().startswith("engine: fused\n")
+        sim = sweep.CASES[name](device=device)
+        lines = sim.explain().splitlines()
+        assert lines[0] == "engine: fused"
+        assert lines[-1].startswith("kernel: ") or name in sweep.SPLIT
         sim.step(N_STEPS)
         return sim.data
 
-    agree(*both(run), ROUNDING)
+    agree(*both(run), sweep.TOLERANCES.get(name, ROUNDING))
 
 
-@pytest.mark.parametrize("engine", ["fused", "lanes", "plain"])
 @pytest.mark.parametrize("n_drones", [3, 33, 256])
-def test_drones_that_act_on_each_other_fly_as_on_the_cpu(n_drones, engine):
+def test_drones_that_act_on_each_other_fly_as_on_the_cpu(n_drones):
     """Kernels exchange numbers within a warp, and within a block with fewer or all of its threads in use."""
 
     def run(device):
-        sim = flying(device, 4, n_drones, [Downwash()], control="attitude", engine=engine)
+        sim = flying(device, 4, n_drones, [Downwash()], control="attitude")
         sim.step(20)
         return sim.data
 
@@ -87,87 +52,6 @@ def test_steps_in_float64_are_those_of_the_cpu(x64):
         return sim.data
 
     agree(*both(run), 1e-12)
-
-
-hills = 0.5 * (1 + np.sin(np.arange(41) / 6)[:, None] * np.cos(np.arange(41) / 5))
-field = Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0))
-PLUGINS = {
-    "effects": (
-        {"control": "attitude"},
-        lambda: [
-            Battery(0.25, 0.1),
-            Downwash(),
-            GroundEffect(),
-            Latency(2),
-            MotorFailure(0.9, rate=0.5),
-            Wind((2.0, 1.0, 0.0), speed_20ft=7.7, roughness=0.05),
-            WindField(field, spread=(0.5, 0.5, 0.0)),
-        ],
-    ),
-    "follow": ({"control": "state"}, lambda: [Follow([figure_eight(2.0, 1.0, speed=1.0)], start=0.02)]),
-    "load": (
-        {"control": "attitude"},
-        lambda: [
-            SlungLoad(0.005, 0.3, cable=True, drag=0.01),
-            RotorJet(),
-            ContactResponse(),
-        ],
-    ),
-    "shared": ({"control": "attitude", "integrator": "symplectic_euler"}, lambda: [SharedLoad(0.005)]),
-    "hook": ({"control": "state", "drone": "bumblebee"}, lambda: [Hook.bumblebee(0.2), ContactLog()]),
-    "vehicles": (
-        {"control": "rotor_vel"},
-        lambda: [
-            Cars(2, path=figure_eight(6.0, 2.0, period=12.0), controller=vehicles.PathLQR(), trailer=True),
-            Bicycles(pos=(0.0, 3.0)),
-            Radar((0.0, 0.0, 0.5)),
-        ],
-    ),
-    "terrain": (
-        {"control": "attitude"},
-        lambda: [Terrain(hills, (8.0, 8.0)), RangeFinder(drones=True), ContactLog()],
-    ),
-    "bodies": (
-        {"control": "state"},
-        lambda: [FreeBodies(3, size=(0.2, 0.2, 0.2), mass=0.2, pos=[(0, 0, 0.11), (0.02, 0, 0.35), (1, 0, 2.0)])],
-    ),
-}
-"""Settings and plugins, each plugin once or more."""
-
-
-@pytest.mark.parametrize("name", PLUGINS)
-def test_plugins_do_what_they_do_on_the_cpu(name):
-    settings, plugins = PLUGINS[name]
-
-    def run(device):
-        sim = flying(device, plugins=plugins(), **settings)
-        lines = sim.explain().splitlines()
-        assert lines[0] == "engine: fused"
-        assert lines[-1].startswith("kernel: ")
-        sim.step(N_STEPS)
-        return sim.data
-
-    agree(*both(run), LOADS if name in ("shared", "hook") else ROUNDING)
-
-
-@pytest.mark.parametrize(
-    ("plugin", "height", "tolerance"),
-    [
-        (DroneCollisions(), 1.0, ROUNDING),
-        (ContactResponse(), 0.03, 0.02),
-    ],  # a box on a floor touches with any corner
-    ids=["drones", "floor"],
-)
-def test_impacts_are_those_of_the_cpu(plugin, height, tolerance):
-    def run(device):
-        sim = flying(device, plugins=[plugin], control="attitude")
-        meeting = {"pos": [[0, 0, height], [0.12, 0.02, height + 0.01]], "vel": [[0.5, 0, -0.3], [-0.5, 0, -0.3]]}
-        sim.data = with_states(sim.data, **{k: np.broadcast_to(x, (8, 2, 3)) for k, x in meeting.items()})
-        sim.step(20)
-        assert (np.asarray(sim.data.states.vel)[:, 0, 0] < 0.2).any()
-        return sim.data.states.pos, sim.data.states.vel
-
-    agree(*both(run), tolerance)
 
 
 def test_law_01_many_worlds_on_wide_blocks_fly_as_few():

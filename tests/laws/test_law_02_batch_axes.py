@@ -10,7 +10,7 @@ from cases import LEVELS, PAIRS, n_documented, shared_sim, with_params, with_sta
 
 from crazysim import ConfigError, Control, Sim
 from crazysim.core.data import SimData
-from crazysim.engine import ENGINES, Step
+from crazysim.engine import Step
 from crazysim.pytree import scopes
 
 SIZES = [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4)]
@@ -60,10 +60,11 @@ def test_a_step_keeps_every_shape_and_type(dynamics, control):
     # Every size for one pair; the others, whose stages are batched alike, share them out, equal numbers included.
     k = PAIRS.index((dynamics, control))
     equal, unequal = EQUAL[(k + 1) % 4], UNEQUAL[k % 12]
-    cases = [("plain", *unequal), ("lanes", *equal), *([("auto", *equal), ("lanes", *unequal)] if k == 0 else [])]
-    cases += [("stages", *size) for size in (SIZES if k == 0 else (equal,))]  # "plain" runs the stages, too
-    steps = {engine: functools.partial(Step(sim.step_pipeline, engine), n_steps=1) for engine in ENGINES[:3]}
-    steps["stages"] = functools.partial(after_all_stages, sim)
+    cases = [("step", *equal), ("step", *unequal), *(("stages", *size) for size in (SIZES if k == 0 else (equal,)))]
+    steps = {
+        "step": functools.partial(Step(sim.step_pipeline), n_steps=1),
+        "stages": functools.partial(after_all_stages, sim),
+    }
     for name, n_worlds, n_drones in cases:
         data = resized(sim, n_worlds, n_drones)
         if (n_worlds + n_drones) % 2 == 0:

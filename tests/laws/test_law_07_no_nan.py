@@ -55,9 +55,9 @@ def tilted(data):
 
 
 FITTED = ("so_rpy_rotor_drag", "attitude", "auto")
-ENGINES = [*((*pair, "stages") for pair in PAIRS[1:]), (*PAIRS[0], "plain"), (*PAIRS[0], "auto"), FITTED]
-"""Every pair, as its stages are written, without an engine; the longest pipeline on the plain engine, and on the one
-that users get, as well as one of fitted dynamics."""
+ENGINES = [*((*pair, "stages") for pair in PAIRS[1:]), (*PAIRS[0], "auto"), FITTED]
+"""Every pair, as its stages are written, without an engine; the longest pipeline on the engine that users get, as well
+as one of fitted dynamics."""
 
 
 @functools.cache

@@ -7,8 +7,6 @@ import pytest
 
 from crazysim import ConfigError, Sim
 from crazysim.core.data import MAX_STEPS
-from crazysim.engine import ENGINES
-from crazysim.engine.backends import fused
 from crazysim.envs import AutoReset, DroneEnv, rollout
 from crazysim.envs.tasks.hover import Hover
 from crazysim.envs.vector import make_vector
@@ -47,25 +45,21 @@ def test_a_simulation_refuses_the_step_that_would_pass_the_largest_count(sim):
     sim.step()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_the_functional_api_flags_worlds_whose_count_has_wrapped(engine):
-    sim = Sim(3, control="rotor_vel", engine=engine)
+def test_the_functional_api_flags_worlds_whose_count_has_wrapped():
+    sim = Sim(3, control="rotor_vel")
     data = counted(sim.data, [MAX_STEPS - 2, MAX_STEPS - 1, 0])
     after = sim.step_fn(sim.step_fn(data, jnp.int32(2)), jnp.int32(1))
     np.testing.assert_array_equal(after.core.nonfinite[:, 0], [True, True, False])
     assert not np.any(sim.step_fn(data, jnp.int32(1)).core.nonfinite)
 
 
-@pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_an_environment_that_never_resets_ends_where_its_count_wraps(engine):
-    sim, task = Sim(3, control="attitude", engine=engine), Hover()
+def test_an_environment_that_never_resets_ends_where_its_count_wraps():
+    sim, task = Sim(3, control="attitude"), Hover()
     task.install(sim)
     env = AutoReset(DroneEnv(sim, task), "Disabled")
     state = env.reset(jax.random.key(0))
     state = state.replace(data=counted(state.data, [MAX_STEPS - 5, MAX_STEPS - 10, 0]))
     after = jax.jit(env.step)(state, jnp.zeros_like(state.action))
-    is_fused = engine == "auto" and fused.unavailable_reason("cpu") is None
-    assert env.explain().startswith("engine: fused\n") == is_fused
     np.testing.assert_array_equal(after.info["nonfinite"], [True, False, False])
     np.testing.assert_array_equal(after.terminated, [True, False, False])
 

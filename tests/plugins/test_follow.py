@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, by_stages, with_states
+from cases import by_stages, with_states
 
 from crazysim import ConfigError, Sim
-from crazysim.engine import Step
 from crazysim.plugins.follow import Follow
 from crazysim.trajectories import Trajectory, figure_eight, helix, hover, line
 
@@ -99,16 +98,6 @@ def test_drones_follow(flown):
     np.testing.assert_allclose(error[0, 0], np.asarray(s.pos) - np.asarray(sim.data.states.pos)[0, 0], atol=1e-5)
     assert np.linalg.norm(error) < 0.1
     assert sim.plugins.observations(sim.data)["follow.vel_error"].shape == (1, 1, 3)
-
-
-@pytest.mark.parametrize("engine", FAST)
-def test_every_engine_flies_what_plain_flies(engine):
-    sim = build()
-    sim.add(Follow([EIGHT, UP], start=START, rate=RATE, n_slots=6, max_pieces=20))
-    assert sim.step_fn.plan(sim.data).program.fused
-    found, plain = (Step(sim.step_pipeline, e)(sim.data, np.int32(60)) for e in (engine, "plain"))
-    np.testing.assert_allclose(found.states.pos, plain.states.pos, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(found.controls.state.cmd, plain.controls.state.cmd, rtol=1e-4, atol=1e-4)
 
 
 def test_uploads_are_flown_and_nothing_is_compiled_again():

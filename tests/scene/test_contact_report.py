@@ -137,13 +137,12 @@ def test_one_drone_one_world_and_all_worlds_get_the_same(flown):
         report = alone(data)
         return data.replace(states=data.states.replace(torque=report.object_distance[:3]))
 
-    for engine in ("plain", "auto"):
-        seen = Step({"world": world, "drone": drone}, engine)(sim.data, 1).states
-        expected = np.stack(
-            [everything.drone_distance, everything.floor_distance, everything.object_distance[..., 1]], axis=-1
-        )
-        np.testing.assert_allclose(seen.force, expected, atol=1e-5)
-        np.testing.assert_allclose(seen.torque, everything.object_distance[..., :3], atol=1e-5)
+    seen = Step({"world": world, "drone": drone})(sim.data, 1).states
+    expected = np.stack(
+        [everything.drone_distance, everything.floor_distance, everything.object_distance[..., 1]], axis=-1
+    )
+    np.testing.assert_allclose(seen.force, expected, atol=1e-5)
+    np.testing.assert_allclose(seen.torque, everything.object_distance[..., :3], atol=1e-5)
 
 
 def test_the_distance_has_the_slope_of_the_way_to_the_object(flown):
@@ -194,10 +193,9 @@ def test_a_swarm_of_4096_finds_the_two_that_touch_without_quadratic_memory():
     assert not report.floor.any()
 
 
-@pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_contacts_are_logged_at_the_step_they_begin(engine):
+def test_contacts_are_logged_at_the_step_they_begin():
     """Drones fly past a pole in the first world and into it in the second; the third stands still next to another."""
-    sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel", engine=engine)
+    sim = Sim(n_worlds=3, n_drones=2, control="rotor_vel")
     pole = sim.scene.add("pole", pos=[0.5, 0, 0], height=3.0, radius=0.02)
     sim.add(ContactLog(pole, floor=False))
     pos = np.float32([[[0, 0.5, 1], [5, 0, 1]], [[0, 0, 1], [5, 0, 1]], [[0, 5, 1], [0, 5.1, 1]]])

@@ -163,9 +163,8 @@ def test_the_slope_of_depth_is_the_way_to_the_wall(room):
     assert float(jax.jit(jax.grad(middle))(0.0)) == pytest.approx(-1.0, abs=1e-5)
 
 
-@pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_a_range_finder_measures_in_the_step(engine):
-    sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
+def test_a_range_finder_measures_in_the_step():
+    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
     sim.scene.add("wall", pos=[2, 0, 0], length=8, height=8)
     sim.scene.add("sphere", pos=[0, 1.2, 1.0], radius=0.2)
     sim.add(RangeFinder(max_range=3.0, drones=True))
@@ -183,10 +182,9 @@ def test_a_range_finder_measures_in_the_step(engine):
     assert "not fused" not in sim.explain()
 
 
-@pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_rays_in_a_step_meet_loads_where_they_are_now(engine):
+def test_rays_in_a_step_meet_loads_where_they_are_now():
     """No image was drawn since the load and its drone moved. The rod, which begins at the drone, is not measured."""
-    sim = Sim(n_worlds=2, control="rotor_vel", engine=engine)
+    sim = Sim(n_worlds=2, control="rotor_vel")
     load = sim.add(SlungLoad(mass=0.005, length=0.5, size=0.1))
     sim.add(RangeFinder([[0, 0, -1], [1, 0, 0]], max_range=3.0))
     sim.sync(0)
@@ -241,20 +239,19 @@ def test_a_range_finder_finds_the_first_of_many_objects(x64, rng):
         np.testing.assert_allclose(slope[..., k], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
 
 
-@pytest.mark.parametrize("engine", ["plain", "auto"])
-def test_a_range_finder_measures_many_movable_objects_as_it_does_fixed_ones(engine, rng):
+def test_a_range_finder_measures_many_movable_objects_as_it_does_fixed_ones(rng):
     """A stage of all worlds measures them, at the same steps, and where they are in each world."""
     pos, quat = rng.uniform([-2, -2, 0.2], [2, 2, 2], (20, 3)), rng.normal(size=(20, 4))
     start = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (6, 2, 3))
     found = []
     for mocap in (False, True):
-        sim = Sim(6, 2, control="attitude", engine=engine)
+        sim = Sim(6, 2, control="attitude")
         boxes = sim.scene.add("box", count=20, pos=pos, quat=quat, size=(0.5, 0.5, 0.5), mocap=mocap)
         sim.add(RangeFinder(freq=250, drones=True, max_range=2.0))
         placed(sim, start)
         sim.step(5)
         found.append(np.asarray(sim.data.plugins["range_finder"].distance))
-        assert engine == "plain" or ("'range_finder' is not fused: rays among 22 movable" in sim.explain()) == mocap
+        assert ("'range_finder' is not fused: rays among 22 movable" in sim.explain()) == mocap
     np.testing.assert_allclose(found[1], found[0], atol=1e-5)
     assert 0.1 < np.mean(found[0] < 2.0) < 0.9
     sim.data = boxes.set_pose(sim.data, pos - [0, 0, 50])

@@ -103,25 +103,21 @@ def test_set_pose_is_pure_masked_and_differentiable(course):
     assert slope == pytest.approx(2 * 2.0 * 3 * 2 * 3)  # d/dz of z^2 over 3 worlds, 2 gates, 3 components
 
 
-def test_a_stage_of_one_world_moves_them_on_every_engine():
-    ends = []
-    for engine in ("plain", "auto"):
-        sim = Sim(n_worlds=2, n_drones=2, control="attitude", engine=engine)
-        pad = sim.scene.add("landing_pad", pos=np.array([[[0, 0, 0.5]], [[1, 0, 0.5]]]))
+def test_a_stage_of_one_world_moves_them():
+    sim = Sim(n_worlds=2, n_drones=2, control="attitude")
+    pad = sim.scene.add("landing_pad", pos=np.array([[[0, 0, 0.5]], [[1, 0, 0.5]]]))
 
-        @stage("world")
-        def drift(data, pad=pad):
-            pos, _ = pad.pose(data)
-            return pad.set_pose(data, pos + jnp.array([0.001, 0, 0]), vel=jnp.array([0.5, 0, 0]))
+    @stage("world")
+    def drift(data):
+        pos, _ = pad.pose(data)
+        return pad.set_pose(data, pos + jnp.array([0.001, 0, 0]), vel=jnp.array([0.5, 0, 0]))
 
-        sim.step_pipeline["drift"] = drift
-        sim.build_step_fn()
-        sim.step(100)
-        ends.append(np.asarray(pad.pose(sim.data)[0]))
-        assert "fused" in sim.explain() or engine == "plain"
-        np.testing.assert_allclose(sim.data.objects.vel, np.broadcast_to([0.5, 0, 0], (2, 1, 1, 3)))
-    np.testing.assert_allclose(ends[0][:, 0, 0], [0.1, 1.1], atol=1e-5)
-    np.testing.assert_allclose(ends[1], ends[0], atol=1e-6)
+    sim.step_pipeline["drift"] = drift
+    sim.build_step_fn()
+    sim.step(100)
+    assert "fused" in sim.explain()
+    np.testing.assert_allclose(sim.data.objects.vel, np.broadcast_to([0.5, 0, 0], (2, 1, 1, 3)))
+    np.testing.assert_allclose(np.asarray(pad.pose(sim.data)[0])[:, 0, 0], [0.1, 1.1], atol=1e-5)
 
 
 @pytest.mark.parametrize("what", PRIMITIVES)

@@ -323,23 +323,6 @@ def test_a_report_in_a_stage_needs_a_world():
         contacts(sim.data.replace(states=jax.tree.map(lambda x: np.asarray(x)[0, 0], sim.data.states)))
 
 
-def test_law_01_all_engines_agree():
-    sim = flying(2, 2, height=1.0, strict=True)
-    load = sim.add(SlungLoad(mass=0.2, cable=True, size=RADIUS))
-    sim.scene.add("sphere", pos=[0.3, 0, 0.6], radius=0.1, mocap=False)
-    sim.add(ContactResponse(restitution=0.4))
-    vel = np.array([[[2.0, 0, 0], [-1.5, 0.2, 0]], [[0, 3.0, 0.5], [1.0, 1.0, 4.0]]])
-    sim.data = with_load(load, sim.data, vel=vel)
-    sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
-    leave_out_drones(sim)
-    ends = {}
-    for engine in ("plain", "lanes", "fused"):
-        data = Step(sim.step_pipeline, engine, strict=True)(sim.data, np.int32(60))
-        ends[engine] = np.concatenate([data.states.pos, load.read(data).pos, load.read(data).vel], axis=-1)
-    for engine in ("lanes", "fused"):
-        np.testing.assert_allclose(ends[engine], ends["plain"], atol=2e-3)
-
-
 def test_law_07_no_nan(rng):
     """Loads in drones, in obstacles, in the floor, without mass, at any speed."""
     n = 12

@@ -243,16 +243,10 @@ def test_the_landing_place_has_a_gradient():
     assert float(slope) == pytest.approx(float(difference), rel=0.15)
 
 
-def test_engines_agree_and_the_impulse_is_reported():
-    ends = []
-    for engine in ("plain", "lanes", "auto"):
-        sim = without_air(2, engine=engine)
-        throw(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.06]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
-        sim.step(60)
-        ends.append(sim.data)
-    for other in ends[1:]:
-        np.testing.assert_allclose(other.states.pos, ends[0].states.pos, atol=2e-4)
-    sim.step(400)
+def test_the_impulse_is_reported():
+    sim = without_air(2)
+    throw(sim, pos=[[[0, 0, 0.1]], [[0.3, 0.05, 0.06]]], vel=[[[0.5, 0, 0]], [[0, 0, 0]]])
+    sim.step(460)
     weight = float(sim.data.params.mass[0]) * GRAVITY
     impulse = np.asarray(sim.data.plugins["contact_response"].impulse)[0, 0]
     np.testing.assert_allclose(impulse * 500, [0, 0, weight], atol=0.02 * weight)

@@ -4,56 +4,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import FAST, hover_command, hovering, n_documented, to_all, trees_equal, with_states
+from cases import hover_command, hovering, n_documented, to_all, trees_equal, with_states
+from sweep import EFFECTS
 
 from crazysim import (
     Battery,
     ConfigError,
-    Downwash,
-    GroundEffect,
     Latency,
     MotorFailure,
     Plugin,
-    Randomize,
-    Residual,
-    RotorAerodynamics,
     Sim,
     Wind,
-    WindField,
     load_airframe,
 )
 from crazysim.core.pipeline import replace_fn
 from crazysim.core.stage import vmap_drones
 from crazysim.engine import Step
 from crazysim.plugins import effects
-from crazysim.plugins.effects.grid import Grid
 from crazysim.pytree import scopes
 
-ON = {
-    Battery: {"capacity": 0.25, "resistance": 0.1},
-    Downwash: {},
-    GroundEffect: {},
-    Latency: {"delay": 2},
-    Randomize: {"mass": (0.9, 1.1), "drag": (0.5, 1.5), "wind": (0.0, 2.0)},
-    RotorAerodynamics: {"flapping": 1e-8, "ceiling": 4.0},
-    MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
-    Residual: {
-        "linear": np.full((6, 14), 1e-6),
-        "hidden": np.arange(28).reshape(2, 14) / 50,
-        "output": np.full((6, 2), 1e-6),
-    },
-    Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
-    WindField: {
-        "field": Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0)),
-        "spread": (0.5, 0.5, 0.0),
-    },
-}
-"""Every effect, with settings that do something."""
 IDLE = {Battery: {"capacity": 1e6, "resistance": 1e-6}, Latency: {"delay": 0}, MotorFailure: {}, Wind: {}}
 """Effects at settings at which they do nothing."""
 
 
-def switch_on(sim, settings=ON):
+def switch_on(sim, settings=EFFECTS):
     for effect, kwargs in settings.items():
         n = sim.airframe.n_rotors
         if "fail_step" in kwargs:
@@ -83,7 +57,7 @@ def test_every_effect_is_here_and_sorted():
     assert effects.__all__ == sorted(effects.__all__)
     kinds = [name for name in effects.__all__ if isinstance(getattr(effects, name), type)]
     plugins = [name for name in kinds if issubclass(getattr(effects, name), Plugin)]
-    assert plugins == sorted(effect.__name__ for effect in ON)
+    assert plugins == sorted(effect.__name__ for effect in EFFECTS)
 
 
 def test_off_nothing_is_there_and_without_strength_nothing_changes():
@@ -221,19 +195,6 @@ def test_every_effect_is_fused(every):
     assert [(s.scope, s.phase) for s in program.fused_segments] == [("drone", "before"), ("drone", "each")]
 
 
-@pytest.mark.long("compiles all effects in every engine")
-def test_effects_mean_the_same_on_every_engine(every, flown):
-    """20 steps, rounding grown by the controller's gains; random numbers are the same bits everywhere."""
-    expected = Step(every.step_pipeline, "plain")(flown, jnp.int32(20))
-    still = Step(hovering().step_pipeline, "interpret")(flown, jnp.int32(20))
-    assert np.abs(np.asarray(expected.states.vel) - np.asarray(still.states.vel)).max() > 1e-3
-    for engine in FAST:
-        found = Step(every.step_pipeline, engine)(flown, jnp.int32(20))
-        for name in ("pos", "quat", "vel"):
-            a, b = getattr(found.states, name), getattr(expected.states, name)
-            np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5, err_msg=f"{engine} {name}")
-
-
 def test_law_06_one_trace_whatever_is_reset_and_changed(every):
     sim = every
     for i in range(4):
@@ -339,7 +300,11 @@ def test_default_data_get_the_record_and_nothing_else():
     default = sim.default_data
     switch_on(sim)
     assert trees_equal(sim.default_data.replace(plugins={}), default)
-    assert set(sim.default_data.plugins) == set(sim.plugins) == {effect(**kwargs).name for effect, kwargs in ON.items()}
+    assert (
+        set(sim.default_data.plugins)
+        == set(sim.plugins)
+        == {effect(**kwargs).name for effect, kwargs in EFFECTS.items()}
+    )
     sent = np.asarray(sim.data.controls.attitude.staged_cmd)
     np.testing.assert_array_equal(sim.data.plugins["latency"].arrived, sent)
     np.testing.assert_array_equal(sim.default_data.plugins["latency"].arrived, 0 * sent)

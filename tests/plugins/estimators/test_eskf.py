@@ -296,14 +296,10 @@ def test_satellites_barometer_and_magnetometer_are_enough():
     assert np.sqrt(np.mean(error[:, 12:] ** 2)) < 0.1 * 0.0175
 
 
-def test_engines_agree_and_an_impossible_estimate_begins_anew():
-    """Rounding of float32 apart; world 1 is moved out of bounds."""
-    ends = []
-    for engine in ("plain", "fused"):
-        sim = flown(2, [MotionCapture(noise=POS, angle_noise=ANGLE), Barometer(noise=3.0)], 500, engine)
-        record = sim.data.plugins["eskf"]
-        ends.append(np.concatenate([sim.data.states.pos, record.estimate.pos, record.estimate.gyro_bias], axis=-1))
-    np.testing.assert_allclose(*ends, rtol=0, atol=2e-4)
+def test_an_impossible_estimate_begins_anew():
+    """World 1 is moved out of bounds."""
+    sim = flown(2, [MotionCapture(noise=POS, angle_noise=ANGLE), Barometer(noise=3.0)], 500)
+    record = sim.data.plugins["eskf"]
     far = record.replace(estimate=record.estimate.replace(pos=record.estimate.pos.at[1].set(1.1e4)))
     sim.data = ESKF(()).write(sim.data, far)
     sim.step(1)

@@ -1,6 +1,6 @@
 """Loads on rods and cables: invariants, impacts, the bare drone in the limit, and the laws.
 
-Flights use the fused engine, whose programs compile in a quarter of the time; law 01 compares the engines.
+Flights use the fused engine, whose programs compile in a quarter of the time.
 """
 
 import jax
@@ -247,26 +247,22 @@ def test_law_07_no_nan_in_gradients():
             assert x.dtype == jax.dtypes.float0 or np.isfinite(x).all()
 
 
-def test_law_01_all_engines_and_all_worlds_agree():
-    """Worlds of drones with loads of their own masses fly as alone, on every engine."""
+def test_law_01_worlds_fly_as_alone():
+    """With loads of their own masses."""
     masses = np.array([[0.0, 0.1], [0.2, 0.3]])
-    ends = {}
-    for engine in ("plain", "lanes", "fused"):
-        sim = flying(2, 2, height=2.0, engine=engine, strict=True)
-        load = sim.add(SlungLoad(mass=masses, attach=OFFSET, cable=True, in_scene=False))
-        sim.data = load.release(sim.data, np.array([[False, False], [False, True]]))
-        sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
-        sim.step(50)
-        ends[engine] = np.concatenate([sim.data.states.pos, load.read(sim.data).pos], axis=-1)
-    np.testing.assert_allclose(ends["lanes"], ends["plain"], atol=1e-5)
-    np.testing.assert_allclose(ends["fused"], ends["plain"], atol=1e-5)
+    sim = flying(2, 2, height=2.0)
+    load = sim.add(SlungLoad(mass=masses, attach=OFFSET, cable=True, in_scene=False))
+    sim.data = load.release(sim.data, np.array([[False, False], [False, True]]))
+    sim.rotor_vel_control(np.full((2, 2, 4), 13000.0))
+    sim.step(50)
+    heights = np.asarray(load.read(sim.data).pos)[..., 2]
     alone = flying(1, 1, height=2.0)
     load = alone.add(SlungLoad(mass=0.2, attach=OFFSET, cable=True, in_scene=False))
     alone.rotor_vel_control(np.full((1, 1, 4), 13000.0))
     alone.step(50)
     rise = np.asarray(load.read(alone.data).pos)[0, 0, 2]
-    np.testing.assert_allclose(ends["plain"][1, 0, 5], rise, atol=1e-5)
-    np.testing.assert_allclose(ends["plain"][1, 1, 5], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
+    np.testing.assert_allclose(heights[1, 0], rise, atol=1e-5)
+    np.testing.assert_allclose(heights[1, 1], 2 - 0.03 - 0.4 - 9.81 * 0.1**2 / 2, atol=3e-3)  # cut loose
 
 
 def test_rest_on_the_floor_and_release(x64):

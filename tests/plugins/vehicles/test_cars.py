@@ -36,20 +36,12 @@ def states_of(sim):
 
 
 @pytest.mark.parametrize(("n_worlds", "n_drones", "n_cars"), [(1, 1, 1), (2, 2, 2), (3, 1, 3), (2, 3, 4)])
-def test_engines_agree_for_any_counts(n_worlds, n_drones, n_cars):
-    sims, found, most = {}, {}, n_cars == 4
-    for engine in ("plain", "interpret", *(("lanes", "fused") if most else ())):
-        sim, cars = build(n_worlds, n_drones, engine, not most, members=n_cars, level="speed", in_scene=False)
-        command = np.random.default_rng(0).uniform([0.5, -0.3], [1.5, 0.3], (n_worlds, n_cars, 2))
-        sim.data = cars.commanded(sim.data, command)
-        sim.step(60)
-        assert sim.step_fn.engines == [engine]
-        sims[engine], found[engine] = sim, states_of(sim)
-    for engine, values in found.items():
-        for name, value in values.items():
-            np.testing.assert_allclose(value, found["plain"][name], rtol=1e-4, atol=1e-4, err_msg=f"{engine} {name}")
-    sims["plain"].step(240)
-    np.testing.assert_allclose(states_of(sims["plain"])["body_vel"][..., 0], command[..., 0], atol=0.1)
+def test_cars_follow_their_commands_for_any_counts(n_worlds, n_drones, n_cars):
+    sim, cars = build(n_worlds, n_drones, "fused", members=n_cars, level="speed", in_scene=False)
+    command = np.random.default_rng(0).uniform([0.5, -0.3], [1.5, 0.3], (n_worlds, n_cars, 2))
+    sim.data = cars.commanded(sim.data, command)
+    sim.step(300)
+    np.testing.assert_allclose(states_of(sim)["body_vel"][..., 0], command[..., 0], atol=0.1)
 
 
 @jax.jit

@@ -1,0 +1,399 @@
+"""Simulations that together run every stage of the package, on which all engines and devices must agree.
+
+``tests/test_agreement.py`` runs them on all engines, ``tests/gpu`` on the accelerator.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from cases import INTEGRATORS, PAIRS, as_numbers, centre, gap, hover_command, repulsion, send, with_states
+from springs import KINDS, Tied, build
+
+from crazysim import (
+    IMU,
+    Battery,
+    Bicycles,
+    Cars,
+    ContactLog,
+    ContactResponse,
+    Downwash,
+    DroneCollisions,
+    Follow,
+    FreeBodies,
+    GroundEffect,
+    Hook,
+    Kalman,
+    Latency,
+    MotionCapture,
+    MotorFailure,
+    Radar,
+    Randomize,
+    RangeFinder,
+    Residual,
+    RotorAerodynamics,
+    RotorJet,
+    SharedLoad,
+    Sim,
+    SlungLoad,
+    Terrain,
+    Wind,
+    WindField,
+    load_airframe,
+    rotation,
+    stage,
+)
+from crazysim.control.controllers import CONTROLLERS
+from crazysim.control.load_lqr import LoadLQR
+from crazysim.control.tracking_lqr import TrackingLQR
+from crazysim.core.pipeline import insert_fn_before
+from crazysim.geometry import Shape, distance, hull
+from crazysim.plugins import sensors, vehicles
+from crazysim.plugins.effects import Grid
+from crazysim.plugins.estimators import ESKF, Complementary
+from crazysim.plugins.sensors import GPS, UWB, Barometer, Lighthouse, OpticalFlow, TimeOfFlight, Triad
+from crazysim.trajectories import figure_eight
+
+ROUNDING = 1e-4
+"""Tolerance after 100 steps in float32: some 1,000 roundings of 1e-7, since errors in the speeds of rotors and in
+angular velocities add up in attitudes and positions. Two engines of the CPU differ by 2e-5 at most."""
+LOADS = 1e-3
+"""Tolerance of flights with loads, as slack cables and friction enlarge roundings.
+
+Two engines of the CPU differ by 8e-5 with cables. Kernels of GPUs divide to 2 units in the last place; with exact
+division a hook agrees to 1e-4. The task ``deliver`` needs no more than other tasks: after 20 steps two engines of the
+CPU differ by 2e-6, and each from float64 by 4e-6.
+"""
+NOISE = {
+    "state": [0.2, 0.2, 0.2, *[0.0] * 13],
+    "attitude": [0.2, 0.2, 0.2, 0.0],
+    "body_rate": [0.5, 0.5, 0.5, 0.0],
+    "force_torque": [0.0, 1e-6, 1e-6, 1e-6],
+    "rotor_vel": [0.0] * 4,
+}
+"""Largest differences of commands from those in hover, besides 2% of each number."""
+
+
+def flying(device="cpu", n_worlds=8, n_drones=2, plugins=(), prepare=None, height=1.5, **settings):
+    """Return a simulation whose drones differ in states and commands; those of world k are always the same."""
+    sim = Sim(n_worlds, n_drones, device=device, rng_key=4, **settings)
+    rng = np.random.default_rng(3)
+
+    def draw(size, k):
+        return size * rng.uniform(-1, 1, (100, n_drones, k))[:n_worlds]
+
+    quat = np.append(draw(0.1, 3), np.ones((n_worlds, n_drones, 1)), axis=-1)
+    sim.data = with_states(
+        sim.data,
+        pos=draw(0.1, 3) + np.stack(np.broadcast_arrays(0.0, 0.5 * np.arange(n_drones), height), axis=-1),
+        quat=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        vel=draw(0.5, 3),
+        ang_vel=draw(1.0, 3),
+    )
+    if prepare is not None:
+        prepare(sim)
+    for plugin in plugins:
+        sim.add(plugin)
+    hover = hover_command(sim.data, (0, 0, height))
+    command = hover * (1 + draw(0.02, len(hover))) + draw(1.0, len(hover)) * NOISE[sim.control.value]
+    sim.data = send(sim.data, command)
+    return sim
+
+
+def agree(found, expected, tolerance, label=""):
+    """Check that flags and integers are equal, and other numbers but for rounding.
+
+    Differences of large numbers carry their errors, so the tolerance is relative to the largest number of an array, or
+    to 1.
+    """
+    leaves, rest = jax.tree_util.tree_flatten_with_path(found)
+    assert rest == jax.tree.structure(expected)
+    for (path, x), y in zip(leaves, jax.tree.leaves(expected), strict=True):
+        x, y, name = as_numbers(x), as_numbers(y), f"{label} {jax.tree_util.keystr(path)}"
+        if np.issubdtype(y.dtype, np.floating):
+            size = np.abs(y[np.isfinite(y)]).max(initial=1.0)
+            np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * size, err_msg=name)
+        else:
+            np.testing.assert_array_equal(x, y, err_msg=name)
+
+
+ANGLES = np.pi / 3 * np.arange(6) + np.pi / 6
+CRAZYFLIE = load_airframe("cf21B_500").tables
+HEXAROTOR = {
+    **CRAZYFLIE,
+    "name": "hexarotor",
+    "rotors": {
+        **CRAZYFLIE["rotors"],
+        "position": np.stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), 0 * ANGLES], axis=-1),
+        "yaw_torque_sign": [1, -1, 1, -1, 1, -1],
+    },
+}
+FLEET = ("cf21B_500", "bumblebee", HEXAROTOR, "cf2x_L250")
+"""Airframes with different numbers of rotors."""
+SPHERE = Shape("sphere", (0.1,))
+SHAPES = [
+    Shape("plane"),
+    Shape("sphere", (0.35,)),
+    Shape("capsule", (0.2, 0.4)),
+    Shape("box", (0.3, 0.5, 0.2)),
+    Shape("cylinder", (0.4, 0.25)),
+    Shape("ellipsoid", (0.5, 0.3, 0.15)),
+    hull([[0.4, 0, 0], [-0.3, 0.3, 0], [-0.2, -0.4, 0.1], [0, 0.1, 0.5], [0.1, 0, -0.3]]),
+]
+EIGHT = figure_eight(2.0, 1.0, speed=1.0)
+HILLS = 0.5 * (1 + np.sin(np.arange(41) / 6)[:, None] * np.cos(np.arange(41) / 5))
+FIELD = Grid(np.arange(54).reshape(3, 3, 2, 3) % 7 - 3.0, (-1.0, -1.0, 0.0), (1.0, 1.0, 4.0))
+EFFECTS = {
+    Battery: {"capacity": 0.25, "resistance": 0.1},
+    Downwash: {},
+    GroundEffect: {},
+    Latency: {"delay": 2},
+    Randomize: {"mass": (0.9, 1.1), "drag": (0.5, 1.5), "wind": (0.0, 2.0)},
+    RotorAerodynamics: {"flapping": 1e-8, "ceiling": 4.0},
+    MotorFailure: {"effectiveness": 0.9, "fail_step": [-1, -1, -1, 30], "rate": 0.1},
+    Residual: {
+        "linear": np.full((6, 14), 1e-6),
+        "hidden": np.arange(28).reshape(2, 14) / 50,
+        "output": np.full((6, 2), 1e-6),
+    },
+    Wind: {"velocity": (2.0, 1.0, 0.0), "speed_20ft": 7.7, "roughness": 0.05},
+    WindField: {"field": FIELD, "spread": (0.5, 0.5, 0.0)},
+}
+"""Every effect, with settings that do something."""
+RANGES = {
+    "mass": (0.9, 1.2),
+    "inertia": (0.8, 1.1),
+    "thrust": (0.9, 1.0),
+    "rotor_thrust": (0.95, 1.05),
+    "torque": (0.5, 2.0),
+    "lag": (0.7, 1.3),
+    "drag": (0.0, 3.0),
+    "wind": (1.0, 3.0),
+}
+"""Every factor that ``Randomize`` draws by itself."""
+
+
+def errors(size):
+    """Return errors of three axes, of the size of what they measure."""
+    return Triad(noise=1e-3 * size, bias=0.1 * size, bias_spread=0.1 * size, random_walk=0.01 * size,
+                 instability=0.1 * size, scale=0.1, scale_spread=0.03, misalignment=0.02, misalignment_spread=0.02,
+                 bandwidth=80.0)  # fmt: skip
+
+
+OFFSET, TURN = (0.01, 0.0, -0.02), (0.1, 0.2, 0.3)
+ANCHORS = [(2.0, 2.0, 2.0), (-2.0, -2.0, 2.5)]
+STATIONS = [(0, 0, -2.4), (0, 0.6, 0.8)]
+LATE = {"delay": 0.004, "jitter": 0.004, "dropout": 0.1}
+SENSORS = {
+    "imu": lambda: IMU(errors(1.0), errors(1.0), OFFSET, TURN, 1e-8, **LATE),
+    "motion_capture": lambda: MotionCapture(1e-3, 1e-2, 50.0, OFFSET, TURN, freq=250, **LATE),
+    "optical_flow": lambda: OpticalFlow(0.1, pos=OFFSET),
+    "time_of_flight": lambda: TimeOfFlight(0.01, pos=OFFSET, resolution=None, freq=100, delay=0.01),
+    "barometer": lambda: Barometer(1.0, 2.0, 10.0, 30.0, 200.0),
+    "magnetometer": lambda: sensors.Magnetometer((1e-5, 2e-5, -4.5e-5), errors(1e-4), TURN, freq=100),
+    "rotor_speeds": lambda: sensors.RotorSpeeds(5.0, freq=250, delay=0.002),
+    "battery_voltage": lambda: sensors.BatteryVoltage(0.01),
+    "multi_ranger": lambda: sensors.MultiRanger(0.01, freq=100),
+    "uwb": lambda: UWB(ANCHORS, 0.1, 0.05, 0.3, 0.5, OFFSET, freq=100, delay=0.006),
+    "lighthouse": lambda: Lighthouse(ANCHORS, STATIONS, 1e-3, [OFFSET, (0, 0.01, 0)], freq=100),
+    "gps": lambda: GPS(0.5, 1.0, 20.0, 0.1, OFFSET, freq=100),
+}
+"""Every sensor, with all of its errors but rounding and limits."""
+REQUIRED_BY = {"battery_voltage": lambda: Battery(0.25, 0.1), "multi_ranger": lambda: RangeFinder()}
+"""Plugins that some sensors need."""
+
+
+def effects():
+    return [effect(**options) for effect, options in EFFECTS.items()]
+
+
+def all_sensors():
+    return [make() for make in (*REQUIRED_BY.values(), *SENSORS.values())]
+
+
+def kalman():
+    """Return a filter with every kind of sensor that it uses."""
+    used = [
+        IMU.bmi088(),
+        MotionCapture(noise=0.01, freq=20, delay=0.01),
+        OpticalFlow(noise=0.2),
+        TimeOfFlight(),
+        UWB(ANCHORS, noise=0.1),
+        UWB(ANCHORS, noise=0.1, tdoa=True, name="tdoa"),
+        Lighthouse(ANCHORS[:1], STATIONS[1:], noise=4e-4),
+    ]
+    return [*used, Kalman(used)]
+
+
+def eskf():
+    imu = IMU(gyro=Triad(noise=2.4e-4, bias_spread=0.0175), accel=Triad(noise=2e-3, bias_spread=0.2))
+    used = [imu, MotionCapture(noise=0.01, angle_noise=0.02), Barometer(noise=3.0)]
+    return [*used, ESKF(used)]
+
+
+def complementary():
+    used = [IMU.bmi088(), Barometer(noise=2.0), TimeOfFlight(noise=0.01)]
+    return [*used, Complementary(used)]
+
+
+def drifting_pad(sim):
+    """Add an object that a stage of the user moves."""
+    pad = sim.scene.add("landing_pad", pos=[0, 0, 0.5])
+
+    @stage("world")
+    def drift(data):
+        pos, _ = pad.pose(data)
+        return pad.set_pose(data, pos + jnp.array([0.001, 0, 0]), vel=jnp.array([0.5, 0, 0]))
+
+    sim.step_pipeline["drift"] = drift
+
+
+def ball(sim):
+    sim.scene.add("sphere", pos=[0.1, 0, 1.1], radius=0.1, mocap=False)
+
+
+def approach(sim):
+    """Let the two drones of each world meet."""
+    pos, vel = [[0, 0, 1.0], [0.12, 0.02, 1.01]], [[0.5, 0, -0.3], [-0.5, 0, -0.3]]
+    shape = sim.data.states.pos.shape
+    sim.data = with_states(sim.data, pos=np.broadcast_to(pos, shape), vel=np.broadcast_to(vel, shape))
+
+
+@stage("drone")
+def distances(data):
+    """Write distances of a sphere to every kind of shape, and the slope of one, where wrenches are."""
+    s = data.states
+    turned = rotation.matrix(s.quat)
+    found = jnp.stack([distance(SPHERE, shape, s.pos, turned) for shape in SHAPES])
+    slope = jax.grad(lambda pos: distance(SPHERE, SHAPES[0], pos, turned))(s.pos)
+    return data.replace(states=s.replace(force=found[:3] + found[3:6], torque=found[4:] + slope))
+
+
+def alone(**stages):
+    """Return a function that replaces all stages but the count of steps."""
+
+    def prepare(sim):
+        sim.step_pipeline = stages | {"increment_steps": sim.step_pipeline["increment_steps"]}
+
+    return prepare
+
+
+def before_integration(*stages):
+    """Return a function that inserts stages."""
+
+    def prepare(sim):
+        for fn in stages:
+            insert_fn_before(sim.step_pipeline, "integration", fn)
+
+    return prepare
+
+
+def undeclared(data):
+    """Add a torque that depends on the drones of all worlds."""
+    mean = jnp.mean(data.states.pos, axis=(0, 1))
+    return data.replace(states=data.states.replace(torque=0 * data.states.torque + 1e-6 * mean))
+
+
+NAMED = [name for name in CONTROLLERS if name not in ("auto", "crazyflow", "load_lqr", "tracking_lqr")]
+"""Controllers of states that need no more than their names; ``"auto"`` is the default."""
+
+
+def turns(state, setpoint, time):
+    """Return the number of the controller that flies: each for six steps."""
+    return jnp.int32(time * 500 / 6) % len(NAMED)
+
+
+def case(plugins=list, **settings):
+    """Return a function of further settings that returns a simulation."""
+
+    def build(**more):
+        return flying(plugins=plugins(), **settings | more)
+
+    build.plugins = plugins
+    return build
+
+
+def along_a_figure_eight(**more):
+    t = np.linspace(0, 1, 11)
+    controller = TrackingLQR(setpoints=jax.vmap(EIGHT.evaluate)(t), dt=0.1)
+    return flying(plugins=follow(), control="state", controller=controller, **more)
+
+
+def follow():
+    return [Follow([EIGHT])]
+
+
+along_a_figure_eight.plugins = follow
+
+
+def fleet(**more):
+    """Return drones of several airframes, of which one has six rotors."""
+    sim = Sim(3, drone=FLEET, control="attitude", integrator="rk4", **more)
+    rng = np.random.default_rng(0)
+    sim.data = with_states(sim.data, pos=rng.uniform(0.9, 1.1, (3, 4, 3)), vel=[0.1, 0.1, 0.1])
+    sim.attitude_control(rng.uniform([0, 0, 0, 0.3], [0.2, 0.1, 0.2, 0.4], (3, 4, 4)))
+    return sim
+
+
+STEPS = {
+    f"{dynamics}-{control}-{INTEGRATORS[i % 3]}": {
+        "dynamics": dynamics, "control": control, "integrator": INTEGRATORS[i % 3],
+    } for i, (dynamics, control) in enumerate(PAIRS)
+}  # fmt: skip
+"""Every kind of dynamics and command level, and every integrator."""
+CASES = {name: case(**settings) for name, settings in STEPS.items()}
+CASES |= {
+    "crazyflow": case(control="state", controller="crazyflow"),
+    "controllers": case(control="state", controller=NAMED, switch=turns),
+    "load_lqr": case(
+        lambda: [SlungLoad(0.05, 0.4)], drone="bumblebee", control="state", controller=LoadLQR()
+    ),
+    "tracking_lqr": along_a_figure_eight,
+    "effects": case(effects, control="attitude"),
+    "randomize": case(
+        lambda: [Randomize(**RANGES, charge=(0.2, 0.6), delay=(1, 4)), Battery(),
+                 Latency(delay=np.zeros((8, 2), int), max_delay=4)],
+        control="rotor_vel",
+    ),
+    "sensors": case(all_sensors, control="rotor_vel"),
+    "kalman": case(kalman, n_drones=1, control="state"),
+    "eskf": case(eskf, n_drones=1, control="state", integrator="rk4"),
+    "complementary": case(complementary, control="attitude"),
+    "load": case(
+        lambda: [SlungLoad(0.005, 0.3, cable=True, drag=0.01), RotorJet(), ContactResponse()],
+        control="attitude", prepare=ball,
+    ),
+    "shared": case(lambda: [SharedLoad(0.005)], control="attitude", integrator="symplectic_euler"),
+    "hook": case(lambda: [Hook.bumblebee(0.2), ContactLog()], control="state", drone="bumblebee"),
+    "vehicles": case(
+        lambda: [Cars(2, path=figure_eight(6.0, 2.0, period=12.0), controller=vehicles.PathLQR(), trailer=True),
+                 Bicycles(pos=(0.0, 3.0)), Radar((0.0, 0.0, 0.5))],
+        control="rotor_vel",
+    ),
+    "terrain": case(
+        lambda: [Terrain(HILLS, (8.0, 8.0)), RangeFinder(drones=True), ContactLog()], control="attitude",
+    ),
+    "bodies": case(
+        lambda: [FreeBodies(3, size=(0.2, 0.2, 0.2), mass=0.2, pos=[(0, 0, 0.11), (0.02, 0, 0.35), (1, 0, 2.0)])],
+        control="state",
+    ),
+    "collisions": case(lambda: [DroneCollisions()], control="attitude", prepare=approach),
+    "impact": case(lambda: [ContactResponse()], control="attitude", height=0.03),
+    "objects": case(control="attitude", prepare=drifting_pad),
+    "distances": case(height=0.0, control="rotor_vel", prepare=alone(distances=distances)),
+    "fleet": fleet,
+    "populations": lambda **more: build(KINDS, 3, 2, 4, **more),
+    "populations of equal sizes": lambda **more: build(KINDS, 2, 2, 2, **more),
+    "many members": lambda **more: build(Tied, 2, 2, 9, **more),
+    "stages of all scopes": case(
+        n_drones=4, control="attitude", prepare=before_integration(repulsion, centre, undeclared)
+    ),
+    "pairs of 17": case(n_worlds=3, n_drones=17, control="rotor_vel", prepare=before_integration(gap)),
+    "downwash of 9": case(lambda: [Downwash()], n_worlds=4, n_drones=9, control="attitude"),
+}  # fmt: skip
+"""Functions that return the simulations, by name."""
+PLUGINS = {name: build.plugins for name, build in CASES.items() if hasattr(build, "plugins")}
+"""Functions that return the plugins of these simulations."""
+SPLIT = ("bodies", "collisions", "stages of all scopes", "many members")
+"""Simulations with stages that no engine fuses."""
+TOLERANCES = {"shared": LOADS, "hook": LOADS, "impact": 0.02}  # a box on a floor touches with any corner
+"""Tolerances other than ``ROUNDING``."""

@@ -1,0 +1,45 @@
+"""One sweep over all stages of a step: every engine gives what ``plain`` gives.
+
+``tests/envs/test_env_step.py`` has the sweep over environments.
+"""
+
+import importlib
+import pkgutil
+
+import jax.numpy as jnp
+import pytest
+import sweep
+from cases import FAST
+
+from crazysim import Plugin, plugins
+from crazysim.control.controllers import CONTROLLERS
+from crazysim.engine import Step
+
+ENGINES = ("interpret", *FAST)
+N_STEPS = 20
+"""Steps of each simulation; sensors, controllers and delays have their ticks in them."""
+NOT_ON_LANES = ("kalman", "eskf", "terrain")
+"""Simulations whose lanes XLA takes more than half a minute to compile."""
+
+
+@pytest.mark.long("compiles every stage of the package for every engine")
+@pytest.mark.parametrize("name", sweep.CASES)
+def test_every_engine_gives_what_plain_gives(name):
+    sim = sweep.CASES[name]()
+    expected = Step(sim.step_pipeline, "plain")(sim.data, jnp.int32(N_STEPS))
+    for engine in ENGINES:
+        if engine == "lanes" and name in NOT_ON_LANES:
+            continue
+        step = Step(sim.step_pipeline, engine)
+        assert step.plan(sim.data).engine == engine
+        found = step(sim.data, jnp.int32(N_STEPS))
+        sweep.agree(found, expected, sweep.TOLERANCES.get(name, sweep.ROUNDING), engine)
+
+
+def test_every_plugin_and_controller_is_in_the_sweep():
+    swept = {type(plugin) for factory in sweep.PLUGINS.values() for plugin in factory()}
+    modules = [importlib.import_module(m.name) for m in pkgutil.walk_packages(plugins.__path__, "crazysim.plugins.")]
+    classes = {x for module in modules for x in vars(module).values() if isinstance(x, type) and issubclass(x, Plugin)}
+    assert len(swept) > 30
+    assert not {x.__name__ for x in classes if not any(issubclass(y, x) for y in swept)}
+    assert set(sweep.NAMED) | {"auto", "crazyflow", "load_lqr", "tracking_lqr"} == set(CONTROLLERS)
