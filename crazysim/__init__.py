@@ -10,7 +10,7 @@ from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
 from crazysim.core.others import reduce_over_others
-from crazysim.core.plugin import Placement, Plugin, parameter
+from crazysim.core.plugin import Plugin, StagePlacement, parameter
 from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
@@ -79,7 +79,6 @@ __all__ = [
     "Members",
     "MotionCapture",
     "MotorFailure",
-    "Placement",
     "Plugin",
     "Population",
     "PyTree",
@@ -94,6 +93,7 @@ __all__ = [
     "Sim",
     "SimData",
     "SlungLoad",
+    "StagePlacement",
     "Terrain",
     "Wind",
     "WindField",

@@ -21,7 +21,7 @@ from crazysim import IMU, Follow, MotionCapture, Sim
 from crazysim.envs import flying
 from crazysim.media import View
 from crazysim.plugins import sensors
-from crazysim.plugins.sensors.imu import DEGREE, G
+from crazysim.plugins.sensors.imu import RAD_PER_DEGREE, STANDARD_GRAVITY
 from crazysim.trajectories import figure_eight
 
 mpl.use("Agg")
@@ -73,8 +73,8 @@ def allan() -> None:
     """Allan deviation of the gyroscope and accelerometer of simulated BMI088 at rest, beside that of their numbers."""
     n, freq = 32, 100
     sim = Sim(n, control="rotor_vel", freq=freq, rng_key=2)
-    gyro = sensors.Triad(noise=0.014 * DEGREE, instability=5.1e-5, correlation_time=20.0, random_walk=5e-6)
-    accel = sensors.Triad(noise=160e-6 * G, instability=3e-4, correlation_time=20.0, random_walk=3e-5)
+    gyro = sensors.Triad(noise=0.014 * RAD_PER_DEGREE, instability=5.1e-5, correlation_time=20.0, random_walk=5e-6)
+    accel = sensors.Triad(noise=160e-6 * STANDARD_GRAVITY, instability=3e-4, correlation_time=20.0, random_walk=3e-5)
     sim.add(IMU(gyro=gyro, accel=accel))
     kept = sim.rollout(
         lambda _, data: data.controls.rotor_vel, None, 400 * freq, keep=lambda data: data.plugins["imu"].samples.value

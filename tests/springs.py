@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import crazysim as cs
-from crazysim.core.plugin import Placement, parameter
+from crazysim.core.plugin import StagePlacement, parameter
 from crazysim.core.population import Population
 from crazysim.core.stage import stage
 from crazysim.pytree import Members, leaf
@@ -95,7 +95,10 @@ class Tying(Springs):
             data = data.replace(states=states.replace(vel=states.vel.at[0].add(-swapped)))
             return self.write(data, record.replace(vel=record.vel.at[-1].add(swapped)))
 
-        placed = [Placement(pull, name=f"{self.name}_pull"), Placement(exchange, name=f"{self.name}_exchange")]
+        placed = [
+            StagePlacement(pull, name=f"{self.name}_pull"),
+            StagePlacement(exchange, name=f"{self.name}_exchange"),
+        ]
         return [*placed, *super().stages(sim)]
 
 

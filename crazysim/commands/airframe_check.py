@@ -13,7 +13,7 @@ import numpy as np
 from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.control.allocation import hover_rotor_vel, level_thrust, yaw_arm
 from crazysim.control.auto import Auto
-from crazysim.control.bandwidth import authority, precession, rotor_rate
+from crazysim.control.bandwidth import max_ang_acc, precession_rate, rotor_rate
 from crazysim.control.controllers import find_controller
 from crazysim.control.crazyflow import Crazyflow
 from crazysim.drones import Airframe
@@ -193,21 +193,21 @@ def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
 
 def _agility_warnings(airframe: Airframe) -> Iterator[str]:
     """Yield what makes flights slow, or steps of the default rate diverge."""
-    for (axis, least), acc in zip(MIN_AUTHORITY.items(), authority(airframe), strict=True):
+    for (axis, least), acc in zip(MIN_AUTHORITY.items(), max_ang_acc(airframe), strict=True):
         if acc < least:
             seconds = 2 * np.sqrt(QUARTER_TURN / acc)
             yield f"{axis} has {acc:.2g} rad/s^2 in hover: a turn by 90 degrees takes {seconds:.2g} s at least"
-    if precession(airframe) > MAX_PRECESSION_SHARE * np.min(authority(airframe)[:2]):
+    if precession_rate(airframe) > MAX_PRECESSION_SHARE * np.min(max_ang_acc(airframe)[:2]):
         yield (
             f"rotors turn one way more than the other: at 1 rad/s of roll or pitch their momentum takes "
-            f"{precession(airframe):.2g} of {np.min(authority(airframe)[:2]):.2g} rad/s^2 about the other axis"
+            f"{precession_rate(airframe):.2g} of {np.min(max_ang_acc(airframe)[:2]):.2g} rad/s^2 about the other axis"
         )
     bandwidth = float(np.sqrt(Auto().params(airframe).stiffness[0]))
-    if precession(airframe) > MAX_PRECESSION_RATIO * bandwidth:
+    if precession_rate(airframe) > MAX_PRECESSION_RATIO * bandwidth:
         yield (
             f"rotors turn one way more than the other: their momentum turns roll into pitch at "
-            f"{precession(airframe):.2g} rad/s, against a bandwidth of controller 'auto' of {bandwidth:.2g} rad/s: it "
-            f"may not hold the drone"
+            f"{precession_rate(airframe):.2g} rad/s, against a bandwidth of controller 'auto' of {bandwidth:.2g} "
+            f"rad/s: it may not hold the drone"
         )
     if rotor_rate(airframe) * MAX_TIME_CONSTANT < 1:
         yield f"rotors lag by {1 / rotor_rate(airframe):.2g} s: a drone that is thrown takes long to recover"

@@ -12,7 +12,7 @@ from typing import Any
 
 from crazysim.commands.options import DefaultsFormatter
 from crazysim.drones import load_airframe
-from crazysim.dynamics.utils.identification import FITTED
+from crazysim.dynamics.utils.identification import FITTED_MODELS
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import (
     Columns,
@@ -52,7 +52,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--test", nargs="+", default=[], metavar="LOG", help="logs for held-out errors")
     add("--motion", type=Path, nargs="+", default=[], metavar="FILE", help="motion capture of each log, also of --test")
     add("--mass", type=float, metavar="KG", help="mass; by default the airframe's")
-    add("--dynamics", choices=["first_principles", *FITTED], default="first_principles", help="model to fit")
+    add("--dynamics", choices=["first_principles", *FITTED_MODELS], default="first_principles", help="model to fit")
     add("--network", type=int, metavar="N", help="train a residual with N hidden units, 0 for linear terms")
     add("--iterations", type=int, default=1000, metavar="N", help="iterations of that training")
     add("--plot", type=Path, metavar="FILE", help="picture of the errors of held-out logs, or else of the fitted ones")

@@ -3,13 +3,13 @@
 from typing import TYPE_CHECKING
 
 from crazysim.control.allocation import AllocationParams, force_torque2rotor_vel
-from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
+from crazysim.control.attitude_controller import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.levels import COMMAND_FIELDS, Control, command_size
 from crazysim.control.mellinger import Mellinger
 from crazysim.control.pid import PID
 from crazysim.control.protocol import Controller
 from crazysim.control.setpoint import Setpoint
-from crazysim.control.state import StateParams, state2attitude
+from crazysim.control.state_controller import StateParams, state2attitude
 from crazysim.control.switch import Switch
 from crazysim.dynamics.parameter_tables import load_controller_fn_params as load_fn_params
 from crazysim.dynamics.parameter_tables import load_controller_params as load_params

@@ -37,7 +37,7 @@ class AllocationParams(PyTree):
     def create(airframe: Airframe) -> AllocationParams:
         """Return the shared parameters of an airframe.
 
-        The drag torque over thrust is that of ``torque_arms``.
+        For the drag torque over thrust see ``torque_arms``.
 
         Raises:
             ConfigError: If the airframe lacks one.
@@ -78,7 +78,7 @@ def torque_arms(airframe: Airframe) -> np.ndarray:
 
 
 def yaw_arm(airframe: Airframe) -> float:
-    """Return the change of a rotor's drag torque over that of its thrust around hover, m.
+    """Return the ratio of the changes of a rotor's drag torque and thrust around hover, m.
 
     Raises:
         ConfigError: If the airframe has no thrust curve or no torque curve.

@@ -26,8 +26,8 @@ feedback that lead would alternate the rotors at every tick. The rotors are ther
 
     (1 + z s) / (1 + (z + 1 / r) s),
 
-which is at most one at every frequency, and immediate for heavy rotors. Their momentum counts with that of the body
-where unknown torques are estimated.
+which is at most one at every frequency, and immediate for heavy rotors. Their momentum is added to the momentum of the
+body where unknown torques are estimated.
 """
 
 from __future__ import annotations
@@ -41,38 +41,38 @@ from jax import Array, lax
 
 from crazysim import rotation
 from crazysim.control.allocation import AllocationParams, hover_arms, wrench_matrix
-from crazysim.control.bandwidth import YAW, fastest_rotor_rate, reaction_time, rotor_rate, turn_rates
-from crazysim.control.fitted import FittedAuto
-from crazysim.control.flatness import HORIZONTAL, NO_THRUST
+from crazysim.control.bandwidth import YAW_RATE_RATIO, fastest_rotor_rate, reaction_time, rotor_rate, turn_rates
+from crazysim.control.fitted_auto import FittedAuto
+from crazysim.control.flatness import MIN_HEADING_SINE, MIN_THRUST
 from crazysim.control.levels import Control
-from crazysim.control.position import PositionMemory, PositionParams, specific_force, upright
+from crazysim.control.position import PositionMemory, PositionParams, keep_upright, specific_force
 from crazysim.control.priority import prioritized_thrusts
 from crazysim.control.protocol import Controller, DroneData, DroneState
-from crazysim.control.rigid_body import RigidBodyParams, rigid_body
+from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
-from crazysim.dynamics.rotor import curve, thrust_slope
+from crazysim.dynamics.rotor import quadratic_curve, thrust_slope
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec, safe_clip
 
-RATE = 50.0
-"""Rate at which the rotors follow with feedback of their speeds, 1/s, where ``LEAD`` suffices and authority allows."""
-LEAD = 5.0
+ROTOR_RATE = 50.0
+"""Rate of the rotors with feedback of their speeds, 1/s, where ``MAX_LEAD`` suffices and authority allows."""
+MAX_LEAD = 5.0
 """Largest factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
-STEP = 0.5
+MAX_FEEDBACK_STEP = 0.5
 """Largest part of the missing rotor speed that the feedback adds in one tick of the controller, 1."""
-DAMPING = 0.6
+DAMPING_RATIO = 0.6
 """Angular acceleration per body rate over the rate about the axis, 1."""
-STIFFNESS = 0.12
+STIFFNESS_RATIO = 0.12
 """Angular acceleration per rotation error over the squared rate about the axis, 1."""
-OBSERVER = 0.6
+OBSERVER_RATE_RATIO = 0.6
 """Rate of the estimate of unknown torques over the largest rate about an axis, 1."""
 TORQUE_MAX = 0.5
 """Largest unknown torque that is compensated, as the rotation error against which it holds, rad."""
 YAW_RATE_MAX = 35.0
 """Largest rate about body z that holds a heading, rad/s: what a Crazyflie's gyroscope measures (BMI088, data sheet)."""
-INVERTED = 1e-6
+INVERTED_COSINE = 1e-6
 """One plus the cosine of the tilt error below which its direction counts as undefined, 1: 0.08 degrees."""
 
 
@@ -113,14 +113,14 @@ class AutoParams(RigidBodyParams):
         Raises:
             ConfigError: If the airframe lacks a value.
         """
-        lag, turns = rotor_rate(airframe), DAMPING / STIFFNESS * turn_rates(airframe)
-        wanted = 1 / max(1 / np.max(turns[:2]) - 1.5 / freq, 1 / RATE)
-        lead = max(min(wanted / lag, LEAD, STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        lag, turns = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
+        wanted = 1 / max(1 / np.max(turns[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
+        lead = max(min(wanted / lag, MAX_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
         rate = 1 / (1 / (lead * lag) + 1.5 / freq)
-        rates = np.minimum(rate * np.array([1.0, 1.0, YAW]), turns)
-        stiffness, damping = STIFFNESS * rates**2, DAMPING * rates
-        delay, reaction = DAMPING / STIFFNESS / np.min(rates[:2]), reaction_time(airframe)
-        body = rigid_body(airframe)
+        rates = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turns)
+        stiffness, damping = STIFFNESS_RATIO * rates**2, DAMPING_RATIO * rates
+        delay, reaction = DAMPING_RATIO / STIFFNESS_RATIO / np.min(rates[:2]), reaction_time(airframe)
+        body = rigid_body_params(airframe)
         allocation: AllocationParams = body.pop("allocation")
         position = None
         if outer_freq is not None:
@@ -132,7 +132,7 @@ class AutoParams(RigidBodyParams):
             stiffness=as_parameter(stiffness),
             damping=as_parameter(damping),
             torque_max=as_parameter(TORQUE_MAX * np.diag(airframe.inertia) * stiffness),
-            observer=as_parameter(1 - np.exp(-OBSERVER * np.max(rates) / freq)),
+            observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO * np.max(rates) / freq)),
             lead=as_parameter(lead),
             reaction=as_parameter(reaction),
             share=as_parameter(1 / (1 + lead * lag * reaction)),
@@ -180,7 +180,7 @@ class AutoMemory(PyTree):
         return AutoMemory(AutoTarget.at_rest() if follows_setpoints else None, zeros, zeros)
 
 
-def error_of_quat(quat: Array) -> Array:
+def quat_error(quat: Array) -> Array:
     """Return the rotation vector, shortened to ``2 sin(angle / 2)``, that turns a body into a desired attitude.
 
     The thrust is tilted along the shortest way, and the rest turns about it (Brescianini and D'Andrea 2018). The first
@@ -195,8 +195,8 @@ def error_of_quat(quat: Array) -> Array:
     """
     x, y, z, w = (quat[..., i : i + 1] for i in range(4))
     squared = w * w + z * z
-    twice = 2 * lax.rsqrt(jnp.maximum(squared, INVERTED / 2))
-    roll = jnp.where(squared < INVERTED / 2, 2.0, (w * x - y * z) * twice)
+    twice = 2 * lax.rsqrt(jnp.maximum(squared, INVERTED_COSINE / 2))
+    roll = jnp.where(squared < INVERTED_COSINE / 2, 2.0, (w * x - y * z) * twice)
     yaw = jnp.where(w < 0, -z, z) * twice
     return jnp.concatenate([roll, (w * y + x * z) * twice, yaw], axis=-1)
 
@@ -244,7 +244,7 @@ class Auto(Controller):
         matrix = rotation.matrix(s.quat)
         to_body = jnp.swapaxes(matrix, -1, -2)
         drag = matvec(matrix, matvec(p.drag_matrix, matvec(to_body, s.vel))) / p.mass
-        push = jnp.sum(curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
+        push = jnp.sum(quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust), axis=-1, keepdims=True) / p.mass
         known = drag + push * matrix[..., 2]
         # There is an outer loop, so none of these is None.
         freq, loop, target = (
@@ -254,54 +254,51 @@ class Auto(Controller):
         )
         specific, position = specific_force(s.pos, s.vel, known, sp, target.position, freq, loop)
         # The attitude is held for a period, in whose middle the setpoint's acceleration has changed by half a step.
-        specific = upright(specific - drag + 0.5 / freq * sp.jerk, sp, loop)
+        specific = keep_upright(specific - drag + 0.5 / freq * sp.jerk, sp, loop)
 
-        # The heading of a state command is that of its quaternion, which needs no angles.
+        # The heading of a state command follows from its quaternion, which needs no angles.
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         squared = dot(specific, specific)
-        falls = squared < NO_THRUST**2
+        falls = squared < MIN_THRUST**2
         inverse = jnp.where(falls, 0.0, lax.rsqrt(jnp.where(falls, 1.0, squared)))
         z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], specific.dtype), specific * inverse)
         across = cross(z, ahead)
         x_ahead = rotation.safe_norm(across)
-        parallel = x_ahead < NO_THRUST
+        parallel = x_ahead < MIN_THRUST
         y = jnp.where(parallel, left, across / jnp.where(parallel, 1.0, x_ahead))
         z_rate = (sp.jerk - dot(z, sp.jerk) * z) * inverse
         turned = sp.yaw_rate * dot(y, left) - dot(y, z_rate) * dot(z, ahead)
-        yaw_rate = turned / jnp.maximum(x_ahead, HORIZONTAL)
+        yaw_rate = turned / jnp.maximum(x_ahead, MIN_HEADING_SINE)
         ang_vel = cross(z, z_rate) + safe_clip(yaw_rate, -YAW_RATE_MAX, YAW_RATE_MAX) * z
         attitude, thrust = rotation.quat_from_axes(cross(y, z), y, z), p.mass * squared * inverse
         return memory.replace(target=AutoTarget(position, attitude, matvec(to_body, ang_vel), thrust))
 
     def params(self, airframe: Airframe) -> AutoParams:
-        """Return gains and constants for an airframe."""
         return AutoParams.create(airframe, self.freq, self.outer_freq)
 
     def memory(self, airframe: Airframe) -> AutoMemory:
-        """Return the memory before the first tick."""
         return AutoMemory.at_rest(follows_setpoints=self.has_outer)
 
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: AutoMemory, params: AutoParams
     ) -> tuple[Array, AutoMemory]:
-        """Return the rotor speeds, and the memory."""
         s, p = data.states, params
         if isinstance(command, Setpoint):
             target = cast(AutoTarget, memory.target)
             error = rotation.multiply(rotation.conjugate(s.quat), target.quat)
             z, w = error[..., 2:3], error[..., 3:]
             thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its part along the present z axis
-            error, rate = error_of_quat(error), target.ang_vel
+            error, rate = quat_error(error), target.ang_vel
             on: Any = True
         else:
             thrust = command[..., 3:]
             error, rate = self._of_command(s, command, data.controls.mode)
             on = thrust > 0
 
-        rotors = matvec(p.mixing_matrix, curve(s.rotor_vel, p.allocation.rpm2thrust))
+        rotors = matvec(p.mixing_matrix, quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust))
         momentum = matvec(p.J, s.ang_vel)
         gyroscopic = cross(s.ang_vel, momentum)
-        # Rotors that speed up turn the body the other way: their momentum counts with that of the body.
+        # Rotors that speed up turn the body the other way: their momentum is added to the body's.
         total = momentum - rotation.along_z((p.reaction * rotors[..., 2:])[..., 0])
         impulse = p.torque_max / self.freq
         measured = jnp.clip(total - memory.momentum, -impulse, impulse)
@@ -330,4 +327,4 @@ class Auto(Controller):
         if self.yaw_rate:
             rpy = jnp.concatenate([rpy[..., :2], rotation.yaw(s.quat)[..., None]], axis=-1)
             rate = command[..., 2:3] * rotation.matrix(s.quat)[..., 2, :]
-        return error_of_quat(rotation.multiply(rotation.conjugate(s.quat), rotation.from_rpy(rpy))), rate
+        return quat_error(rotation.multiply(rotation.conjugate(s.quat), rotation.from_rpy(rpy))), rate

@@ -11,11 +11,11 @@ them). A controller that runs every 1/freq s acts half a period late, and its in
 counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
 
 Two limits lower these rates. A large error e turns the drone along the line on which kp e + kd e' = 0, so the rotors
-have to brake it with (kp / kd)^2 e. Beyond what they can give (``authority``) the drone turns faster than it can stop:
-``turn_rates`` bounds kp / kd. And a rotor that speeds up turns the body the other way, at once: with rotors of the lag
-rate r whose momentum changes by z over their drag torque (``reaction_time``), a demand of yaw torque has 1 + r z times
-its effect in the first tick. A controller that leaves this out of account may take away no more than ``REACTION`` of an
-error of the yaw rate in a tick.
+have to brake it with (kp / kd)^2 e. Beyond what they can give (``max_ang_acc``) the drone turns faster than it can
+stop: ``turn_rates`` bounds kp / kd. And a rotor that speeds up turns the body the other way, at once: with rotors of
+the lag rate r whose momentum changes by z over their drag torque (``reaction_time``), a demand of yaw torque has 1 + r
+z times its effect in the first tick. A controller without a model of this may take away no more than ``MAX_REACTION``
+of an error of the yaw rate in a tick.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 
 ATTITUDE_STIFFNESS = 0.3
 """Attitude gain per inertia over the squared lag rate, 1."""
-REACTION = 1 / 3
+MAX_REACTION = 1 / 3
 """Largest part of an error of the yaw rate that the reaction to accelerating rotors takes away in a tick, 1."""
-YAW = 0.5
-"""Rate of the yaw loop over that of roll and pitch, 1."""
-ERRORS = np.array([2.0, 2.0, 1.0])
+YAW_RATE_RATIO = 0.5
+"""Ratio of the rate of the yaw loop to the rate of roll and pitch, 1."""
+STOPPABLE_ERRORS = np.array([2.0, 2.0, 1.0])
 """Rotation errors about x, y and z from which a turn can be stopped, 1: 2 sin(angle / 2) of half a turn, and 1 rad."""
-POSITION = 0.12
+POSITION_RATE_RATIO = 0.12
 """Natural frequency of the position loop over the lag rate, 1."""
 
 
@@ -76,7 +76,7 @@ def _slopes(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
 
 
 def reaction_time(airframe: Airframe) -> float:
-    """Return the change of a rotor's angular momentum over that of its drag torque around hover, s.
+    """Return the ratio of the changes of a rotor's angular momentum and drag torque around hover, s.
 
     Raises:
         ConfigError: If the airframe has no rotor constants.
@@ -86,7 +86,7 @@ def reaction_time(airframe: Airframe) -> float:
     return float(np.mean(airframe.value("rotors.inertia") * RPM_TO_RAD_S / (k1 + 2 * k2 * hover)))
 
 
-def precession(airframe: Airframe) -> float:
+def precession_rate(airframe: Airframe) -> float:
     """Return the angular acceleration about x or y that rotors exert in hover per rate about the other axis, 1/s.
 
     It is their net angular momentum over the smaller inertia: zero where as many rotors turn one way as the other.
@@ -96,10 +96,10 @@ def precession(airframe: Airframe) -> float:
     return float(abs(momentum) / np.min(np.diag(airframe.inertia)[:2]))
 
 
-def authority(airframe: Airframe) -> np.ndarray:
+def max_ang_acc(airframe: Airframe) -> np.ndarray:
     """Return the angular acceleration that the rotors can give about each axis, either way, rad/s^2. (3,)
 
-    Roll and pitch may lower the collective thrust from that of hover, as ``prioritized_thrusts`` does, yaw may not.
+    Roll and pitch may lower the collective thrust below hover, as ``prioritized_thrusts`` does, yaw may not.
 
     Raises:
         ConfigError: If the airframe has no rotor constants.
@@ -121,7 +121,7 @@ def authority(airframe: Airframe) -> np.ndarray:
 
 def turn_rates(airframe: Airframe) -> np.ndarray:
     """Return the largest ratio of attitude gain to damping whose turns the rotors can stop, 1/s. (3,)"""
-    return np.sqrt(authority(airframe) / ERRORS)
+    return np.sqrt(max_ang_acc(airframe) / STOPPABLE_ERRORS)
 
 
 def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, reacts: bool = True) -> Bandwidth:
@@ -137,7 +137,7 @@ def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, reacts: 
         ConfigError: If the airframe has no rotor constants.
     """
     rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
-    axes = np.minimum(rate * np.array([1.0, 1.0, YAW]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
+    axes = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)
     if reacts:
-        axes[2] = min(axes[2], REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
-    return Bandwidth(float(POSITION * np.min(axes[:2])), ATTITUDE_STIFFNESS * axes**2, axes)
+        axes[2] = min(axes[2], MAX_REACTION * freq / (1 + rotor_rate(airframe) * reaction_time(airframe)))
+    return Bandwidth(float(POSITION_RATE_RATIO * np.min(axes[:2])), ATTITUDE_STIFFNESS * axes**2, axes)

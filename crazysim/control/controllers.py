@@ -6,10 +6,10 @@ import importlib
 from typing import Any
 
 from crazysim.control.protocol import Controller
-from crazysim.control.switch import switch_of
+from crazysim.control.switch import make_switch
 from crazysim.errors import ConfigError, UnknownNameError
 
-DEFAULT = "auto"
+DEFAULT_CONTROLLER = "auto"
 """Name of the default controller."""
 CONTROLLERS = {
     "auto": "crazysim.control.auto:Auto",
@@ -37,7 +37,7 @@ def find_controller(controller: Any, switch: Any = None) -> Controller:
         ConfigError: If it is neither a name nor a controller, or the switch does not fit.
     """
     if isinstance(controller, (list, tuple)):
-        return switch_of([find_controller(each) for each in controller], switch)
+        return make_switch([find_controller(each) for each in controller], switch)
     if switch is not None:
         raise ConfigError(f"expected a list of controllers for a switch, got {controller!r}. Use controller=[...].")
     if isinstance(controller, Controller):

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim.control import attitude, state
-from crazysim.control.attitude import AttitudeParams, attitude2force_torque, body_rate2force_torque
+from crazysim.control import attitude_controller, state_controller
+from crazysim.control.attitude_controller import AttitudeParams, attitude2force_torque, body_rate2force_torque
 from crazysim.control.gains import require_gains
 from crazysim.control.levels import Control
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
-from crazysim.control.state import StateParams, state2attitude
+from crazysim.control.state_controller import StateParams, state2attitude
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, leaf
 
@@ -38,7 +38,7 @@ class AttitudeMemory(PyTree):
 
 
 class CrazyflowState(Controller):
-    """State controller of Crazyflow (``state2attitude``), which ``Crazyflow`` places in front of itself."""
+    """State controller of Crazyflow (``state2attitude``), which ``Crazyflow`` puts in front of itself."""
 
     name: ClassVar[str] = "crazyflow"
     levels: ClassVar[tuple[Control, ...]] = (Control.state,)
@@ -53,14 +53,13 @@ class CrazyflowState(Controller):
         """Return the gains of an airframe.
 
         Raises:
-            ConfigError: If the airframe lacks gains, those of the attitude controller included.
+            ConfigError: If the airframe lacks gains, also of the attitude controller.
         """
-        keys = (*state.KEYS, *(() if self.inner is None else attitude.KEYS))
+        keys = (*state_controller.KEYS, *(() if self.inner is None else attitude_controller.KEYS))
         require_gains(airframe, keys, self.name)
         return StateParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> StateMemory:
-        """Return the memory of one drone before the first tick."""
         return StateMemory(_zeros())
 
     def update(
@@ -101,7 +100,6 @@ class Crazyflow(Controller):
         return AttitudeParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> AttitudeMemory:
-        """Return the memory of one drone before the first tick."""
         return AttitudeMemory(_zeros(), _zeros(), _zeros())
 
     def update(

@@ -26,17 +26,17 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 from crazysim.storage import read_bytes, replacing
 
-VERSION = 1
+INTERFACE_VERSION = 1
 """Version of the interface in ``firmware.h``."""
-LEVELS = (Control.state, Control.attitude, Control.body_rate)
+COMMAND_LEVELS = (Control.state, Control.attitude, Control.body_rate)
 """Command levels by their number in ``firmware.h``."""
-UNITS = ("throttle", "thrust", "rpm")
+MOTOR_UNITS = ("throttle", "thrust", "rpm")
 """Units of motor commands."""
-FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
+LIBRARY_FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
 """Functions of a library that are called from here."""
 MAX_LIBRARY, MAX_MEMORY = 2**28, 2**24
 """Largest library, and largest memory of a drone, bytes."""
-LOADING = 60
+LOADING_TIMEOUT = 60
 """Longest time that loading a library takes, s."""
 N_COMMAND, N_FEEDFORWARD = 16, 8
 """Numbers of a state command and of its feedforward."""
@@ -57,7 +57,7 @@ class CFirmware(Controller):
     """
 
     name: ClassVar[str] = "c_firmware"
-    levels: ClassVar[tuple[Control, ...]] = LEVELS
+    levels: ClassVar[tuple[Control, ...]] = COMMAND_LEVELS
     output: ClassVar[Control] = Control.rotor_vel
     include: ClassVar[Path] = Path(__file__).parent
     """Folder of ``firmware.h``, for the compiler's option ``-I``."""
@@ -76,22 +76,20 @@ class CFirmware(Controller):
         Raises:
             ConfigError: If it cannot be loaded or lacks a function, or the unit does not exist.
         """
-        if self.motors not in UNITS:
-            raise ConfigError(f"expected motors as one of {', '.join(UNITS)}, got {self.motors!r}")
+        if self.motors not in MOTOR_UNITS:
+            raise ConfigError(f"expected motors as one of {', '.join(MOTOR_UNITS)}, got {self.motors!r}")
         _ = self._copy
 
     @functools.cached_property
     def _copy(self) -> str:
         """Path of the copy that is loaded."""
-        return load(self.library)
+        return copy_library(self.library)
 
     def params(self, airframe: Airframe) -> AllocationParams:
-        """Return the limits and curves of the rotors."""
         return AllocationParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> CFirmwareMemory:
-        """Return the memory of a drone at rest, as the library sets it."""
-        library = _opened(self._copy)
+        library = _open_library(self._copy)
         words: Any = np.zeros(-(-library.crazysim_memory_size() // 4) or 1, np.uint32)
         library.crazysim_init(words.ctypes.data)
         return CFirmwareMemory(words)
@@ -99,9 +97,8 @@ class CFirmware(Controller):
     def update(
         self, data: DroneData, command: Any, memory: CFirmwareMemory, params: AllocationParams
     ) -> tuple[Array, CFirmwareMemory]:
-        """Return the rotor speeds that the library commands."""
         s, controls = data.states, data.controls
-        level, n_motors = LEVELS.index(controls.mode), params.allocation_matrix.shape[0]
+        level, n_motors = COMMAND_LEVELS.index(controls.mode), params.allocation_matrix.shape[0]
         if controls.mode == Control.state:
             given, feedforward = controls.state.cmd, controls.state.feedforward
         else:
@@ -112,7 +109,7 @@ class CFirmware(Controller):
         @jax.custom_jvp
         def call(words: Array, row: Array) -> tuple[Array, Array]:
             shapes = (jax.ShapeDtypeStruct(words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32))
-            own = functools.partial(_call, self._copy, level, n_motors)
+            own = functools.partial(_call_library, self._copy, level, n_motors)
             return jax.pure_callback(own, shapes, words, row, vmap_method="broadcast_all")
 
         call.defjvp(self._refuse_derivative)
@@ -134,12 +131,12 @@ class CFirmware(Controller):
         return jnp.where(thrust <= 0, 0.0, rotor_vel_of_thrust(limited, params.rpm2thrust))
 
 
-def _call(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
+def _call_library(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return memories and motor commands after one call of a library for all drones.
 
     Args:
         library: Path of the copy of the library.
-        level: Number of the command level in ``LEVELS``.
+        level: Number of the command level in ``COMMAND_LEVELS``.
         n_motors: Number of motors of a drone.
         words: Memories; the library writes into a copy. (..., n_words)
         inputs: ``struct crazysim_input`` of each drone. (..., n_inputs)
@@ -147,11 +144,11 @@ def _call(library: str, level: int, n_motors: int, words: Any, inputs: Any) -> t
     words, inputs = np.array(words, np.uint32, order="C"), np.ascontiguousarray(inputs, np.float32)
     motors = np.zeros((*inputs.shape[:-1], n_motors), np.float32)
     pointers = words.ctypes.data, level, inputs.ctypes.data, motors.ctypes.data
-    _opened(library).crazysim_update_all(motors.size // n_motors, n_motors, words.strides[-2], *pointers)
+    _open_library(library).crazysim_update_all(motors.size // n_motors, n_motors, words.strides[-2], *pointers)
     return words, motors
 
 
-def load(library: str | Path) -> str:
+def copy_library(library: str | Path) -> str:
     """Load a copy of a library that has its content of now, and return the path of the copy.
 
     Raises:
@@ -162,20 +159,20 @@ def load(library: str | Path) -> str:
         content = read_bytes(path, MAX_LIBRARY)
     except ConfigError as error:
         raise ConfigError(f"expected a shared library at {path}: {error}. {remedy}") from error
-    copy = Path(_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
+    copy = Path(_copies_folder().name) / f"{path.stem}-{hashlib.sha256(content).hexdigest()[:16]}{path.suffix}"
     if not copy.exists():  # a loaded one is never written again
         with replacing(copy) as file:
             file.write(content)
-        if reason := _fault(copy):
+        if reason := _loading_error(copy):
             copy.unlink()
             raise ConfigError(f"expected a shared library at {path}, got one that cannot be loaded: {reason}. {remedy}")
-    loaded = _opened(str(copy))
-    missing = [name for name in FUNCTIONS if not hasattr(loaded, name)]
+    loaded = _open_library(str(copy))
+    missing = [name for name in LIBRARY_FUNCTIONS if not hasattr(loaded, name)]
     if missing:
-        needed, lacking = ", ".join(FUNCTIONS), ", ".join(missing)
+        needed, lacking = ", ".join(LIBRARY_FUNCTIONS), ", ".join(missing)
         raise ConfigError(f"expected the functions {needed} in {path}, got no {lacking}. {remedy}")
-    if (version := loaded.crazysim_version()) != VERSION:
-        raise ConfigError(f"expected version {VERSION} of firmware.h in {path}, got {version}. {remedy}")
+    if (version := loaded.crazysim_version()) != INTERFACE_VERSION:
+        raise ConfigError(f"expected version {INTERFACE_VERSION} of firmware.h in {path}, got {version}. {remedy}")
     pointer, integer, size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
     loaded.crazysim_memory_size.restype = size
     if (needed := loaded.crazysim_memory_size()) > MAX_MEMORY:
@@ -189,26 +186,26 @@ def load(library: str | Path) -> str:
     return str(copy)
 
 
-def _fault(library: Path) -> str:
+def _loading_error(library: Path) -> str:
     """Return the reason why a library cannot be loaded, empty if it can.
 
     A process of its own tries it, because the system kills a process that loads a truncated library.
     """
     command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LOADING, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LOADING_TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
-        return f"it takes over {LOADING} s"
+        return f"it takes over {LOADING_TIMEOUT} s"
     if done.returncode < 0:
         return f"it ends the process with {signal.Signals(-done.returncode).name}"
     return (done.stderr.strip().splitlines() or ["unknown"])[-1] if done.returncode else ""
 
 
-_opened = functools.cache(ctypes.CDLL)
+_open_library = functools.cache(ctypes.CDLL)
 """Open a library by its path, once: the types of its functions stay."""
 
 
 @functools.cache
-def _folder() -> tempfile.TemporaryDirectory[str]:
+def _copies_folder() -> tempfile.TemporaryDirectory[str]:
     """Return the folder of the copies of this process."""
     return tempfile.TemporaryDirectory(prefix="crazysim-", ignore_cleanup_errors=True)

@@ -13,13 +13,13 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
-HORIZONTAL = 0.05
+MIN_HEADING_SINE = 0.05
 """Sine of the angle between thrust and heading below which the yaw rate that holds the heading is limited.
 
 Below 3 degrees the heading does not determine the attitude, and the rate that holds it grows without bound.
 """
 
-NO_THRUST = 1e-3
+MIN_THRUST = 1e-3
 """Thrust over mass below which its direction counts as undefined, m/s^2: a ten-thousandth of hover."""
 
 
@@ -94,8 +94,8 @@ def attitude_of_thrust(
 
         w_z x.c = w_x z.c + yaw' y.l
 
-    A thrust below ``NO_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y is
-    the horizontal ``l``, and the rate about z is limited (``HORIZONTAL``).
+    A thrust below ``MIN_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y
+    is the horizontal ``l``, and the rate about z is limited (``MIN_HEADING_SINE``).
 
     Args:
         thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
@@ -106,12 +106,12 @@ def attitude_of_thrust(
         yaw_acc: Its second derivative, rad/s^2. (..., 1)
     """
     ahead, left = rotation.level_axes(yaw)
-    z, z_rate, z_acc = direction_of(thrust, thrust_rate, thrust_acc)
+    z, z_rate, z_acc = thrust_direction(thrust, thrust_rate, thrust_acc)
     across = cross(z, ahead)
     y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
     x = rotation.safe_normalize(cross(y, z), ahead)  # exactly one unless thrust and heading are parallel
 
-    x_ahead = jnp.maximum(dot(x, ahead), HORIZONTAL)
+    x_ahead = jnp.maximum(dot(x, ahead), MIN_HEADING_SINE)
     z_ahead, y_left, x_left, z_left = dot(z, ahead), dot(y, left), dot(x, left), dot(z, left)
     wx, wy = -dot(y, z_rate), dot(x, z_rate)
     wz = (wx * z_ahead + yaw_rate * y_left) / x_ahead
@@ -122,8 +122,8 @@ def attitude_of_thrust(
     return Attitude(jnp.stack([x, y, z], axis=-1), ang_vel, ang_acc)
 
 
-def direction_of(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[Array, Array, Array]:
-    """Return the unit vector along a vector, and its first two derivatives; e_z at rest below ``NO_THRUST``.
+def thrust_direction(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[Array, Array, Array]:
+    """Return the unit vector along a vector, and its first two derivatives; e_z at rest below ``MIN_THRUST``.
 
     Args:
         thrust: Vector, m/s^2. (..., 3)
@@ -133,7 +133,7 @@ def direction_of(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[
     Returns:
         Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
     """
-    falls = dot(thrust, thrust) < NO_THRUST**2
+    falls = dot(thrust, thrust) < MIN_THRUST**2
     inverse = jnp.where(falls, 0.0, 1 / rotation.safe_norm(jnp.where(falls, 1.0, thrust)))
     z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
     growth = dot(z, thrust_rate) * inverse

@@ -14,7 +14,7 @@ from crazysim.control.flatness import Attitude, attitude_of_thrust
 from crazysim.control.levels import Control
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
-from crazysim.control.rigid_body import RigidBodyParams, rigid_body
+from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
@@ -26,8 +26,8 @@ Gains = Literal["bandwidth", "airframe"]
 """Rule for the gains: by bandwidth, or from the airframe's table ``[geometric]``."""
 
 
-INTEGRAL = 0.5
-"""Largest acceleration by the integral of the position error, along an axis, over that of gravity, 1."""
+MAX_INTEGRAL_RATIO = 0.5
+"""Largest acceleration by the integral of the position error along an axis, over gravity, 1."""
 
 
 class GeometricMemory(PyTree):
@@ -66,14 +66,14 @@ class GeometricParams(RigidBodyParams):
         if gains == "airframe":
             table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
         else:
-            table = gains_of(airframe, bandwidth(airframe, freq))
+            table = bandwidth_gains(airframe, bandwidth(airframe, freq))
         return GeometricParams(
-            **rigid_body(airframe),
+            **rigid_body_params(airframe),
             **{key: as_parameter(np.broadcast_to(value, (3,))) for key, value in table.items()},
         )
 
 
-def gains_of(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
+def bandwidth_gains(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
     """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` that give an airframe the rates of a bandwidth."""
     mass, moments = airframe.value("rigid_body.mass", ()), np.diag(airframe.inertia)
     return {
@@ -113,7 +113,7 @@ def geometric_control(
         params: Gains, shared or with the leading axes of the state.
         feedforward: False for the law of AIMotionLab-Virtual, in which acceleration, jerk, snap, yaw rates and drag
             are not fed forward.
-        integral: Acceleration that is added to that of the errors, world frame, m/s^2; None for none. (..., 3)
+        integral: Acceleration that is added to the feedback, world frame, m/s^2; None for none. (..., 3)
 
     Returns:
         Collective thrust, N, and body torque, N m. (..., 4)
@@ -199,7 +199,7 @@ class Geometric(Controller):
     integral: float = 0.0
     """Rate at which the integral of the position error takes up a constant force, 1/s: its gain over that on the
     position, per axis. 0 for none, and no memory. Without delays the loop is stable below the ratio of ``kv`` to the
-    mass. Errors that alone would require more than ``INTEGRAL`` are left out."""
+    mass. Errors that alone would require more than ``MAX_INTEGRAL_RATIO`` are left out."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
         """Return gains and constants for an airframe.
@@ -212,14 +212,12 @@ class Geometric(Controller):
         return GeometricParams.create(airframe, self.freq, self.gains)
 
     def memory(self, airframe: Airframe) -> GeometricMemory | None:
-        """Return the memory before the first tick; None without an integral."""
         return GeometricMemory(as_parameter(np.zeros(3))) if self.integral else None
 
     def update(self, data: DroneData, command: Any, memory: Any, params: GeometricParams) -> tuple[Array, Any]:
-        """Return the wrench, and the memory."""
         s = data.states
         if self.integral:
-            limit = -INTEGRAL * GRAVITY[2]
+            limit = -MAX_INTEGRAL_RATIO * GRAVITY[2]
             acc = params.kr * (command.pos - s.pos) / params.mass
             acc = jnp.where(jnp.abs(acc) < limit, acc, 0.0)  # Farther away, the drone approaches: no disturbance.
             memory = GeometricMemory(safe_clip(memory.acc + self.integral / self.freq * acc, -limit, limit))

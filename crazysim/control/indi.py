@@ -13,22 +13,22 @@ from crazysim import rotation
 from crazysim.control.allocation import force_torque2rotor_vel, wrench_matrix
 from crazysim.control.bandwidth import bandwidth, fastest_rotor_rate, reaction_time, rotor_rate
 from crazysim.control.flatness import attitude_of_thrust
-from crazysim.control.geometric import GeometricParams, attitude_errors, gains_of
+from crazysim.control.geometric import GeometricParams, attitude_errors, bandwidth_gains
 from crazysim.control.levels import Control
 from crazysim.control.low_pass import butterworth
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
-from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
-LEAD = 2.0
+ROTOR_LEAD = 2.0
 """Factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
 
-STEP = 0.5
+MAX_FEEDBACK_STEP = 0.5
 """Largest part of the missing rotor speed that the feedback adds in one tick of the controller, 1."""
 DISTURBANCE_MAX = 5.0
 """Largest acceleration by a disturbance that is compensated along an axis, m/s^2: half of the weight."""
@@ -56,7 +56,7 @@ class INDIParams(PyTree):
     def create(airframe: Airframe, freq: int, cutoff: float) -> INDIParams:
         """Return the shared parameters of an airframe.
 
-        The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``LEAD`` times as fast.
+        The gains follow the rule of ``crazysim.control.bandwidth`` for rotors that are ``ROTOR_LEAD`` times as fast.
 
         Args:
             airframe: The airframe.
@@ -70,8 +70,8 @@ class INDIParams(PyTree):
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
         params = GeometricParams.create(airframe, freq)
         lag, reaction = rotor_rate(airframe), reaction_time(airframe)
-        lead = max(min(LEAD, STEP * freq / fastest_rotor_rate(airframe)), 1.0)
-        gains = gains_of(airframe, bandwidth(airframe, freq, lead * lag, reacts=False))
+        lead = max(min(ROTOR_LEAD, MAX_FEEDBACK_STEP * freq / fastest_rotor_rate(airframe)), 1.0)
+        gains = bandwidth_gains(airframe, bandwidth(airframe, freq, lead * lag, reacts=False))
         return INDIParams(
             geometric=params.replace(**{key: as_parameter(np.broadcast_to(x, (3,))) for key, x in gains.items()}),
             mixing_matrix=as_parameter(wrench_matrix(airframe)),
@@ -100,7 +100,7 @@ class INDIMemory(PyTree):
         return INDIMemory(*(as_parameter(np.zeros(n)) for n in (3, 3, 24, 1)))
 
 
-def filtered(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
+def apply_filter(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]:
     """Return signals after a filter of order 2, and the filter's new states (direct form II transposed).
 
     Args:
@@ -115,7 +115,7 @@ def filtered(x: Array, state: Array, coefficients: Array) -> tuple[Array, Array]
     return y, jnp.concatenate([2 * b0 * x - a1 * y + second, b0 * x - a2 * y], axis=-1)
 
 
-def steady(x: Array, coefficients: Array) -> Array:
+def steady_filter_states(x: Array, coefficients: Array) -> Array:
     """Return the states of a filter whose signals have always been ``x``. (..., n) -> (..., 2 n)"""
     b0, a1, a2 = (coefficients[..., i : i + 1] for i in range(3))
     return jnp.concatenate([(3 * b0 - a1 - a2) * x, (b0 - a2) * x], axis=-1)
@@ -135,8 +135,8 @@ def indi_control(
 ) -> tuple[Array, INDIMemory]:
     """Return the rotor speeds that track a setpoint under unknown forces and torques, and the memory.
 
-    The loops are those of ``geometric_control``. Its models of force and torque are replaced by increments on what the
-    rotors exert at present (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
+    The loops are the same as in ``geometric_control``. Its models of force and torque are replaced by increments on
+    what the rotors exert at present (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
 
         f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
 
@@ -165,7 +165,7 @@ def indi_control(
     """
     p, sp, allocation = params.geometric, setpoint, params.geometric.allocation
     matrix = rotation.matrix(quat)
-    wrench = matvec(params.mixing_matrix, curve(rotor_vel, allocation.rpm2thrust))
+    wrench = matvec(params.mixing_matrix, quadratic_curve(rotor_vel, allocation.rpm2thrust))
     push = matrix[..., 2] * wrench[..., :1] / p.mass
     fresh = memory.started == 0
     yaw = wrench[..., 3:]
@@ -175,8 +175,8 @@ def indi_control(
     turn = jnp.where(fresh, known, (total - memory.momentum) * freq)
     acc = jnp.where(fresh, push + p.gravity_vec, (vel - memory.vel) * freq)
     signals = jnp.concatenate([acc, push, turn, wrench[..., 1:]], axis=-1)
-    state = jnp.where(fresh, steady(signals, params.filter), memory.filter)
-    signals, state = filtered(signals, state, params.filter)
+    state = jnp.where(fresh, steady_filter_states(signals, params.filter), memory.filter)
+    signals, state = apply_filter(signals, state, params.filter)
     acc, push, turn, torque = (signals[..., i : i + 3] for i in (0, 3, 6, 9))
 
     feedback = -(p.kr * (pos - sp.pos) + p.kv * (vel - sp.vel)) / p.mass
@@ -209,21 +209,18 @@ class INDI(Controller):
     """Cutoff frequency of the filter, Hz."""
 
     def params(self, airframe: Airframe) -> INDIParams:
-        """Return gains and constants for an airframe."""
         return INDIParams.create(airframe, self.freq, self.cutoff)
 
     def memory(self, airframe: Airframe) -> INDIMemory:
-        """Return the memory before the first tick."""
         return INDIMemory.at_rest()
 
     def take_over(
         self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
     ) -> INDIMemory:
-        """Return the memory before the first tick, since the remembered velocities are not those of the last tick."""
+        """Return the memory before the first tick, since the remembered velocities are older than the last tick."""
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:
-        """Return the rotor speeds."""
         s = data.states
         state = (s.pos, s.quat, s.vel, s.ang_vel, s.rotor_vel)
         return indi_control(*state, command, memory, self.freq, params=params)

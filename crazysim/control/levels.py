@@ -42,13 +42,13 @@ def command_size(control: Control, n_rotors: int) -> int:
     return {Control.state: 16, Control.rotor_vel: n_rotors}.get(control, 4)
 
 
-def number_of(rotors: Array | None, n: int) -> Array | int:
+def count_rotors(rotors: Array | None, n: int) -> Array | int:
     """Return the number of rotors of a drone, (..., 1), by the mask of those it has; ``n`` where there is no mask."""
     return n if rotors is None else jnp.sum(jnp.where(rotors, 1.0, 0.0), axis=-1, keepdims=True)
 
 
-def where_present(rotors: Array | None, x: Array, missing: float) -> Array:
-    """Return numbers of rotors, another one for those that a drone of several kinds lacks. (..., n_rotors)"""
+def mask_rotors(rotors: Array | None, x: Array, missing: float) -> Array:
+    """Return values of rotors, with ``missing`` for rotors that a drone lacks. (..., n_rotors)"""
     return x if rotors is None else jnp.where(rotors, x, missing)
 
 

@@ -10,14 +10,14 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim import rotation
-from crazysim.control.flatness import attitude_of_thrust, direction_of
+from crazysim.control.flatness import attitude_of_thrust, thrust_direction
 from crazysim.control.levels import Control
-from crazysim.control.linear import linearize, load_derivative, rod_angles
-from crazysim.control.lqr import Reference, into_heading, solve_on_host, state_error, weights_of
+from crazysim.control.linear_models import linearize, load_derivative, rod_angles
+from crazysim.control.lqr import Reference, lqr_weights, solve_on_host, state_error, to_heading_frame
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import gain_discrete
-from crazysim.control.rigid_body import RigidBodyParams, rigid_body
+from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
@@ -25,7 +25,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import cross, dot, matvec
 
-Target = Literal["load", "drone"]
+SetpointBody = Literal["load", "drone"]
 """Body that a setpoint describes."""
 
 ROD_JERK_MAX = 500.0
@@ -63,8 +63,8 @@ class LoadLQRParams(RigidBodyParams):
             load_mass: Mass of the load, kg.
             length: Length of the rod, m.
             Q: Weights of position, velocity, roll, pitch, yaw, body rates, rod angles and their rates, (16,) or
-                (16, 16); None for those of ``weights_of``.
-            R: Weights of collective thrust and torque (4,) or (4, 4); None for those of ``weights_of``.
+                (16, 16); None for ``lqr_weights``.
+            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
             attach: Joint of the rod, from the centre of mass, body frame, m. (3,)
 
         Raises:
@@ -82,11 +82,11 @@ class LoadLQRParams(RigidBodyParams):
                 f"expected attach as three finite numbers, m, got {attach!r}. Use LoadLQR(attach=(0.0, 0.0, -0.02))."
             )
         mass, inertia = airframe.value("rigid_body.mass"), airframe.inertia
-        Q, R = weights_of(airframe, freq, Q, R, load_mass, length)
+        Q, R = lqr_weights(airframe, freq, Q, R, load_mass, length)
         off_centre = [joint] if np.any(joint) else []
         gain = solve_on_host(load_gain, mass, inertia, [load_mass], [length], 1 / freq, Q, R, *off_centre)
         return LoadLQRParams(
-            **rigid_body(airframe),
+            **rigid_body_params(airframe),
             load_mass=as_parameter(load_mass),
             length=as_parameter(length),
             gain=as_parameter(gain),
@@ -106,7 +106,7 @@ def load_gain(
 ) -> Array:
     """Return the gain of the discrete LQR about hover with a load, or NaN if there is none; pure and differentiable.
 
-    The model is that of ``load_derivative``, discretised by ``A_d = I + dt A``, ``B_d = dt B``.
+    The model is ``load_derivative``, discretised by ``A_d = I + dt A``, ``B_d = dt B``.
 
     Args:
         mass: Mass of the drone, kg. (1,)
@@ -153,14 +153,14 @@ def load_reference(
         Reference of the drone; direction of the rod from drone to load (..., 3); its derivative, 1/s (..., 3).
     """
     p, sp = params, setpoint
-    up, up_rate, up_acc = direction_of(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
+    up, up_rate, up_acc = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
     vel, total = sp.vel + p.length * up_rate, p.mass + p.load_mass
     force = total * (sp.acc - p.gravity_vec) + p.mass * p.length * up_acc - matvec(p.drag_matrix, vel)
     rate = total * sp.jerk - (0.0 if rod_jerk is None else p.mass * p.length * rod_jerk)
     rate = rate - matvec(p.drag_matrix, sp.acc + p.length * up_acc)
     reference = _reference(sp.pos + p.length * up, vel, force, rate, sp, p)
     if p.attach is not None:
-        arm, moving = _joint(reference.matrix, reference.ang_vel, p.attach)
+        arm, moving = _joint_motion(reference.matrix, reference.ang_vel, p.attach)
         reference = reference._replace(pos=reference.pos - arm, vel=reference.vel - moving)
     return reference, -up, -up_rate
 
@@ -176,14 +176,14 @@ def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Refere
         As ``load_reference``.
     """
     p, sp = params, setpoint
-    up, up_rate, _ = direction_of(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
+    up, up_rate, _ = thrust_direction(sp.acc - p.gravity_vec, sp.jerk, sp.snap)
     total = p.mass + p.load_mass
     force = total * (sp.acc - p.gravity_vec) - matvec(p.drag_matrix, sp.vel)
     rate = total * sp.jerk - matvec(p.drag_matrix, sp.acc)
     return _reference(sp.pos, sp.vel, force, rate, sp, p), -up, -up_rate
 
 
-def _joint(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, Array]:
+def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, Array]:
     """Return the joint of the rod from the centre of mass, m, and its velocity relative to that, m/s. (..., 3) each"""
     attach = jnp.broadcast_to(attach, ang_vel.shape)
     return matvec(matrix, attach), matvec(matrix, cross(ang_vel, attach))
@@ -214,7 +214,7 @@ def load_lqr_control(
     setpoint: Setpoint,
     *,
     params: LoadLQRParams,
-    target: Target = "load",
+    target: SetpointBody = "load",
     rod_jerk: Array | None = None,
 ) -> Array:
     """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feed-forward.
@@ -242,7 +242,7 @@ def load_lqr_control(
         reference, rod, rod_rate = load_reference(setpoint, p, rod_jerk)
     else:
         reference, rod, rod_rate = hanging_reference(setpoint, p)
-    rods = [into_heading(x, setpoint.yaw) for x in (direction, direction_rate, rod, rod_rate)]
+    rods = [to_heading_frame(x, setpoint.yaw) for x in (direction, direction_rate, rod, rod_rate)]
     angles, rates = rod_angles(rods[0], rods[1])
     angles_ref, rates_ref = rod_angles(rods[2], rods[3])
     error = state_error(pos, quat, vel, ang_vel, reference, setpoint.yaw)
@@ -273,7 +273,7 @@ class LoadLQR(Controller):
     """Length of the rod, m."""
     attach: ArrayLike = (0.0, 0.0, 0.0)
     """Joint of the rod, from the centre of mass, body frame, m: the ``attach`` of the load's plugin. (3,)"""
-    target: Target = "load"
+    target: SetpointBody = "load"
     """Body that setpoints describe."""
     load: str = "load"
     """Name of the plugin of the load, whose record has ``tip_pos`` and ``tip_vel`` of a hook, or else ``pos`` and
@@ -284,17 +284,15 @@ class LoadLQR(Controller):
     """Weights of the inputs, as for ``LoadLQRParams.create``."""
 
     def params(self, airframe: Airframe) -> LoadLQRParams:
-        """Return gain and constants for an airframe."""
         return LoadLQRParams.create(airframe, self.freq, self.load_mass, self.length, self.Q, self.R, self.attach)
 
     def memory(self, airframe: Airframe) -> LoadLQRMemory:
-        """Return the memory before the first tick."""
         return LoadLQRMemory(as_parameter(np.zeros(3)), as_parameter(0.0))
 
     def take_over(
         self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
     ) -> LoadLQRMemory:
-        """Return the memory before the first tick, since the remembered derivative is not that of the last tick."""
+        """Return the memory before the first tick, since the remembered derivative is older than the last tick."""
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(
@@ -315,12 +313,12 @@ class LoadLQR(Controller):
         tip_pos, tip_vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
         offset, rate = tip_pos - s.pos, tip_vel - s.vel
         if params.attach is not None:
-            arm, moving = _joint(rotation.matrix(s.quat), s.ang_vel, params.attach)
+            arm, moving = _joint_motion(rotation.matrix(s.quat), s.ang_vel, params.attach)
             offset, rate = offset - arm, rate - moving
         distance = jnp.maximum(rotation.safe_norm(offset), 1e-3)
         direction = offset / distance
         turning = (rate - dot(direction, rate) * direction) / distance
-        rod_acc = -direction_of(command.acc - params.gravity_vec, command.jerk, command.snap)[2]
+        rod_acc = -thrust_direction(command.acc - params.gravity_vec, command.jerk, command.snap)[2]
         rod_jerk = memory.started * (rod_acc - memory.rod_acc) * self.freq
         wrench = load_lqr_control(
             *(s.pos, s.quat, s.vel, s.ang_vel, direction, turning, command),

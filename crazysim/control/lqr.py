@@ -15,11 +15,11 @@ from crazysim import rotation
 from crazysim.control.bandwidth import bandwidth
 from crazysim.control.flatness import attitude_of_thrust
 from crazysim.control.levels import Control
-from crazysim.control.linear import drone_derivative, linearize
+from crazysim.control.linear_models import drone_derivative, linearize
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import check_gain, gain_continuous
-from crazysim.control.rigid_body import RigidBodyParams, rigid_body
+from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
@@ -43,20 +43,20 @@ class LQRParams(RigidBodyParams):
             airframe: The airframe.
             freq: Rate of the controller, Hz, which enters the default weights.
             Q: Weights of position, velocity, roll, pitch, yaw and body rates, a diagonal (12,) or a matrix (12, 12);
-                None for those of ``weights_of``.
-            R: Weights of collective thrust and torque (4,) or (4, 4); None for those of ``weights_of``.
+                None for ``lqr_weights``.
+            R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
 
         Raises:
             ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
         """
-        Q, R = weights_of(airframe, freq, Q, R)
+        Q, R = lqr_weights(airframe, freq, Q, R)
         return LQRParams(
-            **rigid_body(airframe),
+            **rigid_body_params(airframe),
             gain=as_parameter(solve_on_host(hover_gain, airframe.value("rigid_body.mass"), airframe.inertia, Q, R)),
         )
 
 
-def weights_of(
+def lqr_weights(
     airframe: Airframe,
     freq: int,
     Q: ArrayLike | None,
@@ -64,7 +64,7 @@ def weights_of(
     load_mass: float = 0.0,
     length: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights Q (n, n) and R (4, 4): as given, or else those that suit an airframe's bandwidth.
+    """Return the weights Q (n, n) and R (4, 4): as given, or suited to an airframe's bandwidth.
 
     Bryson's rule: each weight is one over the square of an acceptable error. An error of position of 1 m counts as
     much as the velocity, the tilt, the body rates, the thrust and the torque that the rule of
@@ -75,8 +75,8 @@ def weights_of(
     Args:
         airframe: The airframe.
         freq: Rate of the controller, Hz.
-        Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for those of the rule.
-        R: Weights of the inputs: a diagonal or a matrix; None for those of the rule.
+        Q: Weights of the n = 12 states, or 16 with a load: a diagonal or a matrix; None for the rule.
+        R: Weights of the inputs: a diagonal or a matrix; None for the rule.
         load_mass: Mass of the load, kg.
         length: Length of its rod, m; None without a load.
 
@@ -90,14 +90,14 @@ def weights_of(
     errors = np.concatenate([np.ones(3), np.full(3, w), np.full(3, tilt), np.full(3, tilt * w), angle])
     inputs = np.array([(mass + load_mass) * w**2, *(moments * rates.stiffness * tilt)])
     Q, R = errors**-2 if Q is None else Q, inputs**-2 if R is None else R
-    return as_weights("Q", Q, len(errors)), as_weights("R", R, 4)
+    return weight_matrix("Q", Q, len(errors)), weight_matrix("R", R, 4)
 
 
-def as_weights(name: str, weights: ArrayLike, n: int) -> np.ndarray:
+def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     """Return weights as a matrix (n, n) of float64.
 
     Args:
-        name: ``"Q"`` for weights of states, which may be zero, or ``"R"`` for those of inputs, which may not.
+        name: ``"Q"`` for weights of states, which may be zero, or ``"R"`` for weights of inputs, which may not.
         weights: A diagonal (n,) or a symmetric matrix (n, n).
         n: Number of states or inputs.
 
@@ -166,7 +166,7 @@ class Reference(NamedTuple):
     """Collective thrust, N, and body torque, N m. (..., 4)"""
 
 
-def reference_of(setpoint: Setpoint, params: RigidBodyParams) -> Reference:
+def flat_reference(setpoint: Setpoint, params: RigidBodyParams) -> Reference:
     """Return the reference of a setpoint, from flatness, with the drag of a level drone compensated.
 
     Args:
@@ -208,11 +208,11 @@ def state_error(
     rate_error = ang_vel - matvec(to_body, matvec(reference.matrix, reference.ang_vel))
     errors = [pos - reference.pos, vel - reference.vel]
     if yaw is not None:
-        errors = [into_heading(error, yaw) for error in errors]
+        errors = [to_heading_frame(error, yaw) for error in errors]
     return jnp.concatenate([*errors, rotation_error, rate_error], axis=-1)
 
 
-def into_heading(vector: Array, yaw: Array) -> Array:
+def to_heading_frame(vector: Array, yaw: Array) -> Array:
     """Return a world vector in the frame that is turned by the yaw about z. (..., 3)"""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = vector[..., :1], vector[..., 1:2], vector[..., 2:]
@@ -223,7 +223,7 @@ def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: S
     """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feed-forward.
 
     ``u = u_ref - K e``. Errors of position and velocity are taken in the frame of the desired heading, so that one gain
-    serves every yaw, and reference attitude, rates and wrench come from flatness (``reference_of``).
+    serves every yaw, and reference attitude, rates and wrench come from flatness (``flat_reference``).
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -236,7 +236,7 @@ def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: S
     Returns:
         Collective thrust, N, and body torque, N m, within the limits of the rotors. (..., 4)
     """
-    reference = reference_of(setpoint, params)
+    reference = flat_reference(setpoint, params)
     error = state_error(pos, quat, vel, ang_vel, reference, setpoint.yaw)
     return prioritized_wrench(reference.wrench - matvec(params.gain, error), params=params.allocation)
 
@@ -255,10 +255,8 @@ class LQR(Controller):
     """Weights of the inputs, as for ``LQRParams.create``."""
 
     def params(self, airframe: Airframe) -> LQRParams:
-        """Return gain and constants for an airframe."""
         return LQRParams.create(airframe, self.freq, self.Q, self.R)
 
     def update(self, data: DroneData, command: Any, memory: Any, params: LQRParams) -> tuple[Array, Any]:
-        """Return the wrench."""
         s = data.states
         return lqr_control(s.pos, s.quat, s.vel, s.ang_vel, command, params=params), memory

@@ -178,7 +178,6 @@ class Mellinger(Controller):
         return MellingerParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> MellingerMemory:
-        """Return the memory of one drone before the first tick."""
         return MellingerMemory.at_rest()
 
     def update(
@@ -210,11 +209,13 @@ class Mellinger(Controller):
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         _, _, _, force = self._command(data, command, rest, p)
         wanted = thrust / p.mass_thrust * rotation.z_axis(s.quat)
-        integral = safe_clip(_over(wanted - force, p.ki), -p.integral_max, p.integral_max)
+        integral = safe_clip(_divide_by_gain(wanted - force, p.ki), -p.integral_max, p.integral_max)
         integral = integral if isinstance(command, Setpoint) else zero
         rest = rest.replace(integral=integral)
         _, out, _, _ = self._command(data, command, rest, p)
-        return rest.replace(integral_m=safe_clip(_over(torque - out, p.ki_m), -p.integral_m_max, p.integral_m_max))
+        return rest.replace(
+            integral_m=safe_clip(_divide_by_gain(torque - out, p.ki_m), -p.integral_m_max, p.integral_m_max)
+        )
 
     def _command(
         self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
@@ -235,13 +236,13 @@ class Mellinger(Controller):
 
 
 def _desired_rates(data: DroneData, command: Setpoint | Array) -> Array:
-    """Return the desired body rates, rad/s: those of a full-state setpoint, otherwise zero. (3,)"""
+    """Return the desired body rates of a full-state setpoint, rad/s, otherwise zero. (3,)"""
     if isinstance(command, Setpoint):
         return data.controls.state.cmd[13:16]
     return jnp.zeros_like(data.states.ang_vel)
 
 
-def _over(x: Array, gain: Array) -> Array:
+def _divide_by_gain(x: Array, gain: Array) -> Array:
     """Return ``x / gain``, and zero where the gain is zero. (...)"""
     return jnp.where(gain == 0, 0.0, x / jnp.where(gain == 0, 1.0, gain))
 

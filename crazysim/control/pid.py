@@ -15,21 +15,21 @@ from crazysim.control.pid_cascade import (
     THRUST_SCALE,
     PIDMemory,
     PIDParams,
-    along_heading,
-    attitude_of_velocity,
-    heading_of,
-    rates_of_attitude,
-    torque_of_rates,
-    velocity_of_position,
-    wrapped_angle,
+    desired_attitude,
+    desired_rates,
+    desired_torque,
+    desired_velocity,
+    heading_vector,
+    to_heading_frame,
+    wrap_degrees,
 )
-from crazysim.control.pid_loop import LoopMemory, continued, pid_step
+from crazysim.control.pid_loop import PIDLoopMemory, continue_integral, pid_step
 from crazysim.control.power_distribution import command_of_rotor_vel, distribute, pwm_of_thrust, rotor_vel_of_pwm
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 
-DEGREES = 180 / np.pi
+DEGREES_PER_RADIAN = 180 / np.pi
 
 
 class PID(Controller):
@@ -63,18 +63,16 @@ class PID(Controller):
         return PIDParams.create(airframe, self.outer_freq, self.freq)
 
     def memory(self, airframe: Airframe) -> PIDMemory:
-        """Return the memory of one drone before the first tick."""
         return PIDMemory.at_rest(self.params(airframe))
 
     def outer(self, data: DroneData, command: Setpoint, memory: PIDMemory, params: PIDParams) -> PIDMemory:
-        """Return the memory after position and velocity loop, with the desired roll, pitch and thrust."""
-        s, heading = data.states, heading_of(data.states.quat)
+        s, heading = data.states, heading_vector(data.states.quat)
         # In world axes, as in the firmware (positionControllerResetAllPID), whose derivative gain here is zero.
         position = memory.position.started_at(s.pos, memory.started)
-        vel_des, position = velocity_of_position(
+        vel_des, position = desired_velocity(
             s.pos, heading, command.pos, position, self.outer_freq, loop=params.position
         )
-        tilt, thrust, velocity = attitude_of_velocity(
+        tilt, thrust, velocity = desired_attitude(
             s.vel, heading, vel_des, memory.velocity, self.outer_freq, params=params
         )
         rpy_des = jnp.concatenate([tilt, memory.rpy_des[2:]])
@@ -84,10 +82,10 @@ class PID(Controller):
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams
     ) -> tuple[Array, PIDMemory]:
         """Return the rotor speeds, rpm, and the memory after the attitude and rate loops. (n_rotors,)"""
-        rpy, ang_vel = DEGREES * rotation.to_rpy(data.states.quat), DEGREES * data.states.ang_vel
+        rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(data.states.quat), DEGREES_PER_RADIAN * data.states.ang_vel
         thrust = memory.thrust if isinstance(command, Setpoint) else pwm_of_thrust(command[3:], params=params.motors)
         rpy_des, attitude, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
-        torque, rate = torque_of_rates(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
+        torque, rate = desired_torque(ang_vel, ang_vel_des, memory.rate, self.freq, loop=params.rate)
         pwm = distribute(thrust, torque, params=params.motors, whole_numbers=self.whole_numbers)
         rotor_vel = rotor_vel_of_pwm(pwm, params=params.motors)
         after = memory.replace(
@@ -104,46 +102,46 @@ class PID(Controller):
         those of the rate loop at every level the difference of torque.
         """
         s, p, rest = data.states, params, jax.tree.map(jnp.zeros_like, memory)
-        rpy, ang_vel = DEGREES * rotation.to_rpy(s.quat), DEGREES * s.ang_vel
+        rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)
         if isinstance(command, Setpoint):
-            heading = heading_of(s.quat)
-            position = rest.position.started_at(along_heading(heading, s.pos), rest.started)
-            vel_des, _ = velocity_of_position(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
-            measured = along_heading(heading, s.vel)
+            heading = heading_vector(s.quat)
+            position = rest.position.started_at(to_heading_frame(heading, s.pos), rest.started)
+            vel_des, _ = desired_velocity(s.pos, heading, command.pos, position, self.outer_freq, loop=p.position)
+            measured = to_heading_frame(heading, s.vel)
             velocity = rest.velocity.started_at(measured, rest.started)
             out, _ = pid_step(vel_des - measured, measured, velocity, self.outer_freq, loop=p.velocity)
             lift = (thrust - p.thrust_base) / THRUST_SCALE
             wanted = jnp.stack([rpy[1], -rpy[0], lift[0]])
-            velocity = continued(velocity, out, wanted, loop=p.velocity)
+            velocity = continue_integral(velocity, out, wanted, loop=p.velocity)
             rest = rest.replace(position=position, velocity=velocity)
         rest = rest.replace(
             attitude=rest.attitude.started_at(rpy, rest.started), rate=rest.rate.started_at(ang_vel, rest.started)
         )
         started = rest.replace(rpy_des=rpy, thrust=thrust, started=jnp.ones_like(rest.started))
         _, _, ang_vel_des = self._desired_rates(data, command, started, p, rpy)
-        out, _ = torque_of_rates(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
-        return started.replace(rate=continued(started.rate, out, torque, loop=p.rate))
+        out, _ = desired_torque(ang_vel, ang_vel_des, started.rate, self.freq, loop=p.rate)
+        return started.replace(rate=continue_integral(started.rate, out, torque, loop=p.rate))
 
     def _desired_rates(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rpy: Array
-    ) -> tuple[Array, LoopMemory, Array]:
+    ) -> tuple[Array, PIDLoopMemory, Array]:
         """Return the desired angles, degrees, the memory of the attitude loop, and the desired rates, degrees/s."""
         by_rate = data.controls.mode == Control.body_rate
         if by_rate and not self.hold_yaw:
-            return memory.rpy_des, memory.attitude, DEGREES * command[:3]  # type: ignore[index]
+            return memory.rpy_des, memory.attitude, DEGREES_PER_RADIAN * command[:3]  # type: ignore[index]
         if isinstance(command, Setpoint):
-            rpy_des = jnp.concatenate([memory.rpy_des[:2], DEGREES * command.yaw])
+            rpy_des = jnp.concatenate([memory.rpy_des[:2], DEGREES_PER_RADIAN * command.yaw])
         elif by_rate:
-            yaw = jnp.where(memory.started, memory.rpy_des[2:], rpy[2:]) + DEGREES * command[2:3] / self.freq
+            yaw = jnp.where(memory.started, memory.rpy_des[2:], rpy[2:]) + DEGREES_PER_RADIAN * command[2:3] / self.freq
             rpy_des = jnp.concatenate([rpy[:2], yaw])
         else:
-            rpy_des = DEGREES * command[:3]
-        rpy_des = jnp.concatenate([rpy_des[:2], wrapped_angle(rpy_des[2:])])
+            rpy_des = DEGREES_PER_RADIAN * command[:3]
+        rpy_des = jnp.concatenate([rpy_des[:2], wrap_degrees(rpy_des[2:])])
         attitude = memory.attitude.started_at(rpy, memory.started)
-        ang_vel_des, attitude = rates_of_attitude(rpy, rpy_des, attitude, self.freq, loop=params.attitude)
+        ang_vel_des, attitude = desired_rates(rpy, rpy_des, attitude, self.freq, loop=params.attitude)
         if by_rate:
-            ang_vel_des = jnp.concatenate([DEGREES * command[:2], ang_vel_des[2:]])  # type: ignore[index]
+            ang_vel_des = jnp.concatenate([DEGREES_PER_RADIAN * command[:2], ang_vel_des[2:]])  # type: ignore[index]
         return rpy_des, attitude, ang_vel_des
 
 

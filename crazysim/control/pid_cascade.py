@@ -11,7 +11,7 @@ from jax import Array
 from crazysim import rotation
 from crazysim.control import power_distribution
 from crazysim.control.gains import require_gains
-from crazysim.control.pid_loop import Loop, LoopMemory, pid_step
+from crazysim.control.pid_loop import PIDLoop, PIDLoopMemory, pid_step
 from crazysim.control.power_distribution import PowerDistributionParams
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -34,18 +34,18 @@ KEYS = (
 class PIDParams(PyTree):
     """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware."""
 
-    position: Loop
+    position: PIDLoop
     """Position loop, along and across the present yaw, m to m/s."""
-    velocity: Loop
+    velocity: PIDLoop
     """Velocity loop, along and across the present yaw: m/s to pitch and roll, degrees, and thrust, 1000 PWM."""
-    attitude: Loop
+    attitude: PIDLoop
     """Attitude loop, degrees to degrees/s."""
-    rate: Loop
+    rate: PIDLoop
     """Rate loop, degrees/s to PWM."""
     tilt_max: Array = leaf("parameter", 1)
     """Limits of the desired roll and pitch, degrees. (2,)"""
     thrust_base: Array = leaf("parameter", 1, (1,))
-    """Thrust that the velocity loop adds to, about that of hover, PWM. (1,)"""
+    """Thrust that the velocity loop adds to, about the thrust of hover, PWM. (1,)"""
     thrust_min: Array = leaf("parameter", 1, (1,))
     """Minimum thrust of the velocity loop, PWM. (1,)"""
     motors: PowerDistributionParams
@@ -60,10 +60,10 @@ class PIDParams(PyTree):
         """
         require_gains(airframe, KEYS, "pid")
         return PIDParams(
-            position=Loop.create(airframe, "pid.position", outer_freq),
-            velocity=Loop.create(airframe, "pid.velocity", outer_freq),
-            attitude=Loop.create(airframe, "pid.attitude", freq),
-            rate=Loop.create(airframe, "pid.rate", freq),
+            position=PIDLoop.create(airframe, "pid.position", outer_freq),
+            velocity=PIDLoop.create(airframe, "pid.velocity", outer_freq),
+            attitude=PIDLoop.create(airframe, "pid.attitude", freq),
+            rate=PIDLoop.create(airframe, "pid.rate", freq),
             tilt_max=as_parameter(airframe.value("pid.tilt_max", (2,))),
             thrust_base=as_parameter(airframe.value("pid.thrust_base", ())),
             thrust_min=as_parameter(airframe.value("pid.thrust_min", ())),
@@ -74,13 +74,13 @@ class PIDParams(PyTree):
 class PIDMemory(PyTree):
     """Memory of the cascade."""
 
-    position: LoopMemory
+    position: PIDLoopMemory
     """Position loop."""
-    velocity: LoopMemory
+    velocity: PIDLoopMemory
     """Velocity loop."""
-    attitude: LoopMemory
+    attitude: PIDLoopMemory
     """Attitude loop."""
-    rate: LoopMemory
+    rate: PIDLoopMemory
     """Rate loop."""
     rpy_des: Array = leaf("drone", 1)
     """Desired roll, pitch, yaw, degrees. (n_worlds, n_drones, 3)"""
@@ -92,15 +92,15 @@ class PIDMemory(PyTree):
     @staticmethod
     def at_rest(params: PIDParams) -> PIDMemory:
         """Return the memory of one drone before the first tick."""
-        p, rest = params, LoopMemory.at_rest
+        p, rest = params, PIDLoopMemory.at_rest
         zeros: Any = np.zeros(3)
         loops = {name: rest(getattr(p, name)) for name in _LOOPS}
         return PIDMemory(**loops, rpy_des=zeros, thrust=zeros[:1], started=zeros[:1] > 0)
 
 
-def velocity_of_position(
-    pos: Array, heading: Array, pos_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
-) -> tuple[Array, LoopMemory]:
+def desired_velocity(
+    pos: Array, heading: Array, pos_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
+) -> tuple[Array, PIDLoopMemory]:
     """Return the desired velocity, along and across the heading and up, and the memory: the position loop.
 
     Args:
@@ -114,13 +114,13 @@ def velocity_of_position(
     Returns:
         Desired velocity, m/s (..., 3); the memory.
     """
-    error = along_heading(heading, pos_des - pos)
-    return pid_step(error, along_heading(heading, pos), memory, freq, loop=loop)
+    error = to_heading_frame(heading, pos_des - pos)
+    return pid_step(error, to_heading_frame(heading, pos), memory, freq, loop=loop)
 
 
-def attitude_of_velocity(
-    vel: Array, heading: Array, vel_des: Array, memory: LoopMemory, freq: float, *, params: PIDParams
-) -> tuple[Array, Array, LoopMemory]:
+def desired_attitude(
+    vel: Array, heading: Array, vel_des: Array, memory: PIDLoopMemory, freq: float, *, params: PIDParams
+) -> tuple[Array, Array, PIDLoopMemory]:
     """Return the desired roll, pitch and thrust, and the memory: the velocity loop.
 
     Args:
@@ -134,16 +134,16 @@ def attitude_of_velocity(
     Returns:
         Desired roll and pitch, degrees (..., 2); thrust of each motor, PWM (..., 1); the memory.
     """
-    p, measured = params, along_heading(heading, vel)
+    p, measured = params, to_heading_frame(heading, vel)
     out, memory = pid_step(vel_des - measured, measured, memory, freq, loop=p.velocity)
     tilt = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
     thrust = safe_clip(THRUST_SCALE * out[..., 2:] + p.thrust_base, p.thrust_min, p.motors.pwm_max)
     return safe_clip(tilt, -p.tilt_max, p.tilt_max), thrust, memory
 
 
-def rates_of_attitude(
-    rpy: Array, rpy_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
-) -> tuple[Array, LoopMemory]:
+def desired_rates(
+    rpy: Array, rpy_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
+) -> tuple[Array, PIDLoopMemory]:
     """Return the desired body rates, degrees/s, and the memory: the attitude loop, on Euler angles.
 
     Args:
@@ -156,9 +156,9 @@ def rates_of_attitude(
     return pid_step(rpy_des - rpy, rpy, memory, freq, loop=loop, wrapped=(False, False, True))
 
 
-def torque_of_rates(
-    ang_vel: Array, ang_vel_des: Array, memory: LoopMemory, freq: float, *, loop: Loop
-) -> tuple[Array, LoopMemory]:
+def desired_torque(
+    ang_vel: Array, ang_vel_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
+) -> tuple[Array, PIDLoopMemory]:
     """Return the torque that follows body rates, PWM, and the memory: the rate loop.
 
     Args:
@@ -172,7 +172,7 @@ def torque_of_rates(
     return safe_clip(torque, -TORQUE_MAX, TORQUE_MAX), memory
 
 
-def along_heading(heading: Array, vector: Array) -> Array:
+def to_heading_frame(heading: Array, vector: Array) -> Array:
     """Return a world vector along the heading, across it to the left, and up. (..., 3)
 
     Args:
@@ -183,13 +183,13 @@ def along_heading(heading: Array, vector: Array) -> Array:
     return jnp.stack([x * cos + y * sin, y * cos - x * sin, vector[..., 2]], axis=-1)
 
 
-def heading_of(quat: Array) -> Array:
+def heading_vector(quat: Array) -> Array:
     """Return cosine and sine of the yaw of an attitude; one and zero where it points straight up or down. (..., 2)"""
     x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
     ahead = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
     return rotation.safe_normalize(ahead, jnp.asarray([1.0, 0.0], quat.dtype))
 
 
-def wrapped_angle(angle: Array) -> Array:
+def wrap_degrees(angle: Array) -> Array:
     """Return the angles between -180 and 180 degrees. (...)"""
     return angle - 360.0 * jnp.round(angle / 360.0)

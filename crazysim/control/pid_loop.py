@@ -18,7 +18,7 @@ DEFAULT_INTEGRAL_MAX = 5000.0
 """Limit of the integral of a loop without a limit of its own (``DEFAULT_PID_INTEGRATION_LIMIT``)."""
 
 
-class Loop(PyTree):
+class PIDLoop(PyTree):
     """Gains and limits of three PID loops, each shared or one per drone.
 
     A gain that is zero in all three loops is None, and its part of the loop and of the memory is omitted.
@@ -38,7 +38,7 @@ class Loop(PyTree):
     """Coefficients b0, a1, a2 of the filter of the derivative, 1; None for no filter. (3,)"""
 
     @staticmethod
-    def create(airframe: Airframe, path: str, freq: float) -> Loop:
+    def create(airframe: Airframe, path: str, freq: float) -> PIDLoop:
         """Return the loops of a table of an airframe, run at a rate, Hz.
 
         Raises:
@@ -49,7 +49,7 @@ class Loop(PyTree):
         ki, kd = (as_parameter(gains[key]) if np.any(gains[key]) else None for key in ("ki", "kd"))
         limit = airframe.value(f"{path}.integral_max", (3,)) if "integral_max" in table else [DEFAULT_INTEGRAL_MAX] * 3
         filtered = kd is not None and "cutoff" in table
-        return Loop(
+        return PIDLoop(
             kp=as_parameter(gains["kp"]),
             ki=ki,
             kd=kd,
@@ -59,7 +59,7 @@ class Loop(PyTree):
         )
 
 
-class LoopMemory(PyTree):
+class PIDLoopMemory(PyTree):
     """Memory of three PID loops; None where the loops have no such part."""
 
     integral: Any = leaf("drone", 1)
@@ -70,21 +70,21 @@ class LoopMemory(PyTree):
     """The two last internal values of the filter of the derivative. (n_worlds, n_drones, 2, 3)"""
 
     @staticmethod
-    def at_rest(loop: Loop) -> LoopMemory:
+    def at_rest(loop: PIDLoop) -> PIDLoopMemory:
         """Return the memory of one drone before the first tick."""
-        return LoopMemory(
+        return PIDLoopMemory(
             integral=None if loop.ki is None else np.zeros(3),  # type: ignore[arg-type]
             measured=None if loop.kd is None else np.zeros(3),  # type: ignore[arg-type]
             delays=None if loop.low_pass is None else np.zeros((2, 3)),  # type: ignore[arg-type]
         )
 
-    def started_at(self, measured: Array, started: Array) -> LoopMemory:
+    def started_at(self, measured: Array, started: Array) -> PIDLoopMemory:
         """Return the memory in which the last measured values are given ones, where the loop has not started. (3,)"""
         if self.measured is None:
             return self
         return self.replace(measured=jnp.where(started, self.measured, measured))
 
-    def reset_where(self, mask: Array, measured: Array, filters: bool = True) -> LoopMemory:
+    def reset_where(self, mask: Array, measured: Array, filters: bool = True) -> PIDLoopMemory:
         """Return the memory with zero integrals and given last measured values in loops of a mask.
 
         Args:
@@ -92,7 +92,7 @@ class LoopMemory(PyTree):
             measured: Measured values. (3,)
             filters: True to reset the filter of the derivative too.
         """
-        return LoopMemory(
+        return PIDLoopMemory(
             integral=None if self.integral is None else jnp.where(mask, 0.0, self.integral),
             measured=None if self.measured is None else jnp.where(mask, measured, self.measured),
             delays=jnp.where(mask, 0.0, self.delays) if filters and self.delays is not None else self.delays,
@@ -102,15 +102,15 @@ class LoopMemory(PyTree):
 def pid_step(
     error: Array,
     measured: Array,
-    memory: LoopMemory,
+    memory: PIDLoopMemory,
     freq: float,
     *,
-    loop: Loop,
+    loop: PIDLoop,
     wrapped: Sequence[bool] = (False, False, False),
-) -> tuple[Array, LoopMemory]:
+) -> tuple[Array, PIDLoopMemory]:
     """Return the outputs of three PID loops, and their memory after a tick.
 
-    The derivative is that of the measured value, so that a step of the setpoint gives no kick. Integral and output are
+    The derivative is taken of the measured value, so that a step of the setpoint gives no kick. Integral and output are
     limited. Source: ``pidUpdate`` in pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29, without its feedforward of
     the setpoint, whose gains are zero on every platform.
 
@@ -125,13 +125,13 @@ def pid_step(
     Returns:
         Outputs (..., 3); the memory.
     """
-    error = _wrap(error, wrapped)
+    error = _wrap_angle(error, wrapped)
     out = loop.kp * error
     if loop.kd is not None:
-        derivative = _wrap(memory.measured - measured, wrapped) * freq
+        derivative = _wrap_angle(memory.measured - measured, wrapped) * freq
         memory = memory.replace(measured=measured)
         if loop.low_pass is not None:
-            derivative, delays = _filtered(derivative, memory.delays, loop.low_pass)
+            derivative, delays = _low_pass(derivative, memory.delays, loop.low_pass)
             memory = memory.replace(delays=delays)
         out = out + loop.kd * derivative
     if loop.ki is not None:
@@ -142,7 +142,7 @@ def pid_step(
     return (out if loop.output_max is None else safe_clip(out, -loop.output_max, loop.output_max)), memory
 
 
-def continued(memory: LoopMemory, out: Array, wanted: Array, *, loop: Loop) -> LoopMemory:
+def continue_integral(memory: PIDLoopMemory, out: Array, wanted: Array, *, loop: PIDLoop) -> PIDLoopMemory:
     """Return the memory with integrals that turn the outputs of a tick into wanted ones, within their limits.
 
     Args:
@@ -158,7 +158,7 @@ def continued(memory: LoopMemory, out: Array, wanted: Array, *, loop: Loop) -> L
     return memory.replace(integral=safe_clip(memory.integral + missing, -integral_max, integral_max))
 
 
-def _filtered(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
+def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array, Array]:
     """Return the output of the low-pass filter, and its delays after a tick (``lpf2pApply``)."""
     b0, a1, a2 = coefficients[..., 0:1], coefficients[..., 1:2], coefficients[..., 2:3]
     first, second = delays[..., 0, :], delays[..., 1, :]
@@ -166,7 +166,7 @@ def _filtered(sample: Array, delays: Array, coefficients: Array) -> tuple[Array,
     return b0 * (new + 2 * first + second), jnp.stack([new, first], axis=-2)
 
 
-def _wrap(angle: Array, wrapped: Sequence[bool]) -> Array:
+def _wrap_angle(angle: Array, wrapped: Sequence[bool]) -> Array:
     """Return angles beyond 180 degrees one revolution less, and those below -180 degrees one more, where wrapped."""
     if not any(wrapped):
         return angle

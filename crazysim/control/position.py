@@ -13,22 +13,22 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import dot, safe_clip, safe_norm
 
-POSITION = 0.4
+POSITION_RATE_RATIO = 0.4
 """Natural frequency of the position loop times the delay of the loop below it, 1."""
-OBSERVER = 1.5
+OBSERVER_RATE_RATIO = 1.5
 """Rate of the estimate of unknown forces times the same delay, 1."""
-THROTTLE = 0.9
+MAX_THRUST_SHARE = 0.9
 """Part of the largest thrust that the feedback uses, 1; the rest is for the attitude."""
-TILT = 1.0
-"""Largest horizontal acceleration by feedback over that of gravity, 1: a tilt of 45 degrees."""
-FALL = 0.5
-"""Largest downward acceleration by feedback over that of gravity, 1: rotors keep half of their thrust to turn with."""
-UPRIGHT = 0.1
+MAX_HORIZONTAL_RATIO = 1.0
+"""Largest horizontal acceleration by feedback over gravity, 1: a tilt of 45 degrees."""
+MAX_FALL_RATIO = 0.5
+"""Largest downward acceleration by feedback over gravity, 1: rotors keep half of their thrust to turn with."""
+MIN_UPWARD_RATIO = 0.1
 """Upward force of the rotors over the weight that keeps a falling drone upright, 1; idle rotors give twice that."""
-LEAST = 0.1
-"""Least acceleration that the feedback may use over that of gravity, 1, for drones that can hardly lift themselves."""
-DISTURBANCE = 0.5
-"""Largest acceleration by unknown forces that is compensated, along an axis, over that of gravity, 1."""
+MIN_FEEDBACK_RATIO = 0.1
+"""Least acceleration that the feedback may use over gravity, 1, for drones that can hardly lift themselves."""
+MAX_DISTURBANCE_RATIO = 0.5
+"""Largest compensated acceleration by unknown forces along an axis, over gravity, 1."""
 
 
 class PositionParams(PyTree):
@@ -64,17 +64,17 @@ class PositionParams(PyTree):
             ConfigError: If the airframe lacks a value.
         """
         g = -GRAVITY[2]
-        most = THROTTLE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
-        up, down = max(most - g, LEAST * g), FALL * g
-        side = min(TILT * g, np.sqrt(max(most**2 - g**2, (LEAST * g) ** 2)))
-        frequency = POSITION / delay
+        most = MAX_THRUST_SHARE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))
+        up, down = max(most - g, MIN_FEEDBACK_RATIO * g), MAX_FALL_RATIO * g
+        side = min(MAX_HORIZONTAL_RATIO * g, np.sqrt(max(most**2 - g**2, (MIN_FEEDBACK_RATIO * g) ** 2)))
+        frequency = POSITION_RATE_RATIO / delay
         return PositionParams(
             gravity_vec=as_parameter(GRAVITY),
             stiffness=as_parameter(frequency**2),
             damping=as_parameter(2 * frequency),
             reach=as_parameter(2 * np.array([side, min(up, down)]) / frequency**2),
             acc_max=as_parameter([side, up, down]),
-            observer=as_parameter(1 - np.exp(-OBSERVER / delay / freq)),
+            observer=as_parameter(1 - np.exp(-OBSERVER_RATE_RATIO / delay / freq)),
         )
 
 
@@ -104,9 +104,9 @@ def specific_force(
     """Return the specific force that leads to a setpoint, and the memory.
 
     The difference between the velocity and the one expected from the known forces, over one tick, is a measurement of
-    the unknown ones. It is limited (``DISTURBANCE``) and then filtered, so that neither a drone that is held nor one
-    that is moved by hand or by a reset winds the estimate up. A drone at rest is one that the floor holds: forces along
-    the floor are not measured, as they would tilt it further.
+    the unknown ones. It is limited (``MAX_DISTURBANCE_RATIO``) and then filtered, so that the estimate does not wind up
+    while a drone is held, or when it is moved by hand or by a reset. A drone at rest is one that the floor holds:
+    forces along the floor are not measured, as they would tilt it further.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -121,22 +121,22 @@ def specific_force(
         Desired acceleration by all known forces other than gravity, world frame, m/s^2 (..., 3); the memory.
     """
     p = params
-    limit = -DISTURBANCE * GRAVITY[2]
+    limit = -MAX_DISTURBANCE_RATIO * GRAVITY[2]
     measured = safe_clip((vel - memory.vel) * freq, -limit, limit)
     sideways = jnp.where(dot(vel, vel) == 0, 0.0, measured[..., :2])
-    measured = _with_height(sideways, measured[..., 2:])
+    measured = _join_height(sideways, measured[..., 2:])
     disturbance = memory.disturbance + p.observer * (measured - memory.disturbance)
 
     error, reach = setpoint.pos - pos, p.reach[..., 1:]
-    error = _with_height(_within(error[..., :2], p.reach[..., :1]), safe_clip(error[..., 2:], -reach, reach))
+    error = _join_height(_limit_length(error[..., :2], p.reach[..., :1]), safe_clip(error[..., 2:], -reach, reach))
     acc = p.stiffness * error + p.damping * (setpoint.vel - vel)
     height = safe_clip(acc[..., 2:], -p.acc_max[..., 2:], p.acc_max[..., 1:2])
-    acc = _with_height(_within(acc[..., :2], p.acc_max[..., :1]), height)
+    acc = _join_height(_limit_length(acc[..., :2], p.acc_max[..., :1]), height)
     specific = setpoint.acc + acc - p.gravity_vec - disturbance
     return specific, PositionMemory(vel + (known + p.gravity_vec) / freq, disturbance)
 
 
-def upright(specific: Array, setpoint: Setpoint, params: PositionParams) -> Array:
+def keep_upright(specific: Array, setpoint: Setpoint, params: PositionParams) -> Array:
     """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
 
     Where feedback, drag and estimates cancel the weight, as in a fall, the sum points anywhere. A small upward
@@ -149,16 +149,16 @@ def upright(specific: Array, setpoint: Setpoint, params: PositionParams) -> Arra
         params: Gains and limits, shared or with the leading axes of the force.
     """
     wanted = setpoint.acc[..., 2:] - params.gravity_vec[..., 2:]
-    least = -UPRIGHT * GRAVITY[2] + 2 * jnp.where(wanted < 0, wanted, 0.0)
-    return _with_height(specific[..., :2], jnp.where(specific[..., 2:] < least, least, specific[..., 2:]))
+    least = -MIN_UPWARD_RATIO * GRAVITY[2] + 2 * jnp.where(wanted < 0, wanted, 0.0)
+    return _join_height(specific[..., :2], jnp.where(specific[..., 2:] < least, least, specific[..., 2:]))
 
 
-def _within(x: Array, limit: Array) -> Array:
+def _limit_length(x: Array, limit: Array) -> Array:
     """Return a vector shortened to a length. (..., n)"""
     norm = safe_norm(x)
     return x * jnp.where(norm > limit, limit / jnp.where(norm > limit, norm, 1.0), 1.0)
 
 
-def _with_height(horizontal: Array, height: Array) -> Array:
+def _join_height(horizontal: Array, height: Array) -> Array:
     """Return the vector of its horizontal part and its height. (..., 3)"""
     return jnp.concatenate([horizontal, height], axis=-1)

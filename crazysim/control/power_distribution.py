@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from crazysim.control.levels import allocation_matrix, number_of, where_present
+from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
 from crazysim.drones import Airframe
-from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec, safe_clip
 
@@ -81,8 +81,8 @@ def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams,
     """
     p = params
     if whole_numbers:
-        shares = truncated(p.torque_allocation * truncated(torque)[..., None, :])
-        pwm = truncated(thrust + jnp.sum(shares, axis=-1))
+        shares = truncate(p.torque_allocation * truncate(torque)[..., None, :])
+        pwm = truncate(thrust + jnp.sum(shares, axis=-1))
     else:
         pwm = thrust + matvec(p.torque_allocation, torque)
     # The gradient of jnp.max divides by the number of equal elements, which is zero where XLA rounds a copy otherwise.
@@ -92,7 +92,7 @@ def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams,
     return jnp.where(thrust <= 0, 0.0, jnp.where(pwm < 0, 0.0, pwm))
 
 
-def truncated(x: Array) -> Array:
+def truncate(x: Array) -> Array:
     """Return numbers without their fractional parts, as a conversion to integers in C; the gradient is one. (...)"""
     return x + lax.stop_gradient(jnp.trunc(x) - x)
 
@@ -114,7 +114,7 @@ def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:
 def pwm_of_thrust(thrust: Array, *, params: PowerDistributionParams) -> Array:
     """Return the PWM of each motor at which all together give a collective thrust, N. (..., 1)"""
     p = params
-    n_rotors = number_of(p.rotors, p.torque_allocation.shape[-2])
+    n_rotors = count_rotors(p.rotors, p.torque_allocation.shape[-2])
     return thrust * (p.pwm_max / (n_rotors * p.thrust_max))
 
 
@@ -126,8 +126,8 @@ def command_of_rotor_vel(rotor_vel: Array, *, params: PowerDistributionParams) -
         params: Parameters, shared or with the leading axes of the rotor speeds.
     """
     p = params
-    pwm = jnp.where(rotor_vel > 0, curve(rotor_vel, p.rpm2thrust), 0.0) * (p.pwm_max / p.thrust_max)
+    pwm = jnp.where(rotor_vel > 0, quadratic_curve(rotor_vel, p.rpm2thrust), 0.0) * (p.pwm_max / p.thrust_max)
     if p.rotors is None:
         return jnp.mean(pwm, axis=-1, keepdims=True), matvec(p.torque_of_pwm, pwm)
-    pwm = where_present(p.rotors, pwm, 0.0)
-    return jnp.sum(pwm, axis=-1, keepdims=True) / number_of(p.rotors, 0), matvec(p.torque_of_pwm, pwm)
+    pwm = mask_rotors(p.rotors, pwm, 0.0)
+    return jnp.sum(pwm, axis=-1, keepdims=True) / count_rotors(p.rotors, 0), matvec(p.torque_of_pwm, pwm)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.control.allocation import AllocationParams
-from crazysim.control.levels import where_present
+from crazysim.control.levels import mask_rotors
 from crazysim.rotation import matvec, safe_clip
 
-BOUNDLESS = 1e9
+UNLIMITED_THRUST = 1e9
 """Collective thrust beyond any rotor's limit, N."""
 
 
@@ -28,7 +28,7 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
     Returns:
         Collective thrust, N, and body torque, N m. (..., 4)
     """
-    force, scale, yaw, _ = _prioritized(wrench, params)
+    force, scale, yaw, _ = _prioritize(wrench, params)
     return jnp.concatenate([force, scale * wrench[..., 1:3], yaw * params.arms[..., 2:]], axis=-1)
 
 
@@ -51,32 +51,34 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
         params: Parameters of the allocation, shared or with the leading axes of the wrench.
     """
-    force, scale, yaw, ratio = _prioritized(wrench, params)
+    force, scale, yaw, ratio = _prioritize(wrench, params)
     lift, turn = params.allocation_matrix[..., 0], params.allocation_matrix[..., 3]
     return lift * (force + scale * ratio) + turn * yaw
 
 
-def _prioritized(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
+def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
     """Return collective thrust, scale of the tilt torque, yaw torque over its arm, and what the tilt torque needs.
 
     The last is the thrust that each rotor adds for it, as collective thrust, N. (..., n_rotors)
     """
     p = params
-    lift = where_present(p.rotors, p.allocation_matrix[..., 0], 1.0)  # of each rotor per collective thrust, positive
-    turn = _of_all(jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift))  # the most per yaw torque over its arm
+    lift = mask_rotors(p.rotors, p.allocation_matrix[..., 0], 1.0)  # of each rotor per collective thrust, positive
+    turn = _reduce_rotors(
+        jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift)
+    )  # the most per yaw torque over its arm
     ratio = matvec(p.allocation_matrix[..., 1:3] / lift[..., None] / p.arms[..., None, :2], wrench[..., 1:3])
 
     # Rotor i allows collective thrusts F with low <= lift_i (F + s ratio_i) <= high; one that a drone lacks, any.
-    least = where_present(p.rotors, p.thrust_min / lift, -BOUNDLESS)
-    most = where_present(p.rotors, p.thrust_max / lift, BOUNDLESS)
-    still_low, still_high = _of_all(jnp.maximum, least), _of_all(jnp.minimum, most)
-    full_low, full_high = _of_all(jnp.maximum, least - ratio), _of_all(jnp.minimum, most - ratio)
+    least = mask_rotors(p.rotors, p.thrust_min / lift, -UNLIMITED_THRUST)
+    most = mask_rotors(p.rotors, p.thrust_max / lift, UNLIMITED_THRUST)
+    still_low, still_high = _reduce_rotors(jnp.maximum, least), _reduce_rotors(jnp.minimum, most)
+    full_low, full_high = _reduce_rotors(jnp.maximum, least - ratio), _reduce_rotors(jnp.minimum, most - ratio)
     weight = still_high if p.weight is None else p.weight
     limit = jnp.maximum(wrench[..., :1], jnp.maximum(weight, still_low))
 
     # The room between the bounds is concave in s, so it is at least the chord from s = 0, where it is positive, to 1.
     still, full = jnp.minimum(still_high, limit) - still_low, jnp.minimum(full_high, limit) - full_low
-    scale = still / jnp.maximum(still - jnp.minimum(full, 0.0), 1 / BOUNDLESS)
+    scale = still / jnp.maximum(still - jnp.minimum(full, 0.0), 1 / UNLIMITED_THRUST)
     chord = still_low + scale * (full_low - still_low)
     force = safe_clip(wrench[..., :1], chord, jnp.where(full < 0, chord, jnp.minimum(full_high, limit)))
 
@@ -84,7 +86,7 @@ def _prioritized(wrench: Array, params: AllocationParams) -> tuple[Array, Array,
     return force, scale, safe_clip(wrench[..., 3:] / p.arms[..., 2:], -room, room), ratio
 
 
-def _of_all(function: Callable[[Array, Array], Array], x: Array) -> Array:
+def _reduce_rotors(function: Callable[[Array, Array], Array], x: Array) -> Array:
     """Return the largest or smallest entry, rotor by rotor. (..., 1)
 
     The gradient of ``jnp.max`` divides by the number of entries that equal the result. Where XLA computes the entries

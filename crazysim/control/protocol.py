@@ -74,7 +74,7 @@ class DroneData(Protocol):
 class Controller:
     """Base class of controllers, which ``Sim(controller=...)`` uses at one of their command levels.
 
-    A subclass lists its settings as annotated fields with defaults, one of which is ``freq``; it becomes a frozen
+    A subclass lists its settings as annotated fields with defaults, including ``freq``; it becomes a frozen
     dataclass. Its methods are pure and written for one drone. A controller whose slow part runs at a lower rate has a
     field ``outer_freq`` and overrides ``outer``, which then precedes ``update`` at the level ``state``.
     """

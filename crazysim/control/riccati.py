@@ -11,10 +11,10 @@ from jax import Array
 
 from crazysim.errors import ConfigError
 
-DOUBLINGS = 30
+N_DOUBLINGS = 30
 """Number of doublings: step k covers 2^k steps of time, and a closed loop whose slowest mode is 1 - 1e-8 converges."""
-REFINEMENTS = 2
-"""Newton steps after the doubling, each of which doubles the number of correct digits."""
+N_REFINEMENTS = 2
+"""Newton steps after the doubling; each doubles the number of correct digits."""
 
 
 def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
@@ -37,10 +37,10 @@ def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
     Returns:
         Solution P. (n, n)
     """
-    P = _doubled(A, B @ jnp.linalg.solve(R, B.T), Q)
-    for _ in range(REFINEMENTS):
+    P = _solve_by_doubling(A, B @ jnp.linalg.solve(R, B.T), Q)
+    for _ in range(N_REFINEMENTS):
         K = jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-        P = _smith(A - B @ K, Q + K.T @ R @ K)
+        P = _solve_smith(A - B @ K, Q + K.T @ R @ K)
     return P
 
 
@@ -67,14 +67,14 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
     inverse = jnp.linalg.inv(shifted)
     W = jnp.linalg.inv(shifted.T + Q @ inverse @ G)
     V = jnp.linalg.inv(shifted + G @ inverse.T @ Q)
-    P = _doubled(eye + 2 * shift * V, 2 * shift * inverse @ G @ W, 2 * shift * W @ Q @ inverse)
-    for _ in range(REFINEMENTS):
+    P = _solve_by_doubling(eye + 2 * shift * V, 2 * shift * inverse @ G @ W, 2 * shift * W @ Q @ inverse)
+    for _ in range(N_REFINEMENTS):
         closed = A - G @ P
         P = solve_lyapunov(closed, Q + P @ G @ P)
     return P
 
 
-def _doubled(A: Array, G: Array, H: Array) -> Array:
+def _solve_by_doubling(A: Array, G: Array, H: Array) -> Array:
     """Return the limit of H under doubling, or NaN where A does not converge to zero. (n, n)"""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
 
@@ -85,7 +85,7 @@ def _doubled(A: Array, G: Array, H: Array) -> Array:
         G, H = G + A @ WG @ A.T, H + A.T @ H @ WA
         return (A @ WA, (G + G.T) / 2, (H + H.T) / 2), None
 
-    (A, G, H), _ = jax.lax.scan(double, (A, G, H), length=DOUBLINGS)
+    (A, G, H), _ = jax.lax.scan(double, (A, G, H), length=N_DOUBLINGS)
     converged = jnp.all(jnp.isfinite(H)) & (jnp.max(jnp.abs(A)) < 1e-3)
     return jnp.where(converged, H, jnp.nan)
 
@@ -95,17 +95,17 @@ def solve_lyapunov(A: Array, Q: Array) -> Array:
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
     shift = jnp.linalg.norm(A) / jnp.sqrt(A.shape[0])
     inverse = jnp.linalg.inv(A - shift * eye)
-    return _smith((A + shift * eye) @ inverse, 2 * shift * inverse.T @ Q @ inverse)
+    return _solve_smith((A + shift * eye) @ inverse, 2 * shift * inverse.T @ Q @ inverse)
 
 
-def _smith(A: Array, Q: Array) -> Array:
+def _solve_smith(A: Array, Q: Array) -> Array:
     """Return X with ``X = A^T X A + Q`` for a stable A, by doubling (Smith 1968). (n, n)"""
 
     def double(carry: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
         X, power = carry
         return (X + power.T @ X @ power, power @ power), None
 
-    (X, _), _ = jax.lax.scan(double, (Q, A), length=DOUBLINGS)
+    (X, _), _ = jax.lax.scan(double, (Q, A), length=N_DOUBLINGS)
     return (X + X.T) / 2
 
 

@@ -38,7 +38,7 @@ class Setpoint(PyTree):
     def command(self) -> Array:
         """Return the state command: position, velocity, acceleration, quaternion of the yaw, body rates. (..., 16)
 
-        The quaternion is xyzw, and the body rates are those of a level drone, (0, 0, yaw rate).
+        The quaternion is xyzw, and the body rates belong to a level drone, (0, 0, yaw rate).
         """
         zeros = jnp.zeros_like(self.pos[..., :2])
         quat = [zeros, jnp.sin(self.yaw / 2), jnp.cos(self.yaw / 2)]

@@ -1,4 +1,4 @@
-"""Several controllers on one drone, of which a function of state, setpoint and time chooses one at each tick."""
+"""Several controllers on one drone. A function of state, setpoint and time chooses one at each tick."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class SwitchMemory(PyTree):
 
 
 class Switch(Controller):
-    """Several controllers, of which one commands a drone; ``Sim(controller=[...], switch=...)`` makes it.
+    """Several controllers; one commands a drone at a time. ``Sim(controller=[...], switch=...)`` makes it.
 
     Only the active controller runs: the memory of the others stands still. When a controller becomes active, its
     ``take_over`` sets its memory so that its first command is as close to the last one as its limits allow. Wrenches
@@ -64,7 +64,6 @@ class Switch(Controller):
 
     @property
     def members(self) -> tuple[Controller, ...]:
-        """The controllers."""
         return self.controllers
 
     def params(self, airframe: Airframe) -> SwitchParams:
@@ -78,7 +77,6 @@ class Switch(Controller):
         return SwitchParams(params, AllocationParams.create(airframe), index)
 
     def memory(self, airframe: Airframe) -> SwitchMemory:
-        """Return the memory of one drone before the first tick."""
         memory = tuple(c.memory(airframe) for c in self.controllers)
         rest: Any = np.zeros(airframe.n_rotors)
         return SwitchMemory(memory, np.full(1, -1, np.int32), rest)  # type: ignore[arg-type]
@@ -95,16 +93,16 @@ class Switch(Controller):
         ):
             chosen = index == k
             starts = chosen & switched
-            own = _where(starts, controller.take_over(data, command, own, p, memory.rotor_vel), own)
+            own = _select_tree(starts, controller.take_over(data, command, own, p, memory.rotor_vel), own)
             if isinstance(command, Setpoint) and controller.has_outer:
-                due = chosen & (starts | _due(data, controller.outer_freq))
-                own = _where(due, controller.outer(data, command, own, p), own)
-            due = chosen & (starts | _due(data, controller.freq))
+                due = chosen & (starts | _is_due(data, controller.outer_freq))
+                own = _select_tree(due, controller.outer(data, command, own, p), own)
+            due = chosen & (starts | _is_due(data, controller.freq))
             out, new = controller.update(data, command, own, p)
             if controller.output == Control.force_torque:
                 out = force_torque2rotor_vel(out, params=params.allocation)
             rotor_vel = jnp.where(due, out, rotor_vel)
-            after.append(_where(due, new, own))
+            after.append(_select_tree(due, new, own))
         active = jnp.full_like(memory.active, index)
         return rotor_vel, SwitchMemory(tuple(after), active, rotor_vel)
 
@@ -122,7 +120,7 @@ class Switch(Controller):
         return jnp.clip(index, 0, len(self.controllers) - 1).astype(jnp.int32)
 
 
-def switch_of(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
+def make_switch(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
     """Return several controllers with a switch.
 
     Raises:
@@ -148,11 +146,11 @@ def _indices(switch: Any, n: int) -> np.ndarray:
     return indices[..., None].astype(np.int32)
 
 
-def _due(data: DroneData, freq: Any) -> Array | bool:
+def _is_due(data: DroneData, freq: Any) -> Array | bool:
     """Return True where a rate fires at this step. ()"""
     return data.core.steps % (data.core.freq // freq) == 0
 
 
-def _where(mask: Any, new: Any, old: Any) -> Any:
+def _select_tree(mask: Any, new: Any, old: Any) -> Any:
     """Return one of two trees. A leaf that is the same in both stays as it is."""
     return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new, old)

@@ -16,15 +16,15 @@ from crazysim import rotation
 from crazysim.control.levels import Control
 from crazysim.control.lqr import (
     Reference,
-    reference_of,
+    flat_reference,
+    lqr_weights,
     solve_on_host,
     state_error,
-    weights_of,
 )
 from crazysim.control.priority import prioritized_wrench
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.riccati import gain_continuous, solve_lyapunov
-from crazysim.control.rigid_body import RigidBodyParams, rigid_body
+from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
 from crazysim.dynamics.models import GRAVITY
@@ -50,7 +50,7 @@ class TrackingLQRParams(RigidBodyParams):
 def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc: Array, mass: Array, J: Array) -> Array:
     """Return the derivative of the errors of a drone about a reference, under an error of its wrench.
 
-    The errors are those of ``state_error`` to first order: position, velocity, a small rotation e_R with
+    The errors are ``state_error`` to first order: position, velocity, a small rotation e_R with
     ``R = R_d exp(e_R^)``, and ``e_w = w - R^T R_d w_d``, so that ``e_R' = e_w``.
 
     Args:
@@ -101,7 +101,7 @@ def tracking_gains(
     params = RigidBodyParams(mass, jnp.asarray(GRAVITY, J.dtype), J, drag_matrix, None)  # type: ignore[arg-type]
 
     def matrices(setpoint: Setpoint) -> tuple[Array, Array]:
-        reference = reference_of(setpoint, params)
+        reference = flat_reference(setpoint, params)
         w = reference.ang_vel
         ang_acc = jnp.linalg.solve(J, reference.wrench[1:] - cross(w, matvec(J, w)))
 
@@ -137,9 +137,9 @@ def tracking_gains(
 def gain_at(time: Array, gains: Array, dt: Array) -> Array:
     """Return the gain at a time, s, interpolated linearly between knots ``dt`` apart and held at the ends. (4, 12)"""
     last = gains.shape[-3] - 1
-    place = rotation.safe_clip(time / dt, 0.0, float(last))
-    gains, below = jnp.asarray(gains), jnp.minimum(jnp.floor(place).astype(jnp.int32), last - 1)
-    share = place - below
+    knot = rotation.safe_clip(time / dt, 0.0, float(last))
+    gains, below = jnp.asarray(gains), jnp.minimum(jnp.floor(knot).astype(jnp.int32), last - 1)
+    share = knot - below
     return (1 - share) * gains[below] + share * gains[below + 1]
 
 
@@ -161,7 +161,7 @@ def tracking_lqr_control(
         Collective thrust, N, and body torque, N m, within the limits of the rotors. (4,)
     """
     p = params
-    reference = reference_of(setpoint, p)
+    reference = flat_reference(setpoint, p)
     error = state_error(pos, quat, vel, ang_vel, reference)
     gain = gain_at(time - p.start[0], p.gains, p.dt[0])
     return prioritized_wrench(reference.wrench - matvec(gain, error), params=p.allocation)
@@ -170,7 +170,7 @@ def tracking_lqr_control(
 class TrackingLQR(Controller):
     """Time-varying LQR (``tracking_lqr_control``) along a trajectory that is known in advance.
 
-    The gains belong to times since the reset of a world, so the setpoints that arrive must be those of the trajectory,
+    The gains belong to times since the reset of a world, so the setpoints that arrive must belong to the trajectory,
     as from ``Follow`` with the same start.
     It is the counterpart of AIMotionLab-Virtual's LTV-LQR, without that one's load.
     """
@@ -210,19 +210,18 @@ class TrackingLQR(Controller):
                 f"expected finite setpoints, got NaN or infinity in {', '.join(bad)}. Evaluate the trajectory at "
                 f"times that it covers, and check its limits."
             )
-        Q, R = weights_of(airframe, self.freq, self.Q, self.R)
+        Q, R = lqr_weights(airframe, self.freq, self.Q, self.R)
         mass, drag = airframe.value("rigid_body.mass"), airframe.matrix("drag.coefficients")
         gains_of = functools.partial(tracking_gains, substeps=math.ceil(self.dt * self.freq))
         gains = solve_on_host(gains_of, self.setpoints, self.dt, mass, airframe.inertia, drag, Q, R)
         return TrackingLQRParams(
-            **rigid_body(airframe),
+            **rigid_body_params(airframe),
             gains=as_parameter(gains),
             dt=as_parameter(self.dt),
             start=as_parameter(self.start),
         )
 
     def update(self, data: DroneData, command: Any, memory: Any, params: TrackingLQRParams) -> tuple[Array, Any]:
-        """Return the wrench."""
         s, core = data.states, data.core
         time = core.steps.astype(s.pos.dtype) / core.freq
         return tracking_lqr_control(s.pos, s.quat, s.vel, s.ang_vel, command, time, params=params), memory

@@ -4,7 +4,7 @@ Exported here are the functions with which stages and resets are written.
 """
 
 from crazysim.core.pipeline import append_fn, insert_fn_after, insert_fn_before, prepend_fn, remove_fn, replace_fn
-from crazysim.core.plugin import FunctionPlugin, Placement, Plugin, check_parameter, parameter
+from crazysim.core.plugin import FunctionPlugin, Plugin, StagePlacement, check_parameter, parameter
 from crazysim.core.random import drone_key, drone_keys, seed_sim, world_key, world_keys
 from crazysim.core.settings import dividing_rate, setting
 from crazysim.core.sharding import shard, world_mesh
@@ -12,8 +12,8 @@ from crazysim.pytree import map_batched, scopes, select_worlds
 
 __all__ = [
     "FunctionPlugin",
-    "Placement",
     "Plugin",
+    "StagePlacement",
     "append_fn",
     "check_parameter",
     "dividing_rate",

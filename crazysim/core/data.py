@@ -224,7 +224,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
 
     def create(one: Airframe) -> SimParams:
         if dynamics == Dynamics.first_principles:
-            return first_principles.with_rotors(first_principles.Params.create(one), n_rotors)
+            return first_principles.pad_rotors(first_principles.Params.create(one), n_rotors)
         return fitted.Params.create(one, dynamics)
 
     return create_per_drone(airframe, create, n_worlds)

@@ -65,7 +65,7 @@ class Simulation(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Placement:
+class StagePlacement:
     """A stage of a plugin and its position in the step pipeline."""
 
     stage: Callable[[SimData], SimData]
@@ -187,8 +187,8 @@ class Plugin:
     the others limit."""
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
     """Scope that ``constrain`` is written for: the data of one drone, or of one world."""
-    begins_before: ClassVar[str | None] = None
-    """Name of the stage of an episode's first step in front of which ``begin_episode`` is called, if it uses what that
+    reset_before: ClassVar[str | None] = None
+    """Name of the stage of an episode's first step in front of which ``reset_episode`` is called, if it uses what that
     step has computed so far; None to call it at resets, and in front of all stages in worlds that were not reset."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -275,23 +275,23 @@ class Plugin:
             ConfigError: If the plugin lacks another one that it needs, or does not go with one.
         """
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of the plugin with their positions, in the order in which they are inserted."""
         return ()
 
-    def begin_episode(self, data: SimData) -> SimData:
+    def reset_episode(self, data: SimData) -> SimData:
         """Return the data of one drone at the beginning of an episode.
 
         It may write leaves of drones, such as what is drawn for an episode. It is called at resets, and in the first
         step of worlds that were not reset, before all other stages and with the same random numbers; with
-        ``begins_before`` in every first step instead, in front of that stage.
+        ``reset_before`` in every first step instead, in front of that stage.
         """
         return data
 
     @property
-    def begins_episodes(self) -> bool:
-        """True if ``begin_episode`` must be called."""
-        return type(self).begin_episode is not Plugin.begin_episode
+    def resets_episode(self) -> bool:
+        """True if ``reset_episode`` must be called."""
+        return type(self).reset_episode is not Plugin.reset_episode
 
     def influence(self, data: SimData) -> SimData:
         """Return the data of one drone as the dynamics are to use it: other forces, commands or parameters.
@@ -329,22 +329,22 @@ class Plugin:
         """
         return deriv
 
-    def place(self, data: SimData) -> Objects:
-        """Return ``data.objects`` with the plugin's objects of the scene at their poses; for the data of one world.
+    def move_objects(self, data: SimData) -> Objects:
+        """Return ``data.objects`` of one world with the plugin's objects at their poses.
 
         It is called when the scene is read, and by queries of the scene within a step.
         """
         return data.objects  # type: ignore[return-value]
 
     @property
-    def placed_kinds(self) -> tuple[str, ...] | None:
-        """Names of the objects that ``place`` moves, without their numbers; None for any object that can move."""
+    def moved_kinds(self) -> tuple[str, ...] | None:
+        """Names of the objects that ``move_objects`` moves, without their numbers; None for any movable object."""
         return None
 
     @property
-    def places(self) -> bool:
-        """True if the plugin puts objects of the scene at their poses by ``place``."""
-        return type(self).place is not Plugin.place
+    def moves_objects(self) -> bool:
+        """True if the plugin moves objects of the scene by ``move_objects``."""
+        return type(self).move_objects is not Plugin.move_objects
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return named measurements of one drone. (k,) each"""
@@ -410,7 +410,7 @@ class FunctionPlugin(Plugin):
     name: str
     data: PyTree | None = None
     """The record for all worlds."""
-    placements: Sequence[Placement] = ()
+    placements: Sequence[StagePlacement] = ()
     """The stages with their positions."""
     influence_fn: Callable[[SimData], SimData] | None = None
     """The influence on the dynamics, for one drone; None for none."""
@@ -427,7 +427,7 @@ class FunctionPlugin(Plugin):
     def default_record(self, sim: Simulation) -> PyTree | None:
         return self.data if self.default is None else self.default
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return self.placements
 
     def influence(self, data: SimData) -> SimData:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.influence import plugin_rates
 from crazysim.core.integration import Integrator, advance_record
-from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import dividing_rate
 from crazysim.core.stage import RESERVED_SCOPES, Stage, tick
 from crazysim.errors import ConfigError
@@ -143,18 +143,18 @@ class Population(Plugin):
         """Return the record of one member at the end of a step: unit quaternions restored, states limited."""
         return record
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of controller and integration, each if the class overrides its method."""
         cls, found = type(self), []
         if cls.control is not Population.control:
             rate = self.control_freq
             when = None if rate is None else functools.partial(tick, freq=rate)
             name = f"{self.name}_control"
-            found.append(Placement(Stage(self._controlled, self.name, when, name=name), name=name))
+            found.append(StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name))
         if cls.derivative is not Population.derivative:
             name = f"{self.name}_integration"
             step = functools.partial(self._integrated, self.scheme(sim.integrator))
-            found.append(Placement(Stage(step, self.name, name=name), before="increment_steps", name=name))
+            found.append(StagePlacement(Stage(step, self.name, name=name), before="increment_steps", name=name))
         return found
 
     def with_poses(self, record: R, pos: Array, quat: Array) -> R:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.drones.keys import GUIDE, LAYOUT
 from crazysim.errors import ConfigError
 
-TUNED = ("fitted", "controller", "geometric", "mellinger", "pid", "residual")
+TUNED_TABLES = ("fitted", "controller", "geometric", "mellinger", "pid", "residual")
 """Tables of gains and fits."""
 
 
@@ -77,7 +77,8 @@ class Airframe:
         """
         if path not in self.values:
             raise ConfigError(
-                f"airframe {self.name!r} has no value {path!r}. {self.why_missing(path)}{_remedy(path, self.values)}"
+                f"airframe {self.name!r} has no value {path!r}. {self.why_missing(path)}"
+                f"{_lookup_advice(path, self.values)}"
             )
         value = self.values[path]
         if shape is not None and value.shape != shape:
@@ -104,7 +105,7 @@ class Airframe:
 
     def why_missing(self, path: str) -> str:
         """Return why a table or value of the base was not inherited, with a space at the end; empty if it was."""
-        return f"{self.not_inherited} " if self.not_inherited and path.partition(".")[0] in TUNED else ""
+        return f"{self.not_inherited} " if self.not_inherited and path.partition(".")[0] in TUNED_TABLES else ""
 
     @functools.cached_property
     def tables(self) -> Mapping[str, Any]:
@@ -173,7 +174,7 @@ def airframe_names() -> tuple[str, ...]:
     return tuple(drone.value for drone in Drone)
 
 
-def _remedy(path: str, paths: Iterable[str]) -> str:
+def _lookup_advice(path: str, paths: Iterable[str]) -> str:
     """Return the advice for a value that an airframe lacks: to add it if it exists, else the path that was meant."""
     table, _, key = path.rpartition(".")
     return (

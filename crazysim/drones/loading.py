@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.drones.airframe import TUNED, Airframe, AirframeSource, airframe_names
-from crazysim.drones.checks import check_airframe
+from crazysim.drones.airframe import TUNED_TABLES, Airframe, AirframeSource, airframe_names
+from crazysim.drones.airframe_checks import check_airframe
 from crazysim.drones.keys import LAYOUT
 from crazysim.storage import is_file
 from crazysim.tables import extend_bases, read_source
 
-FOLDER = Path(__file__).parent
-BODY = (
+AIRFRAME_FOLDER = Path(__file__).parent
+BODY_KEYS = (
     "rigid_body.mass",
     "rigid_body.inertia",
     "rotors.position",
@@ -32,14 +32,14 @@ def load_airframe(source: AirframeSource) -> Airframe:
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
     the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. Another body
-    (``BODY``) does not inherit gains and fits (``TUNED``).
+    (``BODY_KEYS``) does not inherit gains and fits (``TUNED_TABLES``).
 
     Args:
         source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).
 
     Raises:
         UnknownNameError: If the source is neither the name of an airframe nor a file.
-        ConfigError: If a table or key does not exist, or the numbers cannot be those of a drone.
+        ConfigError: If a table or key does not exist, or the numbers cannot belong to a drone.
     """
     return _load(source, ())
 
@@ -54,18 +54,18 @@ def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
     if isinstance(source, Airframe):
         return source
     bases = extend_bases(bases, source)
-    stem, origin, tables = read_source(source, "drone", "an Airframe", FOLDER, airframe_names(), LAYOUT.guide)
+    stem, origin, tables = read_source(source, "drone", "an Airframe", AIRFRAME_FOLDER, airframe_names(), LAYOUT.guide)
     name = str(tables.get("name", stem))
     numbers, why = dict(LAYOUT.numbers(f"airframe {name!r}{origin}", tables)), ""
     if tables.get("base") is not None:
-        inherited, why = _inherited(_load(tables["base"], bases), numbers)
+        inherited, why = _inherit(_load(tables["base"], bases), numbers)
         numbers = inherited | numbers
     airframe = Airframe(name, numbers, why)
     check_airframe(airframe)
     return airframe
 
 
-def _inherited(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, NDArray[np.float64]], str]:
+def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, NDArray[np.float64]], str]:
     """Return the numbers that an airframe inherits, and why not all of them.
 
     Args:
@@ -73,19 +73,21 @@ def _inherited(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str
         changes: The airframe's own numbers, by dotted path.
     """
     old = base.values
-    changed = [path for path in BODY if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))]
-    lost = [table for table in TUNED if table in base.tables]
+    changed = [
+        path for path in BODY_KEYS if path in changes and not np.array_equal(changes[path], old.get(path, np.nan))
+    ]
+    lost = [table for table in TUNED_TABLES if table in base.tables]
     if not changed or not lost:
         return dict(old), base.not_inherited
-    numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED}
+    numbers = {path: x for path, x in old.items() if path.partition(".")[0] not in TUNED_TABLES}
     ratio = "controller.thrust2torque"
     if ratio in old and not {"rotors.thrust_curve", "rotors.torque_curve"} & set(changes):
         numbers[ratio] = old[ratio]  # of the propellers alone
-    names = _listed(f"[{table}]" for table in lost)
-    why = f"Its base {base.name!r} has {names}, which fit another {_listed(changed)} and are not inherited."
+    names = _join_names(f"[{table}]" for table in lost)
+    why = f"Its base {base.name!r} has {names}, which fit another {_join_names(changed)} and are not inherited."
     return numbers, why
 
 
-def _listed(names: Iterable[str]) -> str:
+def _join_names(names: Iterable[str]) -> str:
     *first, last = names
     return f"{', '.join(first)} and {last}" if first else last

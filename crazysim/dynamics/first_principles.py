@@ -12,7 +12,7 @@ from crazysim.dynamics.drag import body_drag_force
 from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.dynamics.rigid_body import angular_acceleration, linear_acceleration, stable_angular_acceleration
 from crazysim.dynamics.rotor import (
-    curve,
+    quadratic_curve,
     reaction_torque,
     rotor_acceleration,
     rotor_momentum,
@@ -108,7 +108,7 @@ def dynamics(
         dist_t: External torque, world frame, N m. (..., 3)
         params: Parameters, shared or with the leading axes of the state.
         dt: Duration of the Euler step that the derivatives are for, s: above 20 rad/s at 500 Hz the angular
-            acceleration is then that of ``stable_angular_acceleration``. None for the exact derivatives.
+            acceleration is then ``stable_angular_acceleration``. None for the exact derivatives.
 
     Returns:
         Velocity, m/s, acceleration, m/s^2 (both world frame), angular acceleration, rad/s^2 (body frame),
@@ -116,8 +116,8 @@ def dynamics(
     """
     del pos  # the argument gives all models one signature
     p = params
-    thrust = curve(rotor_vel, p.rpm2thrust)
-    drag_torque = curve(rotor_vel, p.rpm2torque)
+    thrust = quadratic_curve(rotor_vel, p.rpm2thrust)
+    drag_torque = quadratic_curve(rotor_vel, p.rpm2torque)
     rotor_acc = rotor_acceleration(cmd, rotor_vel, p.rotor_dyn_coef)
 
     body_force = along_z(jnp.sum(thrust, axis=-1)) + body_drag_force(quat, vel, p.drag_matrix)
@@ -165,7 +165,7 @@ def hover_rotor_vel(params: Params) -> Array:
     return jnp.where(exists, rotor_vel_of_thrust(each, curves), 0.0)
 
 
-def with_rotors(params: Params, n_rotors: int) -> Params:
+def pad_rotors(params: Params, n_rotors: int) -> Params:
     """Return the parameters of an airframe with rotors added that do not exist: no thrust, no torque, no speed."""
     own = params.mixing_matrix.shape[-1]
     if own == n_rotors:

@@ -24,9 +24,9 @@ from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import along_z, matvec
 
-FITTED_UP_TO = math.cos(math.radians(80))
-BLENDED_AT = math.cos(math.radians(88))
-FITTED_UP_TO_MAGNITUDE = 100.0
+MIN_FITTED_COSINE = math.cos(math.radians(80))
+MIN_BLENDED_COSINE = math.cos(math.radians(88))
+MAX_FITTED_MAGNITUDE = 100.0
 """Body rate, rad/s, and commanded angles, rad, up to which the fit is used; the blend ends at twice as much.
 
 Three times the 2,000 degrees per second that a Crazyflie's gyroscope can measure (BMI088, data sheet), and sixteen
@@ -155,8 +155,8 @@ def _fitted_angular_acceleration(quat: Array, ang_vel: Array, cmd_rpy: Array, p:
     """Return the fit's angular acceleration, blended into an attitude spring outside of the fitted range."""
     x, y, z, w = quat[..., 0:1], quat[..., 1:2], quat[..., 2:3], quat[..., 3:4]
     cos_pitch = rotation.safe_norm(jnp.concatenate([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1))
-    t = jnp.clip((cos_pitch - BLENDED_AT) / (FITTED_UP_TO - BLENDED_AT), 0.0, 1.0)
-    size = jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / FITTED_UP_TO_MAGNITUDE**2
+    t = jnp.clip((cos_pitch - MIN_BLENDED_COSINE) / (MIN_FITTED_COSINE - MIN_BLENDED_COSINE), 0.0, 1.0)
+    size = jnp.maximum(rotation.dot(ang_vel, ang_vel), rotation.dot(cmd_rpy, cmd_rpy)) / MAX_FITTED_MAGNITUDE**2
     t = t * jnp.clip((4 - size) / 3, 0.0, 1.0)
     weight = t * t * t * (10 - 15 * t + 6 * t * t)
 

@@ -14,7 +14,7 @@ from jax import Array
 
 from crazysim.rotation import safe_sqrt
 
-STILL = 1e-3
+MIN_AIR_SPEED = 1e-3
 """Speed that is added in quadrature to that of the air at a rotor, m/s, so that a stopped rotor in still air has an
 inflow. An assumption; 1 mm/s changes nothing else."""
 N_ITERATIONS = 3
@@ -90,11 +90,11 @@ def thrust_in_flight(
     static = jnp.where(static_thrust > 0, static_thrust, 0.0)
     disc, loss = disc_factor(radius, air_density), blade * ang_vel
     tip = radius * ang_vel
-    advance = in_plane_square / (tip * tip + in_plane_square + STILL**2)
+    advance = in_plane_square / (tip * tip + in_plane_square + MIN_AIR_SPEED**2)
     lift = (static + loss * safe_sqrt(static / disc)) * (1 + 1.5 * advance)
 
     disc = disc * ceiling * ceiling
-    across = in_plane_square + STILL**2
+    across = in_plane_square + MIN_AIR_SPEED**2
     linear = loss - disc * axial
     inflow = (safe_sqrt(linear * linear + 4 * disc * lift) - linear) / (2 * disc)
     for _ in range(N_ITERATIONS):
@@ -115,7 +115,7 @@ def ceiling_factor(gap: Array, radius: Array) -> Array:
     ``rho A v v_wake``, and ``T = rho A v_wake^2 / 2``.
     Hsiao and Chirarattananon (2019, arXiv 1905.04632) treat and measure propellers below a ceiling by momentum and
     blade element theory. Gaps below a twentieth of the radius count as that, an assumption. Above the ceiling there is
-    none: the ratio is that of free air, 1.
+    none: the ratio is 1, as in free air.
 
     Args:
         gap: Height of the ceiling over the rotor, m. (...)

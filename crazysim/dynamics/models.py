@@ -11,7 +11,7 @@ from crazysim.drones import Airframe, AirframeSource, Drone, load_airframe
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
 
-RINGING = 1.5
+MAX_LAG_RATE = 1.5
 """Largest product of a rate and a step: Euler steps diverge from 2 on, and a lag overshoots by half its error here."""
 GRAVITY = (0.0, 0.0, -GRAVITY_MAGNITUDE)
 """Gravitational acceleration, world frame, m/s^2."""
@@ -87,8 +87,8 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
         found[drag] = numbers[drag] / mass
     for path, rates in found.items():
         rate = float(np.max(np.abs(rates)))
-        if rate > RINGING * freq:
+        if rate > MAX_LAG_RATE * freq:
             raise ConfigError(
                 f"expected {path} of airframe {airframe.name!r} to be slow for steps of 1/{freq} s, got a rate of "
-                f"{rate:.4g} 1/s. Use freq={math.ceil(rate / RINGING)} or more, or a smaller number."
+                f"{rate:.4g} 1/s. Use freq={math.ceil(rate / MAX_LAG_RATE)} or more, or a smaller number."
             )

@@ -13,7 +13,7 @@ from crazysim.dynamics import first_principles, fitted
 from crazysim.dynamics.models import GRAVITY, Dynamics, require_support
 from crazysim.errors import ConfigError, UnknownNameError
 
-CONTROLLER = "mellinger"
+CASCADE_NAME = "mellinger"
 """Name of the cascade."""
 _CONSTANTS = ("mass", "mass_thrust", "pwm_min", "pwm_max", "torque_pwm_max", "thrust2torque")
 _ROTORS = {
@@ -77,7 +77,7 @@ def load_params(
             del fit["drag_coefficients"]
             fit["drag_matrix"] = airframe.matrix(f"fitted.{model.value}.drag_coefficients")
         params |= fit
-    return as_arrays(params, xp, device)
+    return convert_arrays(params, xp, device)
 
 
 def load_fn_params(
@@ -117,8 +117,8 @@ def load_controller_params(
     Raises:
         UnknownNameError: If the controller or the drone does not exist.
     """
-    if controller != CONTROLLER:
-        raise UnknownNameError(f"expected controller {CONTROLLER!r}, got {controller!r}")
+    if controller != CASCADE_NAME:
+        raise UnknownNameError(f"expected controller {CASCADE_NAME!r}, got {controller!r}")
     airframe = load_airframe(drone)
     core = {"gravity_vec": GRAVITY, "L": airframe.arm, "mixing_matrix": airframe.mixing_matrix}
     tables: dict[str, dict[str, Any]] = {"core": core}
@@ -127,13 +127,13 @@ def load_controller_params(
         tables.setdefault(name, {}).update(
             {new: airframe.value(f"{table}.{k}") for k, new in keys.items() if k in known}
         )
-    return as_arrays(tables, xp, device)
+    return convert_arrays(tables, xp, device)
 
 
 def load_controller_fn_params(
     fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters of one function of the cascade: those of ``core``, and its own.
+    """Return the parameters of one function of the cascade, including ``core``.
 
     Args:
         fn: Function of ``crazysim.control``, such as ``state2attitude``.
@@ -141,7 +141,7 @@ def load_controller_fn_params(
         xp: Array module of the values; None for NumPy.
         device: Device of the values; None for the module's default.
     """
-    params = load_controller_params(CONTROLLER, drone, xp, device)
+    params = load_controller_params(CASCADE_NAME, drone, xp, device)
     return params["core"] | params.get(fn.__name__, {})
 
 
@@ -156,8 +156,8 @@ def rotor_vel_limits(dynamics: Dynamics | str, drone: AirframeSource) -> tuple[f
     return float(low), float(high)
 
 
-def as_arrays(params: dict[str, Any], xp: ModuleType | None, device: Any) -> dict[str, Any]:
+def convert_arrays(params: dict[str, Any], xp: ModuleType | None, device: Any) -> dict[str, Any]:
     """Return a dict, or a dict of dicts, with its values as arrays of a module."""
     make = (np if xp is None else xp).asarray
     options = {} if device is None else {"device": device}
-    return {k: as_arrays(v, xp, device) if isinstance(v, dict) else make(v, **options) for k, v in params.items()}
+    return {k: convert_arrays(v, xp, device) if isinstance(v, dict) else make(v, **options) for k, v in params.items()}

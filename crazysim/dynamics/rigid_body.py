@@ -7,12 +7,12 @@ from jax import Array
 
 from crazysim.rotation import add_cross, cross, dot, matvec, multiply
 
-EXPLICIT_UP_TO = 0.04
+MAX_EXPLICIT_ANGLE = 0.04
 """Rotation per step, rad, up to which ``stable_angular_acceleration`` is the exact derivative.
 
 20 rad/s at 500 Hz. A free wobble then grows by at most 0.04^2 / 2 of its size per step.
 """
-STABLE_FROM = 0.06
+MIN_STABLE_ANGLE = 0.06
 """Rotation per step, rad, from which ``stable_angular_acceleration`` lets no free wobble grow."""
 
 
@@ -60,7 +60,7 @@ def stable_angular_acceleration(
     whose factor exceeds one in fourth order only. With ``theta = (1 + x^2) / 2`` at a rotation of ``x = |w| dt`` per
     step it stays at most one up to ``k dt = 1``, and the loss of energy is of fourth order.
 
-    Up to ``EXPLICIT_UP_TO`` theta is zero and the result is that of ``angular_acceleration``. From ``STABLE_FROM``
+    Up to ``MAX_EXPLICIT_ANGLE`` theta is zero and the result equals ``angular_acceleration``. From ``MIN_STABLE_ANGLE``
     on it has the value above. In between it rises with the square of the rate.
 
     Args:
@@ -75,8 +75,8 @@ def stable_angular_acceleration(
         Mean angular acceleration over the step, body frame, rad/s^2. (..., 3)
     """
     square = dot(ang_vel, ang_vel)
-    slope = 0.5 * dt * (1 + STABLE_FROM**2) / (STABLE_FROM**2 - EXPLICIT_UP_TO**2)
-    rising = jnp.maximum(slope * dt**2 * square - slope * EXPLICIT_UP_TO**2, 0.0)
+    slope = 0.5 * dt * (1 + MIN_STABLE_ANGLE**2) / (MIN_STABLE_ANGLE**2 - MAX_EXPLICIT_ANGLE**2)
+    rising = jnp.maximum(slope * dt**2 * square - slope * MAX_EXPLICIT_ANGLE**2, 0.0)
     theta_dt = jnp.minimum(rising, 0.5 * dt + 0.5 * dt**3 * square)
 
     ang_momentum = matvec(J, ang_vel, rotor_momentum)

@@ -32,7 +32,7 @@ def rotor_acceleration(cmd: Array, rotor_vel: Array, rotor_dyn_coef: Array) -> A
     return (cmd - rotor_vel) * (a + b * (cmd + rotor_vel))
 
 
-def curve(rotor_vel: Array, coefficients: Array) -> Array:
+def quadratic_curve(rotor_vel: Array, coefficients: Array) -> Array:
     """Return the value of a quadratic curve over the rotor speed: thrust, N, or drag torque, N m.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, Placement
+from crazysim.core.plugin import FunctionPlugin, StagePlacement
 from crazysim.core.settings import check_settings, setting
 from crazysim.envs.state import Obs
 from crazysim.pytree import PyTree
@@ -55,13 +55,13 @@ class Task:
     def install(self, sim: Sim) -> None:
         """Put into a simulation what the task needs: objects, a record, stages. Call it once, before ``DroneEnv``."""
 
-    def add_record(self, sim: Sim, record: PyTree, placements: Sequence[Placement] = ()) -> None:
+    def add_record(self, sim: Sim, record: PyTree, placements: Sequence[StagePlacement] = ()) -> None:
         """Add the task's record, for all worlds, and stages that update it; for use in ``install``.
 
         Args:
             sim: The simulation.
             record: The record, for ``data.plugins["task"]``.
-            placements: Stages with their places in the step, such as ``Placement(stage, before="increment_steps")``.
+            placements: Stages with their positions, such as ``StagePlacement(stage, before="increment_steps")``.
         """
         sim.add(FunctionPlugin(NAME, record, placements))
 

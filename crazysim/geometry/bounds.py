@@ -8,7 +8,7 @@ import numpy as np
 
 from crazysim.geometry.shapes import Shape
 
-UNBOUNDED = 1e18
+UNBOUNDED_LENGTH = 1e18
 """Half length that stands for an unbounded one, m; its square fits into float32."""
 
 
@@ -24,7 +24,7 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
                 low, high = np.array([-x, -y, -base]), np.array([x, y, max(0.0, float(shape.array("heights").max()))])
             return (low + high) / 2, (high - low) / 2
         case "plane":
-            half = [UNBOUNDED] * 3
+            half = [UNBOUNDED_LENGTH] * 3
         case "sphere":
             half = [size[0]] * 3
         case "capsule":
@@ -37,10 +37,10 @@ def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bounding_radius(shape: Shape) -> float:
-    """Return the radius of a ball around a shape whose centre is that of its bounding box, m."""
+    """Return the radius of a ball around a shape, centred at its bounding box, m."""
     match shape.kind:
         case "plane":
-            return UNBOUNDED
+            return UNBOUNDED_LENGTH
         case "sphere" | "ellipsoid":
             return max(shape.size)
         case "capsule":

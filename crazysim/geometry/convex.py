@@ -24,16 +24,16 @@ from crazysim.geometry import support
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.support import segment_support_point
 from crazysim.geometry.triangle import closest_point, closest_point_off_bc, from_barycentric
-from crazysim.geometry.vector import Vector, along, margin, select, stack, unit
+from crazysim.geometry.vector import Vector, axis_vector, normalize, rounding_margin, select_vector, stack_vectors
 
-Best = tuple[Array, Vector]
+BestDirection = tuple[Array, Vector]
 """Largest gap so far, m (...), and its direction."""
 SupportPoint = tuple[Vector, list[Array]]
 """Support point of the Minkowski difference, m, and the point of the segment or box it comes from, in its frame, m."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Pair:
+class ShapePair:
     """Segment or box, and another convex shape whose frame all vectors are in."""
 
     other: Shape
@@ -68,18 +68,18 @@ class Pair:
         coordinates = self.support_coordinates(n)
         return self.point_at(coordinates) - support.support_point(self.other, n), coordinates
 
-    def consider(self, n: Vector, best: Best) -> Best:
+    def with_candidate(self, n: Vector, best: BestDirection) -> BestDirection:
         """Return the direction with the larger gap: the given one or the best so far."""
-        return better((self.gap(n), n), best)
+        return larger_gap((self.gap(n), n), best)
 
 
-def better(new: Best, old: Best) -> Best:
+def larger_gap(new: BestDirection, old: BestDirection) -> BestDirection:
     """Return the direction with the larger gap; on a tie, the old one."""
-    larger = new[0] > old[0] + margin(old[0].dtype) * jnp.abs(old[0])
-    return jnp.where(larger, new[0], old[0]), select(larger, new[1], old[1])
+    larger = new[0] > old[0] + rounding_margin(old[0].dtype) * jnp.abs(old[0])
+    return jnp.where(larger, new[0], old[0]), select_vector(larger, new[1], old[1])
 
 
-def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
+def find_separation(pair: ShapePair, n: Vector, steps: int) -> tuple[BestDirection, list[Array]]:
     """Return the direction between the nearest points of separated shapes, and the nearest point of the first shape.
 
     A triangle of support points of the Minkowski difference moves towards the origin. Each step adds the support point
@@ -90,24 +90,24 @@ def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
         n: Initial direction.
         steps: Number of support points to add.
     """
-    fallback = along(2, pair.centre.x)
+    fallback = axis_vector(2, pair.centre.x)
 
     def step(_: int, carry: Any) -> Any:
         triangle, nearest, best = carry
-        n = unit(nearest, fallback)
+        n = normalize(nearest, fallback)
         new = pair.support_point(n)
         size = nearest.dot(nearest)
         kept = (triangle, nearest)
         p, q, r = (point for point, _ in triangle)
-        b, c = stack([p, q, r]), stack([q, r, p])
+        b, c = stack_vectors([p, q, r]), stack_vectors([q, r, p])
         points = from_barycentric(closest_point_off_bc(new[0], b, c), new[0], b, c)
         squares = points.dot(points)
         for k in range(3):
-            closer = squares[k] < size * (1 - margin(size.dtype))
+            closer = squares[k] < size * (1 - rounding_margin(size.dtype))
             tried = ((new, triangle[k], triangle[(k + 1) % 3]), points[k])
             kept = jax.tree.map(partial(jnp.where, closer), tried, kept)
             size = jnp.where(closer, squares[k], size)
-        return (*kept, pair.consider(n, best))
+        return (*kept, pair.with_candidate(n, best))
 
     first = pair.support_point(n)
     triangle, nearest, best = lax.fori_loop(0, steps, step, ((first,) * 3, first[0], (pair.gap(n), n)))
@@ -116,4 +116,4 @@ def separate(pair: Pair, n: Vector, steps: int) -> tuple[Best, list[Array]]:
         jnp.asarray(sum(w * x for w, x in zip(shares, xs, strict=True)))
         for xs in zip(*(e for _, e in triangle), strict=True)
     ]
-    return pair.consider(unit(nearest, fallback), best), coordinates
+    return pair.with_candidate(normalize(nearest, fallback), best), coordinates

@@ -36,7 +36,7 @@ def point_distance(shape: Shape, point: Array) -> Array:
 
 
 def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
-    """Return the signed distance between two shapes: that of their nearest points, or minus their overlap, m. (...)
+    """Return the signed distance between two shapes: between their nearest points, or minus their overlap, m. (...)
 
     The overlap is the length of the shortest translation that separates them. Exact for spheres, for capsules and
     boxes against a plane, sphere or capsule, and for a capsule against a box. For other pairs see ``convex_distance``
@@ -47,7 +47,7 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
         a: Shape of the drone: a sphere, capsule or box.
         b: Other shape, of any kind.
         pos: Position of the centre of ``a`` in the frame of ``b``, m. (..., 3)
-        rot: Rotation matrix from the frame of ``a`` to that of ``b``. (..., 3, 3)
+        rot: Rotation matrix from the frame of ``a`` to the frame of ``b``. (..., 3, 3)
 
     Raises:
         ConfigError: If ``a`` is of another kind.

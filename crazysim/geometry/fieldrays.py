@@ -5,11 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.geometry.heightfield import height, spacing
+from crazysim.geometry.heightfield import cell_sides, height_at
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.vector import Vector, select, unit, vector
+from crazysim.geometry.vector import Vector, normalize, select_vector, to_vector
 
-PARALLEL = 1e-12
+MIN_COMPONENT = 1e-12
 """Component of a unit direction below which a ray counts as parallel; its inverse and square fit into float32."""
 
 Hit = tuple[Array, Vector]
@@ -31,31 +31,33 @@ def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Arr
         Distance, m, infinite where it misses. (...)
         Unit normal, zero where it misses. (..., 3)
     """
-    o, d = vector(lax.stop_gradient(origin)), vector(lax.stop_gradient(direction))
-    t, n = _nearer(_nearer(_base(shape, o, d), _walls(shape, o, d)), _surface(shape, o, d))
+    o, d = to_vector(lax.stop_gradient(origin)), to_vector(lax.stop_gradient(direction))
+    t, n = _nearer_hit(_nearer_hit(_base_hit(shape, o, d), _wall_hits(shape, o, d)), _surface_hit(shape, o, d))
     hit = jnp.isfinite(t)
-    # The surface is locally flat, so the derivative is that of the distance to the plane of the hit.
+    # The surface is locally flat, so the derivative is taken of the distance to the plane of the hit.
     reached = o + d * jnp.where(hit, t, 0.0)
-    o, d = vector(origin), vector(direction)
+    o, d = to_vector(origin), to_vector(direction)
     across = n.dot(d)
-    safe = hit & (jnp.abs(across) > PARALLEL)
+    safe = hit & (jnp.abs(across) > MIN_COMPONENT)
     moving = n.dot(reached - o) / jnp.where(safe, across, 1.0)
     exact = jnp.where(safe, moving + lax.stop_gradient(t - moving), t)
     normal = jnp.stack([n.x, n.y, n.z], axis=-1)
     return jnp.where(hit, exact, jnp.inf), jnp.where(hit[..., None], normal, 0.0)
 
 
-def _nearer(a: Hit, b: Hit) -> Hit:
-    return jnp.where(a[0] < b[0], a[0], b[0]), select(a[0] < b[0], a[1], b[1])
+def _nearer_hit(a: Hit, b: Hit) -> Hit:
+    return jnp.where(a[0] < b[0], a[0], b[0]), select_vector(a[0] < b[0], a[1], b[1])
 
 
-def _faces(half: tuple[float, float], origin: Vector, direction: Vector) -> list[tuple[Array, Vector, Array, Array]]:
+def _face_hits(
+    half: tuple[float, float], origin: Vector, direction: Vector
+) -> list[tuple[Array, Vector, Array, Array]]:
     """Return for each of the four walls: distance, outward normal, and the x and y of the hit."""
     zero = jnp.zeros_like(origin.x)
     out = []
     for side in (-1.0, 1.0):
         for k, (p, v, h) in enumerate(((origin.x, direction.x, half[0]), (origin.y, direction.y, half[1]))):
-            crosses = jnp.abs(v) > PARALLEL
+            crosses = jnp.abs(v) > MIN_COMPONENT
             t = (side * h - p) / jnp.where(crosses, v, 1.0)
             n = Vector(zero + side, zero, zero) if k == 0 else Vector(zero, zero + side, zero)
             along = origin.y + t * direction.y if k == 0 else origin.x + t * direction.x
@@ -64,15 +66,15 @@ def _faces(half: tuple[float, float], origin: Vector, direction: Vector) -> list
     return out
 
 
-def _base(shape: Shape, origin: Vector, direction: Vector) -> Hit:
+def _base_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     """Return the hits of the box below z = 0."""
     x_half, y_half, _, base = shape.size
     zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
-    for t, n, _, _ in _faces((x_half, y_half), origin, direction):
+    for t, n, _, _ in _face_hits((x_half, y_half), origin, direction):
         z = origin.z + jnp.where(jnp.isfinite(t), t, 0.0) * direction.z
-        hit = _nearer((jnp.where((z <= 0) & (z >= -base), t, jnp.inf), n), hit)
-    crosses = jnp.abs(direction.z) > PARALLEL
+        hit = _nearer_hit((jnp.where((z <= 0) & (z >= -base), t, jnp.inf), n), hit)
+    crosses = jnp.abs(direction.z) > MIN_COMPONENT
     for level, up in ((0.0, 1.0), (-base, -1.0)):
         t = (level - origin.z) / jnp.where(crosses, direction.z, 1.0)
         within = (
@@ -81,33 +83,33 @@ def _base(shape: Shape, origin: Vector, direction: Vector) -> Hit:
             & (jnp.abs(origin.x + t * direction.x) <= x_half)
             & (jnp.abs(origin.y + t * direction.y) <= y_half)
         )
-        hit = _nearer((jnp.where(within, t, jnp.inf), Vector(zero, zero, zero + up)), hit)
+        hit = _nearer_hit((jnp.where(within, t, jnp.inf), Vector(zero, zero, zero + up)), hit)
     return hit
 
 
-def _walls(shape: Shape, origin: Vector, direction: Vector) -> Hit:
+def _wall_hits(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     """Return the hits of the walls between z = 0 and the surface."""
     zero = jnp.zeros_like(origin.x)
     hit = (zero + jnp.inf, Vector(zero, zero, zero))
-    for t, n, x, y in _faces(shape.size[:2], origin, direction):  # type: ignore[arg-type]
+    for t, n, x, y in _face_hits(shape.size[:2], origin, direction):  # type: ignore[arg-type]
         z = origin.z + jnp.where(jnp.isfinite(t), t, 0.0) * direction.z
         x, y = jnp.clip(x, -shape.size[0], shape.size[0]), jnp.clip(y, -shape.size[1], shape.size[1])
-        hit = _nearer((jnp.where((z >= 0) & (z <= height(shape, x, y, origin)), t, jnp.inf), n), hit)
+        hit = _nearer_hit((jnp.where((z >= 0) & (z <= height_at(shape, x, y, origin)), t, jnp.inf), n), hit)
     return hit
 
 
-def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
+def _surface_hit(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     """Return the hits of the triangles, by traversing the cells below each ray in order."""
     ground = shape.array("heights")
     n_rows, n_columns = ground.shape
     heights = jnp.asarray(ground, origin.x.dtype)
-    side_x, side_y = spacing(shape)
+    side_x, side_y = cell_sides(shape)
     # Origin and direction in units of cells.
     u, v = (origin.x + shape.size[0]) / side_x, (origin.y + shape.size[1]) / side_y
     du, dv = direction.x / side_x, direction.y / side_y
     start = jnp.zeros_like(origin.x)
     for p, step, n in ((u, du, n_columns - 1), (v, dv, n_rows - 1)):
-        moves = jnp.abs(step) > PARALLEL
+        moves = jnp.abs(step) > MIN_COMPONENT
         enters = (jnp.where(step > 0, 0.0, float(n)) - p) / jnp.where(moves, step, 1.0)
         start = jnp.where(moves & (enters > start), enters, start)
     column = jnp.clip(jnp.floor(u + start * du), 0, n_columns - 2).astype(jnp.int32)
@@ -123,17 +125,17 @@ def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
         for rise_x, rise_y, right in ((b - a, c - b, 1.0), (c - e, e - a, -1.0)):
             # Height of the ray's origin above the plane of the triangle, and its rate of descent towards it.
             above, sinks = origin.z - a - rise_x * x - rise_y * y, rise_x * du + rise_y * dv - direction.z
-            meets = jnp.abs(sinks) > PARALLEL
+            meets = jnp.abs(sinks) > MIN_COMPONENT
             t = above / jnp.where(meets, sinks, 1.0)
             at_x, at_y = x + t * du, y + t * dv
             on = (at_x >= -slack) & (at_x <= 1 + slack) & (at_y >= -slack) & (at_y <= 1 + slack)
             on = on & (right * (at_x - at_y) >= -slack) & meets & inside & (t >= 0)
             n = Vector(-rise_x / side_x, -rise_y / side_y, jnp.ones_like(t))
-            hit = _nearer((jnp.where(on, t, jnp.inf), n), hit)
+            hit = _nearer_hit((jnp.where(on, t, jnp.inf), n), hit)
         step = jnp.int32(1)
         # Continue with the neighbour whose border is nearer.
         right, up = du > 0, dv > 0
-        moves_x, moves_y = jnp.abs(du) > PARALLEL, jnp.abs(dv) > PARALLEL
+        moves_x, moves_y = jnp.abs(du) > MIN_COMPONENT, jnp.abs(dv) > MIN_COMPONENT
         t_x = jnp.where(moves_x, (jnp.where(right, 1.0, 0.0) - x) / jnp.where(moves_x, du, 1.0), jnp.inf)
         t_y = jnp.where(moves_y, (jnp.where(up, 1.0, 0.0) - y) / jnp.where(moves_y, dv, 1.0), jnp.inf)
         by_x = t_x <= t_y
@@ -144,4 +146,4 @@ def _surface(shape: Shape, origin: Vector, direction: Vector) -> Hit:
     zero = jnp.zeros_like(origin.x)
     none = (zero + jnp.inf, Vector(zero, zero, zero + 1))
     (_, _, (t, n)), _ = lax.scan(cell, (column, row, none), length=n_rows + n_columns - 2)
-    return t, unit(n, n)
+    return t, normalize(n, n)

@@ -12,17 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from crazysim.geometry.points import larger, triangles_distance
+from crazysim.geometry.points import maximum, triangles_distance
 from crazysim.geometry.segments import segment_to_box
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.vector import Vector, vector
+from crazysim.geometry.vector import Vector, to_vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
-FAR = 1e3
-"""Distance of places beyond the border of a field, m: without contact, and finite, as solvers need it."""
+OUTSIDE_DISTANCE = 1e3
+"""Distance of points beyond the border of a field, m: without contact, and finite, as solvers need it."""
 
 
-def spacing(shape: Shape) -> tuple[float, float]:
+def cell_sides(shape: Shape) -> tuple[float, float]:
     """Return the side lengths of a cell along x and y, m."""
     n_rows, n_columns = shape.array("heights").shape
     return 2 * shape.size[0] / (n_columns - 1), 2 * shape.size[1] / (n_rows - 1)
@@ -39,18 +39,20 @@ def field_distance(shape: Shape, point: Array, radius: float = 0.0) -> Array:
         point: Points in the frame of the field, m. (..., 3)
         radius: Distance up to which the result is exact, m; at least one side of a cell.
     """
-    position = vector(point)
+    position = to_vector(point)
     x_half, y_half, _, base = shape.size
-    grid = corners_near(shape, position, radius)
+    grid = nearby_corners(shape, position, radius)
     surface = triangles_distance(position, *triangles(grid))
     # The walls and the bottom can be nearer than the surface.
     qx, qy = safe_clip(position.x, -x_half, x_half), safe_clip(position.y, -y_half, y_half)
-    below = position.z < height(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), position)
-    dx, dy, dz = position.x - qx, position.y - qy, larger(-base - position.z, 0.0)
+    below = position.z < height_at(shape, lax.stop_gradient(qx), lax.stop_gradient(qy), position)
+    dx, dy, dz = position.x - qx, position.y - qy, maximum(-base - position.z, 0.0)
     beside = safe_sqrt(dx * dx + dy * dy + dz * dz)
-    wall = larger(larger(position.x - x_half, -x_half - position.x), larger(position.y - y_half, -y_half - position.y))
-    wall = larger(wall, -base - position.z)
-    inside = larger(-surface, wall)
+    wall = maximum(
+        maximum(position.x - x_half, -x_half - position.x), maximum(position.y - y_half, -y_half - position.y)
+    )
+    wall = maximum(wall, -base - position.z)
+    inside = maximum(-surface, wall)
     return jnp.where(below, jnp.where(wall < 0, inside, beside), surface)
 
 
@@ -66,16 +68,16 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
         half: Half lengths of the box, m; zeros for a segment. (3,)
         shape: Height field.
         pos: Position of the centre of the box in the frame of the field, m. (..., 3)
-        rot: Rotation matrix from the frame of the box to that of the field. (..., 3, 3)
+        rot: Rotation matrix from the frame of the box to the frame of the field. (..., 3, 3)
     """
     size = math.sqrt(sum(h * h for h in half))
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0] if h else [0.0] for h in half], indexing="ij"), axis=-1).reshape(-1, 3)
     ends = jnp.asarray(signs * np.asarray(half), pos.dtype)
     tips = pos[..., None, :] + sum(rot[..., None, :, k] * ends[:, k, None] for k in range(3))
     out = jnp.min(field_distance(shape, tips, size), axis=-1)
-    grid = corners_near(shape, vector(lax.stop_gradient(pos)), 2 * size)
-    axes = [vector(rot[..., k]) for k in range(3)]
-    position = vector(pos)
+    grid = nearby_corners(shape, to_vector(lax.stop_gradient(pos)), 2 * size)
+    axes = [to_vector(rot[..., k]) for k in range(3)]
+    position = to_vector(pos)
     a, b = edges(grid)
     middle, along = (a + b) * 0.5, b - a
     length = jnp.sqrt(along.dot(along))
@@ -89,13 +91,13 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     return jnp.where(of_edges < out, of_edges, out)
 
 
-def corners_near(shape: Shape, position: Vector, radius: float) -> Vector:
+def nearby_corners(shape: Shape, position: Vector, radius: float) -> Vector:
     """Return the corners of the cells within a radius of a point, without derivatives, m. (..., n_y + 1, n_x + 1)"""
     heights = shape.array("heights")
     starts, counts = [], []
     for coordinate, half, side, n in (
-        (position.y, shape.size[1], spacing(shape)[1], heights.shape[0] - 1),
-        (position.x, shape.size[0], spacing(shape)[0], heights.shape[1] - 1),
+        (position.y, shape.size[1], cell_sides(shape)[1], heights.shape[0] - 1),
+        (position.x, shape.size[0], cell_sides(shape)[0], heights.shape[1] - 1),
     ):
         around = max(1, math.ceil(radius / side))
         count = min(n, 2 * around + 1)
@@ -106,7 +108,7 @@ def corners_near(shape: Shape, position: Vector, radius: float) -> Vector:
     columns = starts[1][..., None, None] + jnp.arange(counts[1])
     rows, columns = jnp.broadcast_arrays(rows, columns)
     dtype = position.x.dtype
-    side_x, side_y = spacing(shape)
+    side_x, side_y = cell_sides(shape)
     z = jnp.asarray(heights, dtype)[rows, columns]
     return Vector(columns.astype(dtype) * side_x - shape.size[0], rows.astype(dtype) * side_y - shape.size[1], z)
 
@@ -137,7 +139,7 @@ def edges(grid: Vector) -> tuple[Vector, Vector]:
     return join((every, low), (low, every), (low, low)), join((every, high), (high, every), (high, high))
 
 
-def height(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
+def height_at(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
     """Return the height of the surface at positions within the field, m. (...)"""
     grid_x, grid_y, along_x, along_y, origin = plane_at(shape, x, y, like)
     return origin + along_x * grid_x + along_y * grid_y
@@ -146,19 +148,19 @@ def height(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
 def plane_at(shape: Shape, x: Array, y: Array, like: Vector) -> tuple[Array, Array, Array, Array, Array]:
     """Return the position in its cell (0 to 1, x and y), the rises of its triangle and the height of its origin, m."""
     heights = jnp.asarray(shape.array("heights"), like.x.dtype)
-    side_x, side_y = spacing(shape)
+    side_x, side_y = cell_sides(shape)
     return triangle_at(heights, (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y)
 
 
-def surface(heights: Array, half: Array, point: Array) -> tuple[Array, Array, Array]:
-    """Return height and normal of the surface at a place, and whether it lies on the field.
+def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array, Array]:
+    """Return height and normal of the surface at a point, and whether it lies on the field.
 
     Beyond its border the field continues with the heights of the border.
 
     Args:
         heights: Heights of the nodes, rows along y and columns along x, m. (n_rows, n_columns)
         half: Half extents along x and y, m. (2,)
-        point: Place in the frame of the field, whose z does not count, m. (..., 3)
+        point: Point in the frame of the field; its z does not count, m. (..., 3)
 
     Returns:
         Height, m (...), unit normal, upwards (..., 3), and True on the field (...).
@@ -179,23 +181,23 @@ def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
     """Return the distance of a point to the plane of the triangle below it, m (...), and the plane's normal (..., 3).
 
     That is the signed distance to the ground near a surface without sharp edges, for a small part of the cost of
-    ``field_distance``. Beyond the border, and below the ground's bottom, it is ``FAR``.
+    ``field_distance``. Beyond the border, and below the ground's bottom, it is ``OUTSIDE_DISTANCE``.
     """
     half = jnp.asarray(shape.size[:2], point.dtype)
-    height, normal, inside = surface(jnp.asarray(shape.array("heights"), point.dtype), half, point)
+    height, normal, inside = surface_at(jnp.asarray(shape.array("heights"), point.dtype), half, point)
     inside = inside & (point[..., 2] > -shape.size[3])
-    return jnp.where(inside, (point[..., 2] - height) * normal[..., 2], FAR), normal
+    return jnp.where(inside, (point[..., 2] - height) * normal[..., 2], OUTSIDE_DISTANCE), normal
 
 
 def triangle_at(heights: Array, u: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the triangle below a place: the position in its cell, its rises, and the height of the cell's origin.
+    """Return the triangle below a point: the position in its cell, its rises, and the height of the cell's origin.
 
-    A place outside the grid belongs to the plane of the nearest cell.
+    A point outside the grid belongs to the plane of the nearest cell.
 
     Args:
         heights: Heights of the nodes, rows along y and columns along x, m. (n_rows, n_columns)
-        u: Place along x in units of cells. (...)
-        v: Place along y in units of cells. (...)
+        u: Coordinate along x in units of cells. (...)
+        v: Coordinate along y in units of cells. (...)
 
     Returns:
         Position in the cell along x and y, rises of the triangle over a cell along x and y, m, and height at the

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from crazysim import rotation
-from crazysim.geometry.heightfield import FAR
-from crazysim.geometry.linear import apply, matmul
+from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
+from crazysim.geometry.small_matrices import matmul, matvec
 
-N_OF_BOXES = 13
+N_BOX_POINTS = 13
 """Number of points of two boxes."""
-PARALLEL = 1e-3
+MIN_EDGE_SINE = 1e-3
 """Sine of the angle of two edges below which they span no separating axis."""
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
 """An axis of two edges is taken where its overlap is below this share of that of the best face, by more than this share
@@ -25,7 +25,7 @@ of the smaller box: faces have several points, which rest more steadily."""
 FACE_BIAS = 1e-3
 """A face of the first box is taken unless one of the second has less overlap by this share of the smaller box: between
 aligned boxes rounding would choose, and impulses of the last step would belong to other points."""
-WITHIN = 1 - 1e-4
+FACE_SHARE = 1 - 1e-4
 """Share of a face within which the corners of the other are points of their own; beyond, its clipped edges are, up to
 as far outside of the face."""
 
@@ -41,7 +41,7 @@ class Manifold(NamedTuple):
     """Middle of the gap, m. (n, 3)"""
 
 
-def balls(radius_a: Array, pos_a: Array, radius_b: Array, pos_b: Array) -> Manifold:
+def ball_contacts(radius_a: Array, pos_a: Array, radius_b: Array, pos_b: Array) -> Manifold:
     """Return the contact point of two balls, of radii, m (), and positions, world frame, m (3,)."""
     offset = pos_a - pos_b
     up = jnp.asarray([0.0, 0.0, 1.0], offset.dtype)
@@ -50,7 +50,7 @@ def balls(radius_a: Array, pos_a: Array, radius_b: Array, pos_b: Array) -> Manif
     return Manifold(gap, normal[None], (pos_b + normal * (radius_b + 0.5 * gap))[None])
 
 
-def ball_on_box(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box: Array) -> Manifold:
+def ball_box_contacts(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box: Array) -> Manifold:
     """Return the contact point of a ball, the first body, and a box.
 
     Args:
@@ -60,7 +60,7 @@ def ball_on_box(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box:
         pos_box: Position of its centre, world frame, m. (3,)
         rot_box: Rotation matrix from its frame to the world. (3, 3)
     """
-    centre = apply(rot_box.T, pos - pos_box)
+    centre = matvec(rot_box.T, pos - pos_box)
     nearest = rotation.safe_clip(centre, -size, size)
     out = centre - nearest
     distance = rotation.safe_norm(out)
@@ -71,11 +71,11 @@ def ball_on_box(radius: Array, pos: Array, size: Array, pos_box: Array, rot_box:
     is_out = distance > 0
     normal = jnp.where(is_out, out / jnp.where(is_out, distance, 1.0), face)
     gap = jnp.where(is_out, distance, -jnp.min(depth)) - radius
-    normal = apply(rot_box, normal)
+    normal = matvec(rot_box, normal)
     return Manifold(gap, normal[None], (pos - normal * (radius + 0.5 * gap))[None])
 
 
-def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array, rot_b: Array) -> Manifold:
+def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array, rot_b: Array) -> Manifold:
     """Return the contact points of two boxes.
 
     They are separated by the axis of least overlap among the normals of their faces and the products of their edges
@@ -93,20 +93,20 @@ def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array
     offset = pos_a - pos_b
     turn = matmul(rot_b.T, rot_a)
     size = jnp.abs(turn)
-    along_a, along_b = apply(rot_a.T, offset), apply(rot_b.T, offset)
+    along_a, along_b = matvec(rot_a.T, offset), matvec(rot_b.T, offset)
     faces = jnp.concatenate([
-        jnp.abs(along_a) - half_a - apply(size.T, half_b),
-        jnp.abs(along_b) - half_b - apply(size, half_a),
+        jnp.abs(along_a) - half_a - matvec(size.T, half_b),
+        jnp.abs(along_b) - half_b - matvec(size, half_a),
     ])  # fmt: skip
     smaller = jnp.minimum(jnp.min(half_a), jnp.min(half_b))
     best = jnp.argmax(lax.stop_gradient(faces + FACE_BIAS * smaller * jnp.asarray([1, 1, 1, 0, 0, 0], faces.dtype)))
     axes = rotation.cross(rot_b.T[:, None], rot_a.T[None])  # (3 of b, 3 of a, 3)
     length = rotation.safe_norm(axes)
-    spans = length[..., 0] > PARALLEL
-    axes = axes / jnp.where(length > PARALLEL, length, 1.0)
+    spans = length[..., 0] > MIN_EDGE_SINE
+    axes = axes / jnp.where(length > MIN_EDGE_SINE, length, 1.0)
     reach = jnp.sum(half_a * jnp.abs(jnp.sum(axes[..., None] * rot_a, axis=-2)), axis=-1)
     reach = reach + jnp.sum(half_b * jnp.abs(jnp.sum(axes[..., None] * rot_b, axis=-2)), axis=-1)
-    edges = jnp.where(spans, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -FAR).reshape(-1)
+    edges = jnp.where(spans, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -OUTSIDE_DISTANCE).reshape(-1)
     pair = jnp.argmax(lax.stop_gradient(edges))
     by_edge = edges[pair] > EDGE_SHARE * faces[best] + EDGE_BIAS * smaller
     # Apart, the axis of largest distance counts, face or edge; between level faces that touch rounding would choose.
@@ -116,15 +116,17 @@ def boxes(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array
     own = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
     face = tuple(jnp.where(is_a, x, y) for x, y in zip(*own, strict=True))
     other = tuple(jnp.where(is_a, y, x) for x, y in zip(*own, strict=True))
-    gap, normal, point = _clipped(face, best % 3, other)
-    gap_edge, normal_edge, point_edge = _crossed(own, pair, axes.reshape(-1, 3)[pair], offset)
-    gap = jnp.concatenate([jnp.where(by_edge, FAR, gap), jnp.where(by_edge, gap_edge, FAR)[None]])
+    gap, normal, point = _clip_face(face, best % 3, other)
+    gap_edge, normal_edge, point_edge = _edge_contact(own, pair, axes.reshape(-1, 3)[pair], offset)
+    gap = jnp.concatenate(
+        [jnp.where(by_edge, OUTSIDE_DISTANCE, gap), jnp.where(by_edge, gap_edge, OUTSIDE_DISTANCE)[None]]
+    )
     normal = jnp.where(is_a, -normal, normal)
     normal = jnp.concatenate([jnp.broadcast_to(normal, point.shape), normal_edge[None]])
     return Manifold(gap, normal, jnp.concatenate([point, point_edge[None]]))
 
 
-def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> tuple[Array, Array, Array]:
     """Return gaps, normal of the face towards the other box, and points of the other's nearest face clipped to it.
 
     Args:
@@ -132,21 +134,21 @@ def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> 
         axis: Axis of the face, 0 to 2.
         other: The same of the other box.
     """
-    half, pos, rot = _rolled(face, axis)
+    half, pos, rot = _renumber_axes(face, axis)
     offset = other[1] - pos
     side = jnp.where(jnp.sum(offset * rot[:, 0]) < 0, -1.0, 1.0)
     normal = side * rot[:, 0]
-    against = apply(other[2].T, normal)
+    against = matvec(other[2].T, normal)
     turned = jnp.argmax(lax.stop_gradient(jnp.abs(against)))
-    half_o, _, rot_o = _rolled(other, turned)
+    half_o, _, rot_o = _renumber_axes(other, turned)
     # The other's nearest face: its middle and its half edges, in the plane of the face (u, v) and along its normal (s).
     sign = jnp.where(against[turned] > 0, -1.0, 1.0)
     frame = jnp.stack([rot[:, 1], rot[:, 2], normal])
-    middle = apply(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
-    edge_1, edge_2 = half_o[1] * apply(frame, rot_o[:, 1]), half_o[2] * apply(frame, rot_o[:, 2])
+    middle = matvec(frame, offset + sign * half_o[0] * rot_o[:, 0]) - jnp.stack([0 * side, 0 * side, half[0]])
+    edge_1, edge_2 = half_o[1] * matvec(frame, rot_o[:, 1]), half_o[2] * matvec(frame, rot_o[:, 2])
     ring = jnp.stack([middle + x * edge_1 + y * edge_2 for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     along = jnp.roll(ring, -1, axis=0) - ring
-    limit = half[1:] * (2 - WITHIN)
+    limit = half[1:] * (2 - FACE_SHARE)
     first, last = jnp.zeros(4, pos.dtype), jnp.ones(4, pos.dtype)
     for k in range(2):
         speed = along[:, k]
@@ -167,38 +169,38 @@ def _clipped(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -> 
     away = at - middle[:2]
     p = (away[:, 0] * edge_2[1] - away[:, 1] * edge_2[0]) / det
     q = (edge_1[0] * away[:, 1] - edge_1[1] * away[:, 0]) / det
-    valid.append((jnp.abs(p) < WITHIN) & (jnp.abs(q) < WITHIN))
+    valid.append((jnp.abs(p) < FACE_SHARE) & (jnp.abs(q) < FACE_SHARE))
     height = middle[2] + p * edge_1[2] + q * edge_2[2]
     found.append(jnp.concatenate([at, height[:, None]], axis=-1))
     points = jnp.concatenate(found)
-    gap = jnp.where(jnp.concatenate(valid), points[:, 2], FAR)
-    place = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
-    return gap, normal, pos + jnp.sum(place[:, :, None] * frame[None], axis=-2)
+    gap = jnp.where(jnp.concatenate(valid), points[:, 2], OUTSIDE_DISTANCE)
+    local = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
+    return gap, normal, pos + jnp.sum(local[:, :, None] * frame[None], axis=-2)
 
 
-def _crossed(
+def _edge_contact(
     boxes: tuple[tuple[Array, ...], ...], pair: Array, axis: Array, offset: Array
 ) -> tuple[Array, Array, Array]:
     """Return gap, normal and point of two edges, whose numbers are ``pair // 3`` of b and ``pair % 3`` of a."""
     normal = jnp.where(jnp.sum(axis * offset) < 0, -1.0, 1.0) * axis
     ends = []
     for (half, pos, rot), number, side in zip(boxes, (pair % 3, pair // 3), (-1.0, 1.0), strict=True):
-        toward = apply(rot.T, normal)
+        toward = matvec(rot.T, normal)
         is_edge = jnp.arange(3) == number
-        place = jnp.where(is_edge, 0.0, side * jnp.where(toward < 0, -1.0, 1.0) * half)
+        local = jnp.where(is_edge, 0.0, side * jnp.where(toward < 0, -1.0, 1.0) * half)
         along = jnp.sum(jnp.where(is_edge, rot, 0.0), axis=-1)
-        ends.append((pos + apply(rot, place), along, jnp.sum(jnp.where(is_edge, half, 0.0))))
+        ends.append((pos + matvec(rot, local), along, jnp.sum(jnp.where(is_edge, half, 0.0))))
     (p, u, reach_p), (q, v, reach_q) = ends
     between = p - q
     c, d, e = (jnp.sum(x * y) for x, y in ((u, v), (u, between), (v, between)))
-    det = jnp.maximum(1 - c * c, PARALLEL**2)
+    det = jnp.maximum(1 - c * c, MIN_EDGE_SINE**2)
     s = rotation.safe_clip((c * e - d) / det, -reach_p, reach_p)
     t = rotation.safe_clip((e - c * d) / det, -reach_q, reach_q)
     on_a, on_b = p + s * u, q + t * v
     return jnp.sum((on_a - on_b) * normal), normal, 0.5 * (on_a + on_b)
 
 
-def _rolled(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
+def _renumber_axes(box: tuple[Array, ...], axis: Array) -> tuple[Array, ...]:
     """Return half lengths, position and attitude of a box with its axes renumbered so that one comes first."""
     half, pos, rot = box
 

@@ -14,24 +14,24 @@ import math
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.geometry.convex import Best, Pair, better, separate
+from crazysim.geometry.convex import BestDirection, ShapePair, find_separation, larger_gap
 from crazysim.geometry.points import ellipsoid_normal
 from crazysim.geometry.shapes import Shape
-from crazysim.geometry.triangle import THIN
-from crazysim.geometry.vector import Vector, along, select, stack, unit, vector
+from crazysim.geometry.triangle import MIN_SQUARED_SINE
+from crazysim.geometry.vector import Vector, axis_vector, normalize, select_vector, stack_vectors, to_vector
 
 SEPARATION_STEPS = 16
 """Steps towards the nearest points of separated shapes; polytopes need few, curved shapes more."""
 TOUCH_STEPS = 24
 """Further steps from the best direction towards the nearest or touching points."""
-SEPARATION = 0.02
+SEPARATION_SHARE = 0.02
 """Distance to which overlapping shapes are separated for these steps, as a fraction of the moving half length."""
-ARCS = 16
+N_ARCS = 16
 """Number of arcs of a circle of directions, each searched for the smallest depth."""
-ARC_STEPS = 6
+N_ARC_STEPS = 6
 """Refinement steps within the best arc."""
 
-Flat = tuple[Array, Array]
+PlaneVector = tuple[Array, Array]
 """Vector in the plane of a circle. 2 of (...)"""
 
 
@@ -44,55 +44,55 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     deep inside a curved shape its direction has an error of some hundredths.
 
     Args:
-        a: Box, or capsule of which only the core counts, without its radius.
+        a: Box, or the core of a capsule, without its radius.
         b: Box, cylinder, ellipsoid or mesh.
         pos: Position of the centre of ``a`` in the frame of ``b``, m. (..., 3)
-        rot: Rotation matrix from the frame of ``a`` to that of ``b``. (..., 3, 3)
+        rot: Rotation matrix from the frame of ``a`` to the frame of ``b``. (..., 3, 3)
     """
     half = (a.size[1],) if a.kind == "capsule" else a.size
-    centre, edges = vector(pos), [vector(rot[..., k]) for k in range(3)][-len(half) :]
-    fixed = Pair(b, half, *lax.stop_gradient((edges, centre)))
-    fallback = along(2, centre.x)
-    best, _ = separate(fixed, unit(fixed.centre, fallback), SEPARATION_STEPS)
-    gap, n = overlap(fixed, a.kind == "box", best)
-    # Separated along the direction found, the shapes have nearest points, which are those of first contact.
-    aside = SEPARATION * max(half)
+    centre, edges = to_vector(pos), [to_vector(rot[..., k]) for k in range(3)][-len(half) :]
+    fixed = ShapePair(b, half, *lax.stop_gradient((edges, centre)))
+    fallback = axis_vector(2, centre.x)
+    best, _ = find_separation(fixed, normalize(fixed.centre, fallback), SEPARATION_STEPS)
+    gap, n = find_overlap(fixed, a.kind == "box", best)
+    # Separated along the direction found, the shapes have nearest points, at which they touch first.
+    aside = SEPARATION_SHARE * max(half)
     parted = dataclasses.replace(fixed, centre=fixed.centre + n * jnp.where(gap < aside, aside - gap, 0.0))
-    (_, m), coordinates = separate(parted, n, TOUCH_STEPS)
-    n = fixed.consider(m, (gap, n))[1]
-    n = unit(n, fallback)
-    # The derivative of the distance is that of the nearest point of the moving shape.
-    moving = Pair(b, half, edges, centre).point_at(coordinates).dot(n)
+    (_, m), coordinates = find_separation(parted, n, TOUCH_STEPS)
+    n = fixed.with_candidate(m, (gap, n))[1]
+    n = normalize(n, fallback)
+    # The derivative of the distance is taken at the nearest point of the moving shape.
+    moving = ShapePair(b, half, edges, centre).point_at(coordinates).dot(n)
     return moving + lax.stop_gradient(fixed.gap(n) - moving)
 
 
-def overlap(pair: Pair, is_box: bool, best: Best) -> Best:
+def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDirection:
     """Return the best of a direction and all candidate normals of the Minkowski difference."""
     b, edges = pair.other, pair.edges
-    own = [along(k, pair.centre.x) for k in range(3)]
+    own = [axis_vector(k, pair.centre.x) for k in range(3)]
     sides = {"box": own, "cylinder": own[2:]}.get(b.kind, [])
     faces = [*(edges if is_box else []), *sides]
     if b.kind == "box":
-        faces += [unit(edge.cross(axis), axis, THIN) for edge in edges for axis in own]
+        faces += [normalize(edge.cross(axis), axis, MIN_SQUARED_SINE) for edge in edges for axis in own]
     if faces:
-        n = stack([*faces, *(-n for n in faces)])
-        best = _best_of((pair.gap(n), n), best)
+        n = stack_vectors([*faces, *(-n for n in faces)])
+        best = _select_best((pair.gap(n), n), best)
     if b.kind == "box":
         return best
     if b.kind == "mesh":
-        best = better(_best_face(pair), best)
-    best = _best_of(_best_across(pair, stack([*edges, *sides])), best)
-    return _best_at_ends(pair, best) if b.kind == "ellipsoid" else best
+        best = larger_gap(_best_face_normal(pair), best)
+    best = _select_best(_best_perpendicular(pair, stack_vectors([*edges, *sides])), best)
+    return _best_end_normal(pair, best) if b.kind == "ellipsoid" else best
 
 
-def _best_of(tried: Best, best: Best) -> Best:
+def _select_best(tried: BestDirection, best: BestDirection) -> BestDirection:
     """Return the best of the directions along the first axis and the best so far."""
     for k in range(tried[0].shape[0]):
-        best = better((tried[0][k], tried[1][k]), best)
+        best = larger_gap((tried[0][k], tried[1][k]), best)
     return best
 
 
-def _best_face(pair: Pair) -> Best:
+def _best_face_normal(pair: ShapePair) -> BestDirection:
     """Return the best of the face normals of a mesh."""
     normals, offsets = pair.other.array("normals"), pair.other.array("offsets")
     x, y, z = (jnp.asarray(column, pair.centre.x.dtype) for column in normals.T)
@@ -108,23 +108,23 @@ def _best_face(pair: Pair) -> Best:
     return pair.gap(n), n
 
 
-def _best_at_ends(pair: Pair, best: Best) -> Best:
+def _best_end_normal(pair: ShapePair, best: BestDirection) -> BestDirection:
     """Return the best of a direction and the normals of an ellipsoid at its points nearest to corners of the other."""
     shortest = min(range(3), key=lambda k: pair.other.size[k])
 
-    def at_end(k: Array, best: Best) -> Best:
+    def at_end(k: Array, best: BestDirection) -> BestDirection:
         point = pair.centre
         for bit, (edge, half) in enumerate(zip(pair.edges, pair.half, strict=True)):
             point = point + edge * jnp.where((k >> bit) & 1 == 1, -half, half)
-        n = unit(Vector(*ellipsoid_normal(pair.other, (point.x, point.y, point.z))), best[1])
+        n = normalize(Vector(*ellipsoid_normal(pair.other, (point.x, point.y, point.z))), best[1])
         # The nearest point may be on the wrong side of the ellipsoid, so the mirror image is tried too.
         sign = [-1.0 if k == shortest else 1.0 for k in range(3)]
-        return pair.consider(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.consider(n, best))
+        return pair.with_candidate(Vector(n.x * sign[0], n.y * sign[1], n.z * sign[2]), pair.with_candidate(n, best))
 
     return lax.fori_loop(0, 2 ** len(pair.edges), at_end, best)
 
 
-def _best_across(pair: Pair, axis: Vector) -> Best:
+def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
     """Return the approximately best direction perpendicular to an axis.
 
     Projected onto the plane of these directions, the body is a polygon, possibly with curved sides. Between two
@@ -134,20 +134,20 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
     """
     # Angles start at the cross product with the coordinate axis that is closest to perpendicular.
     x, y, z = (jnp.abs(v) for v in (axis.x, axis.y, axis.z))
-    own = [along(k, axis.x) for k in range(3)]
-    farthest = select((x <= y) & (x <= z), own[0], select(y <= z, own[1], own[2]))
-    e = unit(axis.cross(farthest), own[0])
+    own = [axis_vector(k, axis.x) for k in range(3)]
+    farthest = select_vector((x <= y) & (x <= z), own[0], select_vector(y <= z, own[1], own[2]))
+    e = normalize(axis.cross(farthest), own[0])
     f = axis.cross(e)
 
-    def direction(n: Flat) -> Vector:
+    def direction(n: PlaneVector) -> Vector:
         return e * n[0] + f * n[1]
 
-    def support_point(n: Flat) -> Flat:
+    def support_point(n: PlaneVector) -> PlaneVector:
         """Return the projected support point along a direction in the plane."""
         point, _ = pair.support_point(direction(n))
         return point.dot(e), point.dot(f)
 
-    def between(n: Flat, p: Flat, m: Flat, q: Flat) -> Flat:
+    def between(n: PlaneVector, p: PlaneVector, m: PlaneVector, q: PlaneVector) -> PlaneVector:
         """Return the unit direction between two directions along which their support points are equally far."""
         u, v, middle = q[1] - p[1], p[0] - q[0], (n[0] + m[0], n[1] + m[1])
         sign = jnp.where(u * middle[0] + v * middle[1] < 0, -1.0, 1.0)
@@ -156,9 +156,11 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
         scale = lax.rsqrt(u * u + v * v)
         return u * scale, v * scale
 
-    def arc(k: Array, carry: tuple[Flat, Flat, Array, tuple[Flat, ...]]) -> tuple[Flat, Flat, Array, tuple[Flat, ...]]:
+    def arc(
+        k: Array, carry: tuple[PlaneVector, PlaneVector, Array, tuple[PlaneVector, ...]]
+    ) -> tuple[PlaneVector, PlaneVector, Array, tuple[PlaneVector, ...]]:
         n, p, gap, kept = carry
-        angle = (k + 1).astype(x.dtype) * (2 * math.pi / ARCS)
+        angle = (k + 1).astype(x.dtype) * (2 * math.pi / N_ARCS)
         m = (jnp.cos(angle) + 0 * x, jnp.sin(angle) + 0 * x)
         q = support_point(m)
         top = between(n, p, m, q)
@@ -170,10 +172,10 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
     start = (jnp.ones_like(x), jnp.zeros_like(x))
     first = support_point(start)
     _, _, gap, kept = lax.fori_loop(
-        0, ARCS, arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
+        0, N_ARCS, arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
     )
 
-    def narrow(_: int, carry: tuple[Array, tuple[Flat, ...]]) -> tuple[Array, tuple[Flat, ...]]:
+    def narrow(_: int, carry: tuple[Array, tuple[PlaneVector, ...]]) -> tuple[Array, tuple[PlaneVector, ...]]:
         gap, (n, p, m, q, top) = carry
         middle = between(n, p, m, q)
         r, here = support_point(middle), pair.gap(direction(middle))
@@ -183,11 +185,11 @@ def _best_across(pair: Pair, axis: Vector) -> Best:
         m, q = _choose(rises, m, middle), _choose(rises, q, r)
         return jnp.where(here > gap, here, gap), (n, p, m, q, _choose(here > gap, middle, top))
 
-    _, (*_, top) = lax.fori_loop(0, ARC_STEPS, narrow, (gap, kept))
+    _, (*_, top) = lax.fori_loop(0, N_ARC_STEPS, narrow, (gap, kept))
     n = direction(top)
-    n = unit(n, e)
+    n = normalize(n, e)
     return pair.gap(n), n
 
 
-def _choose(condition: Array, a: Flat, b: Flat) -> Flat:
+def _choose(condition: Array, a: PlaneVector, b: PlaneVector) -> PlaneVector:
     return jnp.where(condition, a[0], b[0]), jnp.where(condition, a[1], b[1])

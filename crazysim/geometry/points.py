@@ -1,7 +1,7 @@
 """Signed distances from a point to each kind of shape, negative inside.
 
 The formulas are in components, with selections instead of branches, so that one drone takes a few dozen scalar
-operations. At a switch the gradient is that of one side.
+operations. At a switch the gradient is taken from one side.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from jax import Array, lax
 
 from crazysim.geometry.shapes import Shape
 from crazysim.geometry.triangle import closest_point, from_barycentric
-from crazysim.geometry.vector import Vector, vector
+from crazysim.geometry.vector import Vector, to_vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
 ELLIPSOID_STEPS = 12
@@ -29,8 +29,8 @@ def components(x: Array) -> Components:
     return x[..., 0], x[..., 1], x[..., 2]
 
 
-def larger(a: Array | float, b: Array | float) -> Array:
-    """Return the larger of two values; the gradient is that of one of them even where they are equal. (...)"""
+def maximum(a: Array | float, b: Array | float) -> Array:
+    """Return the larger of two values, with the gradient of one of them even where they are equal. (...)"""
     return jnp.where(a > b, a, b)
 
 
@@ -62,8 +62,8 @@ def _box(shape: Shape, point: Array) -> Array:
 def box_distance(half: tuple[float, ...], point: tuple[Array, Array, Array]) -> Array:
     """Return the signed distance from a point, 3 components of (...), to a box of given half lengths, m. (...)"""
     x, y, z = (magnitude(p) - h for p, h in zip(point, half, strict=True))
-    inside = larger(larger(x, y), z)
-    x, y, z = larger(x, 0.0), larger(y, 0.0), larger(z, 0.0)
+    inside = maximum(maximum(x, y), z)
+    x, y, z = maximum(x, 0.0), maximum(y, 0.0), maximum(z, 0.0)
     return jnp.where(inside > 0, safe_sqrt(x * x + y * y + z * z), inside)
 
 
@@ -71,8 +71,8 @@ def _cylinder(shape: Shape, point: Array) -> Array:
     radius, half = shape.size
     x, y, z = components(point)
     side, cap = safe_sqrt(x * x + y * y) - radius, magnitude(z) - half
-    inside = larger(side, cap)
-    side, cap = larger(side, 0.0), larger(cap, 0.0)
+    inside = maximum(side, cap)
+    side, cap = maximum(side, 0.0), maximum(cap, 0.0)
     return jnp.where(inside > 0, safe_sqrt(side * side + cap * cap), inside)
 
 
@@ -113,7 +113,7 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
     fixed = [lax.stop_gradient(x) for x in scaled]
     start = fixed[0] * 0
     for x, gap in zip(fixed, gaps, strict=True):
-        start = larger(start, jnp.abs(x) - gap)
+        start = maximum(start, jnp.abs(x) - gap)
     s = lax.fori_loop(0, ELLIPSOID_STEPS - 1, lambda _, s: newton(s, fixed), start)
     s = newton(s, scaled)  # the last step carries the derivative of the root
     x, y, z = (p / (s + gap) for p, gap in zip(moved, gaps, strict=True))
@@ -122,7 +122,7 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
 
 def _mesh(shape: Shape, point: Array) -> Array:
     """Return the distance to the nearest triangle outside, and to the nearest plane inside, m. (...)"""
-    at = vector(point)
+    at = to_vector(point)
     inside = plane_distance(shape.array("normals"), shape.array("offsets"), at)
     triangles = shape.array("vertices")[shape.array("faces")]
     corners = [Vector(*jnp.asarray(triangles[:, k].T, point.dtype)) for k in range(3)]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.geometry.fieldrays import PARALLEL, field_ray
+from crazysim.geometry.fieldrays import MIN_COMPONENT, field_ray
 from crazysim.geometry.points import Components, components
 from crazysim.geometry.shapes import Shape
 from crazysim.rotation import safe_clip, safe_normalize, safe_sqrt
@@ -18,11 +18,11 @@ Interval = tuple[Array, Array, Array]
 
 
 @dataclasses.dataclass(frozen=True)
-class Sized:
-    """Primitives of one kind whose sizes are arrays, as those of many objects are in a loop over them."""
+class SizedShapes:
+    """Primitives of one kind with arrays as sizes, as in a loop over many objects."""
 
     kind: str
-    """Kind of the shapes; one of those that ``Shape`` describes by its size alone."""
+    """Kind of the shapes; one that ``Shape`` describes by its size alone."""
     size: Sequence[Array]
     """Size in the convention of the kind, m. (...) each"""
 
@@ -30,7 +30,7 @@ class Sized:
 def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
     """Return the distance along rays to the surface of a shape, and its outward normal at the hit.
 
-    The conventions are those of MuJoCo's ``mj_ray``: a ray from inside a solid hits the surface where it leaves, and
+    The conventions follow MuJoCo's ``mj_ray``: a ray from inside a solid hits the surface where it leaves, and
     the normal still points outward; a plane is hit only from above; a height field is also hit at z = 0, where the box
     below its surface ends.
 
@@ -50,10 +50,10 @@ def ray_distance(shape: Shape, origin: Array, direction: Array) -> tuple[Array, 
     return t, hit_normal(shape, origin, direction, t)
 
 
-def hit_distance(shape: Shape | Sized, origin: Components, direction: Components) -> Array:
+def hit_distance(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Array:
     """Return the distance along rays to the surface of a shape, m, infinite where they miss. (...)
 
-    The conventions are those of ``ray_distance``. Rays in components make a loop over many objects element-wise
+    For the conventions see ``ray_distance``. Rays in components make a loop over many objects element-wise
     arithmetic, which compilers fuse and vectorise.
 
     Args:
@@ -62,12 +62,12 @@ def hit_distance(shape: Shape | Sized, origin: Components, direction: Components
         direction: Unit direction of each ray, in the frame of the shape. 3 of (...)
     """
     if shape.kind != "plane":
-        return first_of(LINE_INTERVAL[shape.kind](shape, origin, direction))
+        return first_distance(LINE_INTERVAL[shape.kind](shape, origin, direction))
     t, hit = _plane(origin, direction)
-    return first_of((t, t, hit))
+    return first_distance((t, t, hit))
 
 
-def hit_normal(shape: Shape | Sized, origin: Array, direction: Array, distance: Array) -> Array:
+def hit_normal(shape: Shape | SizedShapes, origin: Array, direction: Array, distance: Array) -> Array:
     """Return the outward unit normal where rays hit a shape, in its frame, zero where they miss. (..., 3)
 
     Args:
@@ -84,14 +84,14 @@ def hit_normal(shape: Shape | Sized, origin: Array, direction: Array, distance: 
 
 def _plane(origin: Components, direction: Components) -> tuple[Array, Array]:
     height, down = origin[2], -direction[2]
-    hit = (down > PARALLEL) & (height >= 0)
+    hit = (down > MIN_COMPONENT) & (height >= 0)
     return height / jnp.where(hit, down, 1.0), hit
 
 
 def slab_line(origin: Array, direction: Array, half: Array | float) -> Interval:
     """Return the interval of a line between the planes at ``-half`` and ``half``, from its normal components."""
-    parallel = jnp.abs(direction) < PARALLEL
-    inverse = 1 / jnp.where(parallel, PARALLEL, direction)
+    parallel = jnp.abs(direction) < MIN_COMPONENT
+    inverse = 1 / jnp.where(parallel, MIN_COMPONENT, direction)
     a, b = (-half - origin) * inverse, (half - origin) * inverse
     return jnp.where(a < b, a, b), jnp.where(a < b, b, a), ~parallel | (jnp.abs(origin) <= half)
 
@@ -115,22 +115,22 @@ def _ball_line(origin: Sequence[Array], direction: Sequence[Array], radius: Arra
     It uses the point of the line nearest to the centre, because the usual discriminant cancels far from the ball.
     """
     square = sum(d * d for d in direction)
-    parallel = square < PARALLEL
+    parallel = square < MIN_COMPONENT
     inverse = 1 / jnp.where(parallel, 1.0, square)
     middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) * inverse
     closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
     rest = radius * radius - sum(c * c for c in closest)
     half = safe_sqrt(rest * inverse)
     outside = sum(o * o for o in origin) > radius * radius
-    half = jnp.where(parallel, 1 / PARALLEL, half)
+    half = jnp.where(parallel, 1 / MIN_COMPONENT, half)
     return middle - half, middle + half, jnp.where(parallel, ~outside, rest >= 0)
 
 
-def _sphere_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+def _sphere_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     return _ball_line(origin, direction, shape.size[0])
 
 
-def _capsule_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+def _capsule_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     radius, half = shape.size
     (x, y, z), d = origin, direction
     out = intersection(_ball_line([x, y], d[:2], radius), slab_line(z, d[2], half))
@@ -139,23 +139,23 @@ def _capsule_line(shape: Shape | Sized, origin: Components, direction: Component
     return out
 
 
-def _box_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+def _box_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     x, y, z = (slab_line(o, d, h) for o, d, h in zip(origin, direction, shape.size, strict=True))
     return intersection(intersection(x, y), z)
 
 
-def _cylinder_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+def _cylinder_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     radius, half = shape.size
     (x, y, z), (u, v, w) = origin, direction
     return intersection(_ball_line([x, y], [u, v], radius), slab_line(z, w, half))
 
 
-def _ellipsoid_line(shape: Shape | Sized, origin: Components, direction: Components) -> Interval:
+def _ellipsoid_line(shape: Shape | SizedShapes, origin: Components, direction: Components) -> Interval:
     start, way = ([x / a for x, a in zip(v, shape.size, strict=True)] for v in (origin, direction))
     return _ball_line(start, way, 1.0)
 
 
-def _planes(shape: Shape, v: Components) -> Array:
+def _plane_products(shape: Shape, v: Components) -> Array:
     """Return the products of vectors with all normals of a mesh. (..., n_planes)"""
     x, y, z = (
         jnp.asarray(column, v[0].dtype) * part[..., None]
@@ -166,16 +166,16 @@ def _planes(shape: Shape, v: Components) -> Array:
 
 def _mesh_line(shape: Shape, origin: Components, direction: Components) -> Interval:
     """Return the interval of a line below all planes of a mesh (Kay and Kajiya 1986)."""
-    below = jnp.asarray(shape.offsets, origin[0].dtype) - _planes(shape, origin)
-    rises = _planes(shape, direction)
-    parallel = jnp.abs(rises) < PARALLEL
+    below = jnp.asarray(shape.offsets, origin[0].dtype) - _plane_products(shape, origin)
+    rises = _plane_products(shape, direction)
+    parallel = jnp.abs(rises) < MIN_COMPONENT
     t = below / jnp.where(parallel, 1.0, rises)
     near = jnp.max(jnp.where(~parallel & (rises < 0), t, -jnp.inf), axis=-1)
     far = jnp.min(jnp.where(~parallel & (rises > 0), t, jnp.inf), axis=-1)
     return near, far, (near <= far) & ~jnp.any(parallel & (below < 0), axis=-1)
 
 
-def first_of(interval: Interval) -> Array:
+def first_distance(interval: Interval) -> Array:
     """Return the distance at which a ray meets what it is in along an interval; infinite where it does not. (...)"""
     near, far, meets = interval
     hit = meets & (far >= 0)
@@ -196,27 +196,27 @@ LINE_INTERVAL = {
 # Normals of surface points -------------------------------------------------------------------------------------------
 
 
-def _up(like: Array) -> Array:
+def _z_axis(like: Array) -> Array:
     """Return the unit vector along z, one for each point. (..., 3)"""
     zero = jnp.zeros_like(like[..., 0])
     return jnp.stack([zero, zero, zero + 1], axis=-1)
 
 
-def _plane_normal(_: Shape | Sized, point: Array) -> Array:
-    return _up(point)
+def _plane_normal(_: Shape | SizedShapes, point: Array) -> Array:
+    return _z_axis(point)
 
 
-def _sphere_normal(_: Shape | Sized, point: Array) -> Array:
-    return safe_normalize(point, _up(point))
+def _sphere_normal(_: Shape | SizedShapes, point: Array) -> Array:
+    return safe_normalize(point, _z_axis(point))
 
 
-def _capsule_normal(shape: Shape | Sized, point: Array) -> Array:
+def _capsule_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     x, y, z = components(point)
     half = shape.size[1]
-    return safe_normalize(jnp.stack([x, y, z - safe_clip(z, -half, half)], axis=-1), _up(point))
+    return safe_normalize(jnp.stack([x, y, z - safe_clip(z, -half, half)], axis=-1), _z_axis(point))
 
 
-def _box_normal(shape: Shape | Sized, point: Array) -> Array:
+def _box_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     """Return the normal of the side that a point is nearest to. (..., 3)"""
     x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
     of_x = (x >= y) & (x >= z)
@@ -225,7 +225,7 @@ def _box_normal(shape: Shape | Sized, point: Array) -> Array:
     return jnp.where(sides, jnp.where(point < 0, -1.0, 1.0), 0.0)
 
 
-def _cylinder_normal(shape: Shape | Sized, point: Array) -> Array:
+def _cylinder_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     radius, half = shape.size
     x, y, z = components(point)
     zero = jnp.zeros_like(z)
@@ -237,13 +237,13 @@ def _cylinder_normal(shape: Shape | Sized, point: Array) -> Array:
     return jnp.where(of_side[..., None], side, cap)
 
 
-def _ellipsoid_normal(shape: Shape | Sized, point: Array) -> Array:
+def _ellipsoid_normal(shape: Shape | SizedShapes, point: Array) -> Array:
     gradient = [x / (a * a) for x, a in zip(components(point), shape.size, strict=True)]
-    return safe_normalize(jnp.stack(gradient, axis=-1), _up(point))
+    return safe_normalize(jnp.stack(gradient, axis=-1), _z_axis(point))
 
 
 def _mesh_normal(shape: Shape, point: Array) -> Array:
-    above = _planes(shape, components(point)) - jnp.asarray(shape.offsets, point.dtype)
+    above = _plane_products(shape, components(point)) - jnp.asarray(shape.offsets, point.dtype)
     return jnp.take(jnp.asarray(shape.array("normals"), point.dtype), jnp.argmax(above, axis=-1), axis=0)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.geometry.points import Components, larger, magnitude
+from crazysim.geometry.points import Components, magnitude, maximum
 from crazysim.rotation import safe_clip, safe_sqrt
 
-PARALLEL = 1e-12
+MIN_SQUARED_SINE = 1e-12
 """Square of a sine below which two directions count as parallel."""
 
 
@@ -23,10 +23,10 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
         half: Half length of the segment, m.
         other_half: Half length of the other segment, m.
     """
-    (cx, cy, cz), (x, y, z) = map(_fixed, (middle, axis))
+    (cx, cy, cz), (x, y, z) = map(_stop_gradient, (middle, axis))
     across = x * x + y * y
-    s = -(cx * x + cy * y) / jnp.where(across > PARALLEL, across, 1.0)
-    s = safe_clip(jnp.where(across > PARALLEL, s, 0.0), -half, half)
+    s = -(cx * x + cy * y) / jnp.where(across > MIN_SQUARED_SINE, across, 1.0)
+    s = safe_clip(jnp.where(across > MIN_SQUARED_SINE, s, 0.0), -half, half)
     t = safe_clip(cz + s * z, -other_half, other_half)
     s = safe_clip(t * z - (cx * x + cy * y + cz * z), -half, half)
     # The nearest points of lines are where a small move of either changes nothing: they may count as fixed.
@@ -48,7 +48,7 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
         half: Half length of the segment, m.
         box: Half lengths of the box, m.
     """
-    c, u = _fixed(middle), _fixed(axis)
+    c, u = _stop_gradient(middle), _stop_gradient(axis)
 
     def slope(t: Array) -> Array:
         at = [p + t * d for p, d in zip(c, u, strict=True)]
@@ -57,7 +57,7 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     low, high = 0 * c[0] - half, 0 * c[0] + half
     low_slope, high_slope = slope(low), slope(high)
     for p, d, h in zip(c, u, box, strict=True):
-        crosses = d * d > PARALLEL
+        crosses = d * d > MIN_SQUARED_SINE
         inverse = 1 / jnp.where(crosses, d, 1.0)
         for side in (-h, h):
             t = jnp.where(crosses, jnp.clip((side - p) * inverse, -half, half), 0.0)
@@ -69,25 +69,25 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     between = (low_slope < 0) & (high_slope > 0)
     t = low + (high - low) * jnp.where(between, -low_slope / jnp.where(between, rise, 1.0), 0.0)
     t = jnp.where(high_slope < 0, high, t)
-    x, y, z = (larger(magnitude(p + t * d) - h, 0.0) for p, d, h in zip(middle, axis, box, strict=True))
-    return jnp.where((inside := _inside_box(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), inside)
+    x, y, z = (maximum(magnitude(p + t * d) - h, 0.0) for p, d, h in zip(middle, axis, box, strict=True))
+    return jnp.where((inside := _largest_gap(middle, axis, half, box)) > 0, safe_sqrt(x * x + y * y + z * z), inside)
 
 
-def _inside_box(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
+def _largest_gap(middle: Components, axis: Components, half: Array | float, box: tuple[float, ...]) -> Array:
     """Return the largest gap between a segment and a box along the normals of their Minkowski difference, m. (...)"""
     c, u = [magnitude(p) for p in middle], [magnitude(d) for d in axis]
     faces = [p - h - half * d for p, h, d in zip(c, box, u, strict=True)]
-    out = larger(larger(faces[0], faces[1]), faces[2])
+    out = maximum(maximum(faces[0], faces[1]), faces[2])
     for i, j in ((1, 2), (2, 0), (0, 1)):
         square = axis[i] * axis[i] + axis[j] * axis[j]
-        crosses = square > PARALLEL
+        crosses = square > MIN_SQUARED_SINE
         gap = magnitude(middle[j] * axis[i] - middle[i] * axis[j]) - box[i] * u[j] - box[j] * u[i]
         gap = gap / safe_sqrt(jnp.where(crosses, square, 1.0))
         out = jnp.where(crosses & (gap > out), gap, out)
     return out
 
 
-def _fixed(vector: Components) -> Components:
+def _stop_gradient(vector: Components) -> Components:
     """Return a vector without its derivatives. 3 of (...)"""
     x, y, z = vector
     return lax.stop_gradient(x), lax.stop_gradient(y), lax.stop_gradient(z)

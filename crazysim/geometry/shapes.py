@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 
-SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
+N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
 """Number of entries of the size of each kind."""
-LARGEST_SEARCH = 64
+MAX_HULL_VERTICES = 64
 """Largest number of vertices whose convex hull is computed, by trying every triangle."""
 
 
@@ -35,7 +35,7 @@ class Shape:
     """
 
     kind: str
-    """Kind of the shape, a key of ``SIZES``."""
+    """Kind of the shape, a key of ``N_SIZES``."""
     size: tuple[float, ...] = ()
     """Size in the convention of the kind, m; further entries, as in MuJoCo's ``geom_size``, are ignored."""
     vertices: np.ndarray | None = None
@@ -51,9 +51,9 @@ class Shape:
 
     def __post_init__(self) -> None:
         """Check kind and size, and convert the size to floats."""
-        if self.kind not in SIZES:
-            raise ConfigError(f"expected a shape of kind {', '.join(SIZES)}, got {self.kind!r}; use one of these")
-        needed = SIZES[self.kind]
+        if self.kind not in N_SIZES:
+            raise ConfigError(f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these")
+        needed = N_SIZES[self.kind]
         given = np.asarray(self.size, np.float64).reshape(-1)
         size = given[:needed]
         if len(size) < needed or not np.all(np.isfinite(size)) or not np.all(size > 0):
@@ -99,7 +99,7 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
             None computes the hull, for up to 64 vertices. (n_faces, 3)
 
     Raises:
-        ConfigError: If the vertices span no volume, or the faces are not those of their convex hull.
+        ConfigError: If the vertices span no volume, or the faces are not their convex hull.
     """
     v = np.asarray(vertices, np.float64)
     if v.ndim != 2 or v.shape[1] != 3 or len(v) < 4 or not np.all(np.isfinite(v)):
@@ -108,7 +108,7 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
     if spread <= 1e-9 * scale:
         raise ConfigError(f"expected vertices that span a volume, got {len(v)} in one plane; add one outside of it")
-    triangles = _search(v, 1e-9 * scale) if faces is None else np.asarray(faces)
+    triangles = _find_triangles(v, 1e-9 * scale) if faces is None else np.asarray(faces)
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
         raise ConfigError(f"expected faces as integers, (n_faces, 3), got {triangles.dtype} {triangles.shape}")
     if triangles.min() < 0 or triangles.max() >= len(v):
@@ -124,16 +124,16 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     triangles = np.where(outward[:, None], triangles, triangles[:, ::-1])
     offsets = np.sum(normals * v[triangles[:, 0]], axis=1)
     out = float(np.max(v @ normals.T - offsets)) if len(offsets) else np.inf
-    if out > 1e-4 * scale or (keep.all() and not _closed(triangles)):
+    if out > 1e-4 * scale or (keep.all() and not _is_closed(triangles)):
         raise ConfigError(
             f"expected the triangles of the convex hull, got faces that are not closed or leave a vertex {out:.3g} m "
-            f"outside; omit faces for up to {LARGEST_SEARCH} vertices, and they are computed"
+            f"outside; omit faces for up to {MAX_HULL_VERTICES} vertices, and they are computed"
         )
-    # Coplanar triangles share a plane; its offset is that of the outermost vertex, so that all vertices are inside.
-    planes = _distinct(normals)
+    # Coplanar triangles share a plane through the outermost vertex, so that all vertices are inside.
+    planes = _unique_normals(normals)
     offsets = np.max(v @ planes.T, axis=0)
-    used, places = np.unique(triangles, return_inverse=True)
-    return Shape("mesh", (), *map(_constant, (v[used], places.reshape(-1, 3), planes, offsets)))
+    used, indices = np.unique(triangles, return_inverse=True)
+    return Shape("mesh", (), *map(_read_only_copy, (v[used], indices.reshape(-1, 3), planes, offsets)))
 
 
 def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
@@ -151,17 +151,17 @@ def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
     h = np.asarray(heights, np.float64)
     if h.ndim != 2 or min(h.shape) < 2:
         raise ConfigError(f"expected heights of two or more rows and columns, got shape {h.shape}")
-    shape = Shape("hfield", tuple(size), heights=_constant(h))
+    shape = Shape("hfield", tuple(size), heights=_read_only_copy(h))
     if not np.all(np.isfinite(h)) or h.min() < 0 or h.max() > shape.size[2] * (1 + 1e-6):
         raise ConfigError(f"expected heights between 0 and {shape.size[2]} m, got {h.min()} to {h.max()}")
     return shape
 
 
-def _search(v: np.ndarray, tolerance: float) -> np.ndarray:
+def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the triangles of a convex hull, those with no vertex above their plane; flat sides become fans."""
-    if len(v) > LARGEST_SEARCH:
+    if len(v) > MAX_HULL_VERTICES:
         raise ConfigError(
-            f"expected faces for more than {LARGEST_SEARCH} vertices, got {len(v)} vertices and no faces; pass the "
+            f"expected faces for more than {MAX_HULL_VERTICES} vertices, got {len(v)} vertices and no faces; pass the "
             f"triangles of the convex hull"
         )
     i, j, k = np.array([(i, j, k) for i in range(len(v)) for j in range(i) for k in range(j)]).T
@@ -173,7 +173,7 @@ def _search(v: np.ndarray, tolerance: float) -> np.ndarray:
     low, high = above.min(axis=0) >= -tolerance, above.max(axis=0) <= tolerance
     out = normals[(low | high) & ~flat] * np.where(low[(low | high) & ~flat], -1.0, 1.0)[:, None]
     triangles: list[tuple[int, int, int]] = []
-    for normal in _distinct(out):
+    for normal in _unique_normals(out):
         along = v @ normal
         side = np.flatnonzero(along >= along.max() - 2 * tolerance)
         axis = np.eye(3)[np.argmin(np.abs(normal))]
@@ -185,13 +185,13 @@ def _search(v: np.ndarray, tolerance: float) -> np.ndarray:
     return np.array(triangles, np.int64).reshape(-1, 3)
 
 
-def _closed(triangles: np.ndarray) -> bool:
+def _is_closed(triangles: np.ndarray) -> bool:
     """Return True if every edge occurs once in each direction."""
     edges = {(t[k], t[(k + 1) % 3]) for t in triangles.tolist() for k in range(3)}
     return len(edges) == 3 * len(triangles) and all((b, a) in edges for a, b in edges)
 
 
-def _distinct(normals: np.ndarray) -> np.ndarray:
+def _unique_normals(normals: np.ndarray) -> np.ndarray:
     """Return the unit vectors without near duplicates. (n, 3) -> (m, 3)"""
     kept: list[np.ndarray] = []
     for n in normals:
@@ -200,7 +200,7 @@ def _distinct(normals: np.ndarray) -> np.ndarray:
     return np.asarray(kept).reshape(-1, 3)
 
 
-def _constant(x: np.ndarray) -> np.ndarray:
+def _read_only_copy(x: np.ndarray) -> np.ndarray:
     """Return a read-only copy."""
     x = np.array(x)
     x.setflags(write=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from crazysim.geometry.vector import Vector, margin
+from crazysim.geometry.vector import Vector, rounding_margin
 
-THIN = 1e-10
+MIN_SQUARED_SINE = 1e-10
 """Square of the sine below which the normal of a triangle is rounding error in float32."""
 
 
@@ -23,34 +23,34 @@ def from_barycentric(weights: Barycentric, a: Vector, b: Vector, c: Vector) -> V
 
 def closest_point(a: Vector, b: Vector, c: Vector) -> Barycentric:
     """Return the barycentric coordinates of the point of a triangle nearest to the origin."""
-    t = _along(b, c - b)
+    t = _nearest_on_segment(b, c - b)
     on_third, rest = (jnp.zeros_like(t), 1 - t, t), closest_point_off_bc(a, b, c)
-    return _nearer(on_third, rest, a, b, c)
+    return _nearer_point(on_third, rest, a, b, c)
 
 
 def closest_point_off_bc(a: Vector, b: Vector, c: Vector) -> Barycentric:
     """Return the same, without trying the side from ``b`` to ``c``."""
     ab, ac = b - a, c - a
-    s, t = _along(a, ab), _along(a, ac)
-    on_side = _nearer((1 - t, jnp.zeros_like(t), t), (1 - s, s, jnp.zeros_like(s)), a, b, c)
+    s, t = _nearest_on_segment(a, ab), _nearest_on_segment(a, ac)
+    on_side = _nearer_point((1 - t, jnp.zeros_like(t), t), (1 - s, s, jnp.zeros_like(s)), a, b, c)
     normal = ab.cross(ac)
     u, v, w = normal.dot(b.cross(c)), normal.dot(c.cross(a)), normal.dot(a.cross(b))
-    inside = (u > 0) & (v > 0) & (w > 0) & (normal.dot(normal) > THIN * ab.dot(ab) * ac.dot(ac))
+    inside = (u > 0) & (v > 0) & (w > 0) & (normal.dot(normal) > MIN_SQUARED_SINE * ab.dot(ab) * ac.dot(ac))
     share = 1 / jnp.where(inside, u + v + w, 1.0)
     return _choose(inside, (u * share, v * share, w * share), on_side)
 
 
-def _along(a: Vector, side: Vector) -> Array:
+def _nearest_on_segment(a: Vector, side: Vector) -> Array:
     """Return the parameter, 0 to 1, of the point of a segment nearest to the origin. (...)"""
     square = side.dot(side)
     return jnp.clip(-a.dot(side) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
 
-def _nearer(new: Barycentric, old: Barycentric, a: Vector, b: Vector, c: Vector) -> Barycentric:
+def _nearer_point(new: Barycentric, old: Barycentric, a: Vector, b: Vector, c: Vector) -> Barycentric:
     """Return the point nearer to the origin; on a tie, the old one."""
     p, q = from_barycentric(new, a, b, c), from_barycentric(old, a, b, c)
     square = q.dot(q)
-    return _choose(p.dot(p) < square * (1 - margin(square.dtype)), new, old)
+    return _choose(p.dot(p) < square * (1 - rounding_margin(square.dtype)), new, old)
 
 
 def _choose(condition: Array, new: Barycentric, old: Barycentric) -> Barycentric:

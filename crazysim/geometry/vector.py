@@ -38,7 +38,6 @@ class Vector(PyTree):
         return Vector(self.x * factor, self.y * factor, self.z * factor)
 
     def __getitem__(self, k: int) -> Vector:
-        """Return one of stacked vectors."""
         return Vector(self.x[k], self.y[k], self.z[k])
 
     def dot(self, other: Vector) -> Array:
@@ -54,35 +53,35 @@ class Vector(PyTree):
         )
 
 
-def vector(x: Array) -> Vector:
+def to_vector(x: Array) -> Vector:
     """Return an array of vectors, (..., 3), as a ``Vector``."""
     return Vector(x[..., 0], x[..., 1], x[..., 2])
 
 
-def stack(vectors: list[Vector]) -> Vector:
+def stack_vectors(vectors: list[Vector]) -> Vector:
     """Return vectors stacked along a new first axis."""
     return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
 
 
-def along(axis: int, like: Array) -> Vector:
+def axis_vector(axis: int, like: Array) -> Vector:
     """Return the unit vector along an axis, with the batch shape of an array. (...)"""
     zero = jnp.zeros_like(like)
     return Vector(*(zero + 1 if k == axis else zero for k in range(3)))
 
 
-def select(condition: Array, a: Vector, b: Vector) -> Vector:
+def select_vector(condition: Array, a: Vector, b: Vector) -> Vector:
     """Return ``a`` where the condition holds, and ``b`` elsewhere."""
     return Vector(*(jnp.where(condition, p, q) for p, q in ((a.x, b.x), (a.y, b.y), (a.z, b.z))))
 
 
-def unit(v: Vector, otherwise: Vector, least: float = 0.0) -> Vector:
+def normalize(v: Vector, otherwise: Vector, least: float = 0.0) -> Vector:
     """Return a vector scaled to unit length, or ``otherwise`` where its squared length is at most ``least``."""
     square = v.dot(v)
     long = square > least
-    return select(long, v * lax.rsqrt(jnp.where(long, square, 1.0)), otherwise)
+    return select_vector(long, v * lax.rsqrt(jnp.where(long, square, 1.0)), otherwise)
 
 
-def margin(dtype: jnp.dtype) -> float:
+def rounding_margin(dtype: jnp.dtype) -> float:
     """Return the relative margin by which a number must exceed another to count as larger despite rounding.
 
     A compiler may recompute a comparison for each component of a selected vector with different rounding, and so mix

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.media.journal import is_journal, pack_arrays, read_journal, unpack_arrays
-from crazysim.scene.visual_geoms import KINDS, VisualGeom
+from crazysim.scene.visual_geoms import GEOM_KINDS, VisualGeom
 from crazysim.storage import read_arrays, reading, replacing
 
 FORMAT = 1
@@ -124,7 +124,7 @@ class Flight:
 
 def shape_arrays(shapes: Sequence[VisualGeom]) -> dict[str, NDArray]:
     """Return geoms as arrays, for a file."""
-    arrays = {"shape_kind": np.array([KINDS.index(shape.kind) for shape in shapes], int)}
+    arrays = {"shape_kind": np.array([GEOM_KINDS.index(shape.kind) for shape in shapes], int)}
     for name in ("size", "rgba", "mocap", "pos", "quat"):
         arrays[f"shape_{name}"] = np.array([getattr(shape, name) for shape in shapes]).reshape(len(shapes), -1)
     for name in ("vertices", "faces"):  # of all meshes, concatenated
@@ -140,7 +140,7 @@ def _shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
     faces = np.split(arrays["shape_faces"].astype(int), np.cumsum(n[:, 1])[:-1]) if len(n) else []
     return [
         VisualGeom(
-            kind=KINDS[kind],
+            kind=GEOM_KINDS[kind],
             **{name: arrays[f"shape_{name}"][k] for name in ("size", "rgba", "pos", "quat")},
             mocap=int(arrays["shape_mocap"][k, 0]),
             vertices=vertices[k],

@@ -194,7 +194,7 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
     states = data.states.replace(pos=changed["pos"], quat=changed["quat"])
     core = data.core.replace(steps=changed["steps"])
     if objects is not None:
-        recorded = any(plugin.places for plugin in sim.plugins.values())
+        recorded = any(plugin.moves_objects for plugin in sim.plugins.values())
         objects = objects.replace(pos=changed["body_pos"], quat=changed["body_quat"], recorded=recorded)
     data = data.replace(states=states, core=core, objects=objects)
     if "setpoint" in changed:
@@ -225,7 +225,7 @@ def _body_ids(sim: Sim) -> NDArray:
 def _scene(sim: Sim, worlds: NDArray) -> dict[str, Any]:
     """Return the fields of a flight that do not change with time."""
     ids = _body_ids(sim)
-    sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), worlds[0])
+    sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
     return {
         "worlds": worlds,
         "drone_ids": np.asarray(sim.data.core.drone_mocap_ids),

@@ -18,7 +18,7 @@ def mocap_poses(sim: Sim, worlds: int | NDArray) -> tuple[NDArray, NDArray]:
     Returns:
         Positions, world frame, m (n, n_mocap, 3), and attitudes, body to world, xyzw (n, n_mocap, 4).
     """
-    data = sim.plugins.with_placed_objects(sim.data)
+    data = sim.plugins.with_moved_objects(sim.data)
     base_pos, base_quat = sim.scene.mocap_poses()
     pos = np.array(np.asarray(base_pos)[worlds], float)
     quat = np.roll(np.asarray(base_quat, float)[worlds], -1, axis=-1)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from crazysim.control.setpoint import Setpoint
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.core.stages import tick
@@ -22,13 +22,13 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
 
-DEGREE = 7
-"""Least degree of slots that are kept for later trajectories: that of minimum snap, and of shows."""
-AHEAD = 2.0
+MIN_SLOT_DEGREE = 7
+"""Least degree of slots that are kept for later trajectories: the degree of minimum snap and of shows."""
+DRAWN_TIME = 2.0
 """Time of the path ahead that is drawn, s."""
-N_DRAWN = 40
+N_DRAWN_LINES = 40
 """Number of lines of that path."""
-GREEN = (0.1, 0.9, 0.3, 0.8)
+PATH_COLOR = (0.1, 0.9, 0.3, 0.8)
 """Colour of paths and setpoints, rgba."""
 
 
@@ -88,22 +88,20 @@ class Follow(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The state commands of all drones."""
         return ("state commands",)
 
     def record(self, sim: Simulation) -> FollowData:
-        """Return the trajectories in their slots."""
         if sim.data.controls.state is None:
             raise ConfigError(
                 f"expected state commands for {self.name!r} to replace, got control={sim.data.controls.mode.value!r}. "
                 f"Use Sim(control='state')."
             )
-        given = self._given()
-        n_slots = len(given) if self.n_slots is None else _count("n_slots", self.n_slots, len(given))
+        given = self._trajectory_list()
+        n_slots = len(given) if self.n_slots is None else _check_count("n_slots", self.n_slots, len(given))
         most = max(t.n_pieces for t in given)
-        n_pieces = most if self.max_pieces is None else _count("max_pieces", self.max_pieces, most)
+        n_pieces = most if self.max_pieces is None else _check_count("max_pieces", self.max_pieces, most)
         has_room = self.n_slots is not None or self.max_pieces is not None
-        first = given[0].padded(n_pieces, DEGREE if has_room else 0)
+        first = given[0].padded(n_pieces, MIN_SLOT_DEGREE if has_room else 0)
         slots = Trajectory.stack([first, *given[1:], *[first] * (n_slots - len(given))])
         index = np.int32(0) if self.index is None else self.index
         if self.index is None and len(given) > 1 and sim.n_drones > 1:
@@ -113,16 +111,15 @@ class Follow(Plugin):
             ends=ends,
             coefficients=coefficients,
             repeats=repeats,
-            index=_checked(sim, "index", index, n_slots),
-            start=_checked(sim, "start", self.start, n_slots),
-            rate=_checked(sim, "rate", self.rate, n_slots),
+            index=_check_slot_value(sim, "index", index, n_slots),
+            start=_check_slot_value(sim, "start", self.start, n_slots),
+            rate=_check_slot_value(sim, "rate", self.rate, n_slots),
             degrees=(slots.degree,) * 4 if has_room else slots.degrees(),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that stages the setpoints, in front of the state controller."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         ticks = stage("drone", when=lambda data: tick(data, data.controls.state.freq))
-        return [Placement(ticks(self.stage_setpoint), before="state_controller")]
+        return [StagePlacement(ticks(self.stage_setpoint), before="state_controller")]
 
     def stage_setpoint(self, data: SimData) -> SimData:
         """Stage the setpoint of one drone."""
@@ -166,7 +163,7 @@ class Follow(Plugin):
             )
         leaves = jax.tree.leaves(trajectory.padded(n_pieces, n_coefficients - 1))
         old = [record.ends, record.coefficients, record.repeats]
-        ends, coefficients, repeats = _with_slot(old, leaves, np.int32(slot))
+        ends, coefficients, repeats = _replace_slot(old, leaves, np.int32(slot))
         return self.write(data, record.replace(ends=ends, coefficients=coefficients, repeats=repeats))
 
     def upload(self, sim: Simulation, slot: int, trajectory: Trajectory) -> None:
@@ -204,13 +201,12 @@ class Follow(Plugin):
         new = {name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None}
         with sim.lock:
             record = self.read(sim.data)
-            numbers = {name: _checked(sim, name, value, len(record.ends)) for name, value in new.items()}
+            numbers = {name: _check_slot_value(sim, name, value, len(record.ends)) for name, value in new.items()}
             shapes = {name: np.broadcast_shapes(x.shape, getattr(record, name).shape) for name, x in numbers.items()}
             record = record.replace(**{name: jnp.broadcast_to(x, shapes[name]) for name, x in numbers.items()})
             sim.data = self.write(sim.data, record)
 
     def draw(self, sim: Simulation, world: int) -> None:
-        """Draw the path ahead and the setpoint of every drone."""
         if not self.visible:
             return
         record = self.read(sim.data)
@@ -219,14 +215,14 @@ class Follow(Plugin):
             np.broadcast_to(np.asarray(x)[world] if np.ndim(x) > 1 else np.asarray(x), (sim.n_drones, 1))
             for x in (record.index, record.start, record.rate)
         ]
-        paths = np.asarray(_paths(record, of_drones, now + np.linspace(0.0, AHEAD, N_DRAWN + 1)))
+        paths = np.asarray(_future_paths(record, of_drones, now + np.linspace(0.0, DRAWN_TIME, N_DRAWN_LINES + 1)))
         overlays = sim.scene.renderer.overlays
-        overlays.points(paths[:, 0], GREEN, 0.02)
+        overlays.points(paths[:, 0], PATH_COLOR, 0.02)
         for path in paths:
             if np.any(path != path[0]):
-                overlays.line(path, GREEN, 2.0, 2.0)
+                overlays.line(path, PATH_COLOR, 2.0, 2.0)
 
-    def _given(self) -> list[Trajectory]:
+    def _trajectory_list(self) -> list[Trajectory]:
         """Return the given trajectories, one by one."""
         given = self.trajectories
         given = given.unstacked() if isinstance(given, Trajectory) else given
@@ -235,8 +231,8 @@ class Follow(Plugin):
         return list(given)
 
 
-def _checked(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:
-    """Return an index, start or rate as ``check_parameter`` does; one axis is that of the drones, in all worlds."""
+def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:
+    """Return a checked index, start or rate. An array with one axis has a value per drone, for all worlds."""
     if np.shape(value) == (sim.n_drones,):
         value = np.broadcast_to(np.asarray(value), (sim.n_worlds, sim.n_drones))
     elif np.ndim(value) == 1 and np.shape(value) != (1,):
@@ -246,7 +242,7 @@ def _checked(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Arra
     return check_parameter(sim, name, value, positive=name == "rate")
 
 
-def _count(name: str, value: object, least: int) -> int:
+def _check_count(name: str, value: object, least: int) -> int:
     """Return a setting, checked to be an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise ConfigError(
@@ -256,12 +252,12 @@ def _count(name: str, value: object, least: int) -> int:
 
 
 @jax.jit
-def _with_slot(old: list[Array], new: list[Array], slot: Array) -> list[Array]:
+def _replace_slot(old: list[Array], new: list[Array], slot: Array) -> list[Array]:
     return [x.at[slot].set(y) for x, y in zip(old, new, strict=True)]
 
 
 @jax.jit
-def _paths(record: FollowData, of_drones: list[Array], times: Array) -> Array:
+def _future_paths(record: FollowData, of_drones: list[Array], times: Array) -> Array:
     """Return the positions of all drones of a world at some times. (n_drones, n_times, 3)"""
 
     def of_one(index: Array, start: Array, rate: Array) -> Array:

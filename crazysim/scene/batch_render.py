@@ -13,10 +13,10 @@ from jax import Array
 from crazysim.errors import ConfigError, not_installed
 from crazysim.scene.render import camera_id, require_size
 
-MISSING = not_installed("images of many worlds at once need", "warp-lang", "warp")
+INSTALL_MESSAGE = not_installed("images of many worlds at once need", "warp-lang", "warp")
 
 
-def installed() -> bool:
+def is_installed() -> bool:
     """Return True if MuJoCo Warp is installed."""
     return importlib.util.find_spec("warp") is not None
 
@@ -24,13 +24,13 @@ def installed() -> bool:
 class BatchRenderer:
     """Renderer of one camera in many worlds, with lights, shadows and materials, without overlays.
 
-    Its memory is that of the images and of the scene in as many worlds.
+    It needs memory for the images and for the scene in as many worlds.
     """
 
     def __init__(
         self, model: mujoco.MjModel, camera: str | int, width: int, height: int, n_worlds: int, device: jax.Device
     ):
-        """Prepare. MuJoCo Warp compiles its kernels at its first run on a machine, which takes some seconds.
+        """Load MuJoCo Warp. It compiles its kernels at its first run on a machine, which takes some seconds.
 
         Args:
             model: Compiled scene.
@@ -45,8 +45,8 @@ class BatchRenderer:
             UnknownNameError: If there is no such camera.
             ConfigError: If it is the free camera, or the size is invalid.
         """
-        if not installed():
-            raise ImportError(MISSING)
+        if not is_installed():
+            raise ImportError(INSTALL_MESSAGE)
         require_size(width, height)
         number = camera_id(model, camera)
         if number < 0:
@@ -95,14 +95,14 @@ class BatchRenderer:
             mjw.refit_bvh(self._model, d, self._context)
             mjw.render(self._model, d, self._context)
             wp.synchronize_device(self._device)
-            return _unpacked(wp.to_jax(self._context.rgb_data), self._shape)
+            return _unpack_colors(wp.to_jax(self._context.rgb_data), self._shape)
 
 
-def _unpacked(pixels: Array, shape: tuple[int, int, int]) -> Array:
+def _unpack_colors(pixels: Array, shape: tuple[int, int, int]) -> Array:
     """Return packed pixels as three colours; a copy, because the next call writes to the same buffer."""
-    return _bytes(pixels).reshape(*shape, 3)
+    return _color_bytes(pixels).reshape(*shape, 3)
 
 
 @jax.jit
-def _bytes(pixels: Array) -> Array:
+def _color_bytes(pixels: Array) -> Array:
     return jnp.stack([pixels >> shift for shift in np.array([16, 8, 0], np.uint32)], axis=-1).astype(jnp.uint8)

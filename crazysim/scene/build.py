@@ -18,9 +18,9 @@ from crazysim.drones.body import LED_MATERIALS, MATERIALS, BodyGeom, body_camera
 from crazysim.errors import ConfigError
 from crazysim.scene import mjx
 
-SCENE = Path(__file__).parents[1] / "scene.xml"
+SCENE_FILE = Path(__file__).parents[1] / "scene.xml"
 
-CHUNK = 128
+DRONES_PER_CHUNK = 128
 """Most drones that are added to a spec one by one."""
 
 
@@ -63,7 +63,7 @@ def read_spec(xml_path: str | Path | None) -> mujoco.MjSpec:
     """
     if xml_path is not None and not isinstance(xml_path, (str, Path)):
         raise ConfigError(f"expected the path of an MJCF file or None as xml_path, got {xml_path!r}")
-    path = SCENE if xml_path is None else Path(xml_path)
+    path = SCENE_FILE if xml_path is None else Path(xml_path)
     if not path.is_file():
         raise ConfigError(f"expected an existing MJCF file as xml_path, got {str(path)!r}")
     try:
@@ -84,13 +84,13 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
     for i in range(n_drones):
         for led in LED_MATERIALS:
             spec.add_material(name=f"{led}:{i}", rgba=(1, 1, 1, 0.15))
-    if n_drones <= CHUNK:
+    if n_drones <= DRONES_PER_CHUNK:
         _add_bodies(spec, airframes, range(n_drones))
         return
     with _no_warnings():
-        for first in range(0, n_drones, CHUNK):
+        for first in range(0, n_drones, DRONES_PER_CHUNK):
             chunk = mujoco.MjSpec()
-            _add_bodies(chunk, airframes, range(first, min(first + CHUNK, n_drones)))
+            _add_bodies(chunk, airframes, range(first, min(first + DRONES_PER_CHUNK, n_drones)))
             spec.attach(chunk, prefix="", frame=spec.worldbody.add_frame())
 
 
@@ -168,7 +168,7 @@ def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
     Raises:
         ConfigError: With MJX's message, if MJX does not support the scene.
     """
-    with _limits_of_mjx():
+    with _explain_mjx_errors():
         return mjx.put_model(mj_model, device=device)
 
 
@@ -178,18 +178,18 @@ def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mj
     Raises:
         ConfigError: With MJX's message, if MJX does not support the scene.
     """
-    with _limits_of_mjx():
+    with _explain_mjx_errors():
         one = mjx.put_data(mj_model, mujoco.MjData(mj_model), device=device)
-    return _repeated(one, n_worlds)
+    return _repeat_worlds(one, n_worlds)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _repeated(one: mjx.Data, n: int) -> mjx.Data:
+def _repeat_worlds(one: mjx.Data, n: int) -> mjx.Data:
     return jax.tree.map(lambda x: jnp.repeat(x[None], n, axis=0), one)
 
 
 @contextlib.contextmanager
-def _limits_of_mjx() -> Iterator[None]:
+def _explain_mjx_errors() -> Iterator[None]:
     try:
         yield
     except (NotImplementedError, ValueError) as error:

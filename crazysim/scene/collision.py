@@ -14,13 +14,13 @@ from jax import Array
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, hfield, hull
 
-KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
+GEOM_KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
          ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")}  # fmt: skip
 DRONE_BITS = (3, 1)
 """Bits contype and conaffinity of the geoms by which drones touch."""
 VISIBLE_GROUPS = range(3)
 """Groups of geoms that are drawn, as in MuJoCo's own pictures."""
-OPAQUE = 0.5
+MIN_ALPHA = 0.5
 """Least alpha of geoms that rays hit."""
 
 Kinds = Sequence[tuple[int, ...] | None]
@@ -63,14 +63,16 @@ class DroneGeoms:
     drones: tuple[int, ...] | None = None
     """Indices of the drones; None for all."""
 
-    def present(self, drone_id: Array) -> Array | None:
+    def drone_mask(self, drone_id: Array) -> Array | None:
         """Return True for the drones, by index; None if they are all. (...)"""
         if self.drones is None:
             return None
-        return functools.reduce(jnp.logical_or, [(drone_id >= a) & (drone_id <= b) for a, b in _runs(self.drones)])
+        return functools.reduce(
+            jnp.logical_or, [(drone_id >= a) & (drone_id <= b) for a, b in _consecutive_runs(self.drones)]
+        )
 
 
-def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+def _consecutive_runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
     """Return first and last of each run of consecutive numbers."""
     runs: list[tuple[int, int]] = []
     for k in sorted(numbers):
@@ -137,7 +139,7 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (
     def is_seen(geom: int) -> bool:
         material = model.geom_matid[geom]
         alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
-        return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= OPAQUE
+        return model.geom_group[geom] in VISIBLE_GROUPS and alpha >= MIN_ALPHA
 
     return _model(model, handles, kinds, is_seen, is_seen)
 
@@ -164,10 +166,10 @@ def _model(
             continue
         if not is_taken(geom):
             continue
-        kind = KINDS.get(int(model.geom_type[geom]))
+        kind = GEOM_KINDS.get(int(model.geom_type[geom]))
         if kind is None:
             raise ConfigError(
-                f"expected a geom of type {', '.join(KINDS.values())}, got geom {model.geom(geom).name!r} of type "
+                f"expected a geom of type {', '.join(GEOM_KINDS.values())}, got geom {model.geom(geom).name!r} of type "
                 f"{int(model.geom_type[geom])}. Give it contype='0' conaffinity='0', or another type."
             )
         if root == 0 and kind in ("plane", "hfield"):
@@ -208,7 +210,7 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, body: int | Non
 
 
 def _shape(model: mujoco.MjModel, geom: int) -> Shape:
-    kind, size = KINDS[int(model.geom_type[geom])], model.geom_size[geom]
+    kind, size = GEOM_KINDS[int(model.geom_type[geom])], model.geom_size[geom]
     if kind == "mesh":
         return _hull(model, int(model.geom_dataid[geom]))
     if kind == "hfield":

@@ -27,12 +27,12 @@ from crazysim.geometry import Shape, distance
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionBody, CollisionGeom, CollisionModel
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
+from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
 from crazysim.scene.objects import Handle
-from crazysim.scene.placement import Placing, place, placed_by
 
-UNROLLED = 16
+MAX_UNROLLED_GEOMS = 16
 """Most fixed geoms of one shape that are computed one by one."""
-CHUNK = 64
+DRONES_PER_CHUNK = 64
 """Drones whose distances to all others of their world are computed at a time."""
 
 
@@ -62,8 +62,8 @@ class ContactReport(PyTree):
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
-    def joined(self, other: ContactReport) -> ContactReport:
-        """Return the fields of both reports; those that both have are taken from this one."""
+    def merge(self, other: ContactReport) -> ContactReport:
+        """Return the fields of both reports. Fields of this report take precedence."""
         names = (f.name for f in dataclasses.fields(self))  # type: ignore[arg-type]
         mine = {name: x for name in names if (x := getattr(self, name)) is not None}
         return other.replace(**mine | {"object_names": self.object_names or other.object_names})
@@ -78,17 +78,17 @@ class ContactReport(PyTree):
 
 
 ObjectSelection = Iterable[Handle | str] | Handle | str | None
-"""ObjectSelection of a report: handles, names of bodies; None for all."""
+"""Objects of a report: handles or names of bodies; None for all."""
 ContactFn = Callable[..., ContactReport]
 """``contacts(data, mocap=None) -> ContactReport``."""
 
 
-def build(
+def build_contact_fn(
     model: CollisionModel,
     objects: ObjectSelection = None,
     floor: bool = True,
     drones: bool = True,
-    plugins: Placing = tuple,
+    plugins: ListPlugins = tuple,
 ) -> ContactFn:
     """Return ``contacts(data, mocap=None) -> ContactReport``, pure: for all worlds, one world, or one drone.
 
@@ -97,13 +97,13 @@ def build(
         objects: Handles or names of the objects to report; None for all, () for none.
         floor: True to report the floor.
         drones: True to report other drones. For one drone this needs a stage, and ``nearest_drone`` is None there.
-        plugins: Returns the plugins of the simulation, whose objects are put at their poses first.
+        plugins: Function that returns the plugins of the simulation, which move their objects first.
 
     Raises:
         ConfigError: If nothing is requested, or an object does not exist.
     """
     floor, drones = check_flag("floor", floor), check_flag("drones", drones)
-    chosen = choose(model, objects, in_data=False)
+    chosen = select_bodies(model, objects, in_data=False)
     names = tuple(body.name for body in chosen)
     if not (chosen or floor or drones):
         raise ConfigError("expected floor, drones or at least one object, got a contact report of nothing")
@@ -111,7 +111,7 @@ def build(
 
     def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
         require_poses(model, names, mocap)
-        data = place(data, placed_by(plugins(), names))
+        data = with_moved_objects(data, moving_plugins(plugins(), names))
         data = with_mocap_bodies(model, data, mocap)
         pos, quat = data.states.pos, data.states.quat
         all_geoms = [geom for kind in model.drones for geom in kind.geoms]
@@ -119,7 +119,7 @@ def build(
         own = [
             (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), present)
             for kind in model.drones
-            for present in (kind.present(data.core.drone_id),)
+            for present in (kind.drone_mask(data.core.drone_id),)
             for geom in kind.geoms
         ]
         found: dict[str, Array | None] = dict.fromkeys(
@@ -127,22 +127,26 @@ def build(
              "nearest_drone")
         )  # fmt: skip
         if floor:
-            gaps = [_of(has, _gap(mine, at, drone_rot, geom)) for mine, at, has in own for geom in model.floor]
-            gap = _smallest(gaps, pos)
+            gaps = [
+                _mask_absent(has, _geom_distance(mine, at, drone_rot, geom))
+                for mine, at, has in own
+                for geom in model.floor
+            ]
+            gap = _minimum(gaps, pos)
             found |= {"floor": gap < 0, "floor_distance": gap}
         if chosen:
-            gap = jnp.concatenate([_to_group(own, drone_rot, group, data) for group in groups], axis=-1)
+            gap = jnp.concatenate([_group_distances(own, drone_rot, group, data) for group in groups], axis=-1)
             found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": _argmin(gap)}
         if drones:
-            gap, nearest = (_to_others(own, drone_rot), None) if pos.ndim == 1 else _to_drones(own, drone_rot)
+            gap, nearest = (_nearest_other(own, drone_rot), None) if pos.ndim == 1 else _nearest_drones(own, drone_rot)
             found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
         return ContactReport(**found, object_names=names)
 
     return contacts
 
 
-def choose(model: CollisionModel, objects: ObjectSelection, in_data: bool = True) -> list[CollisionBody]:
-    """Return the objects of a model that are named.
+def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool = True) -> list[CollisionBody]:
+    """Return the selected objects of a model.
 
     Args:
         model: Collision model of the scene.
@@ -161,7 +165,7 @@ def choose(model: CollisionModel, objects: ObjectSelection, in_data: bool = True
     for name in names:
         if name not in by_name:
             raise ConfigError(
-                f"expected an object that drones can touch, {', '.join(by_name) or 'of which there are none'}, got "
+                f"expected an object that drones can touch, {', '.join(by_name) or 'but the scene has none'}, got "
                 f"{name!r}"
             )
         if in_data and name in model.mocap_bodies:
@@ -181,28 +185,30 @@ def _group_key(body: CollisionBody) -> tuple[Any, ...]:
     return (False, *kinds) if len(kinds) == 1 else (False, body.name)
 
 
-def size_of(model: CollisionModel, objects: ObjectSelection) -> int:
+def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
     """Return a measure of the length of a kernel for the contacts with some objects: geoms, movable ones times four."""
-    return sum(len(body.geoms) * (1 if body.row is None else 4) for body in choose(model, objects, in_data=False))
+    return sum(
+        len(body.geoms) * (1 if body.row is None else 4) for body in select_bodies(model, objects, in_data=False)
+    )
 
 
-Own = Sequence[tuple[CollisionGeom, Array, Array | None]]
+DroneParts = Sequence[tuple[CollisionGeom, Array, Array | None]]
 """Geoms of the drone, their positions, world frame, m (..., 3), and True for drones that have them (...) or None."""
 
 
-def _of(present: Array | None, gap: Array) -> Array:
+def _mask_absent(present: Array | None, gap: Array) -> Array:
     """Return distances, infinite for geoms that a drone does not have. (...)"""
     return gap if present is None else jnp.where(present, gap, jnp.inf)
 
 
-def _to_group(own: Own, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
+def _group_distances(own: DroneParts, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
     """Return the distances to objects with equal geoms, m. (..., n)"""
     geoms = group[0].geoms
     if group[0].row is None:
-        if len(group) > UNROLLED:
-            stacked = Stacked.of([body.geoms[0] for body in group])
-            return _smallest([_gaps(mine, at, drone_rot, stacked, has) for mine, at, has in own], own[0][1])
-        return jnp.stack([_to_fixed(own, drone_rot, body.geoms) for body in group], axis=-1)
+        if len(group) > MAX_UNROLLED_GEOMS:
+            stacked = StackedGeoms.of([body.geoms[0] for body in group])
+            return _minimum([_stacked_distances(mine, at, drone_rot, stacked, has) for mine, at, has in own], own[0][1])
+        return jnp.stack([_fixed_distance(own, drone_rot, body.geoms) for body in group], axis=-1)
     objects = data.objects
     rows = [body.row for body in group if body.row is not None]
     run = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
@@ -214,11 +220,11 @@ def _to_group(own: Own, drone_rot: Array | None, group: list[CollisionBody], dat
     for mine, at, has in own:
         inside = rotation.rotate_inverse(quat, at[..., None, :] - pos)
         of_each = None if has is None else has[..., None]
-        gaps += [_of(of_each, _gap(mine, inside, rot, geom)) for geom in geoms]
-    return _smallest(gaps, own[0][1])
+        gaps += [_mask_absent(of_each, _geom_distance(mine, inside, rot, geom)) for geom in geoms]
+    return _minimum(gaps, own[0][1])
 
 
-def _to_fixed(own: Own, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
+def _fixed_distance(own: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
     """Return the distance to the nearest of some geoms in the world frame, m. (...)
 
     Of many of one shape, the distances are computed side by side.
@@ -229,14 +235,14 @@ def _to_fixed(own: Own, drone_rot: Array | None, geoms: Sequence[CollisionGeom])
     gaps = []
     for alike in kinds.values():
         for mine, at, has in own:
-            if len(alike) > UNROLLED:
-                gaps.append(jnp.min(_gaps(mine, at, drone_rot, Stacked.of(alike), has), axis=-1))
+            if len(alike) > MAX_UNROLLED_GEOMS:
+                gaps.append(jnp.min(_stacked_distances(mine, at, drone_rot, StackedGeoms.of(alike), has), axis=-1))
             else:
-                gaps += [_of(has, _gap(mine, at, drone_rot, geom)) for geom in alike]
-    return _smallest(gaps, own[0][1])
+                gaps += [_mask_absent(has, _geom_distance(mine, at, drone_rot, geom)) for geom in alike]
+    return _minimum(gaps, own[0][1])
 
 
-class Stacked(NamedTuple):
+class StackedGeoms(NamedTuple):
     """Geoms of one shape at different poses."""
 
     shape: Shape
@@ -247,20 +253,24 @@ class Stacked(NamedTuple):
     """Rotation matrices; None for the identity. (n, 3, 3)"""
 
     @staticmethod
-    def of(geoms: Sequence[CollisionGeom]) -> Stacked:
+    def of(geoms: Sequence[CollisionGeom]) -> StackedGeoms:
         """Return geoms of one shape, either all turned or none."""
         rot = None if geoms[0].rot is None else np.array([geom.rot for geom in geoms])
-        return Stacked(geoms[0].shape, np.array([geom.pos for geom in geoms]), rot)
+        return StackedGeoms(geoms[0].shape, np.array([geom.pos for geom in geoms]), rot)
 
 
-def _gaps(mine: CollisionGeom, at: Array, drone_rot: Array | None, geoms: Stacked, present: Array | None) -> Array:
+def _stacked_distances(
+    mine: CollisionGeom, at: Array, drone_rot: Array | None, geoms: StackedGeoms, present: Array | None
+) -> Array:
     """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
     turned = None if drone_rot is None else drone_rot[..., None, :, :]
-    gap = _gap(mine, at[..., None, :], turned, geoms)
-    return _of(None if present is None else present[..., None], gap)
+    gap = _geom_distance(mine, at[..., None, :], turned, geoms)
+    return _mask_absent(None if present is None else present[..., None], gap)
 
 
-def _gap(mine: CollisionGeom, at: Array, drone_rot: Array | None, geom: CollisionGeom | Stacked) -> Array:
+def _geom_distance(
+    mine: CollisionGeom, at: Array, drone_rot: Array | None, geom: CollisionGeom | StackedGeoms
+) -> Array:
     """Return the distance of a drone's geom to another geom, m. (...)
 
     Args:
@@ -286,36 +296,36 @@ def _product(a: Array, b: Array) -> Array:
     return jnp.stack([rotation.matvec(a, b[..., k]) for k in range(3)], axis=-1)
 
 
-def _smallest(gaps: list[Array], pos: Array) -> Array:
+def _minimum(gaps: list[Array], pos: Array) -> Array:
     """Return the smallest of some distances, infinite if there are none. (...)"""
     if not gaps:
         return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
 
 
-def _to_others(own: Own, drone_rot: Array | None) -> Array:
+def _nearest_other(own: DroneParts, drone_rot: Array | None) -> Array:
     """Return the distance of one drone to the nearest other of its world, m. ()"""
 
     def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
-        places, theirs, rot = other
+        positions, theirs, rot = other
         inverse = None if rot is None else rot.T
         turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
         for mine, at, has in own:
-            for (geom, *_), there, other_has in zip(own, places, theirs, strict=True):
+            for (geom, *_), there, other_has in zip(own, positions, theirs, strict=True):
                 inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
                 both = None if has is None or other_has is None else has & other_has
-                gaps.append(_of(both, distance(mine.shape, geom.shape, inside, turned)))
-        return jnp.where(is_self, jnp.inf, _smallest(gaps, own[0][1]))
+                gaps.append(_mask_absent(both, distance(mine.shape, geom.shape, inside, turned)))
+        return jnp.where(is_self, jnp.inf, _minimum(gaps, own[0][1]))
 
     return reduce_over_others(between, ([at for _, at, _ in own], [has for *_, has in own], drone_rot), "min")
 
 
-def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
+def _nearest_drones(own: DroneParts, drone_rot: Array | None) -> tuple[Array, Array]:
     """Return the distance to the nearest other drone, m, and its index. (..., n_drones)
 
-    In a large swarm the distances of ``CHUNK`` drones to all others are computed at a time, so memory grows linearly
-    with the swarm.
+    In a large swarm the distances of ``DRONES_PER_CHUNK`` drones to all others are computed at a time, so memory grows
+    linearly with the swarm.
     """
     n = own[0][1].shape[-2]
     indices = jnp.arange(n, dtype=np.int32)
@@ -330,19 +340,21 @@ def _to_drones(own: Own, drone_rot: Array | None) -> tuple[Array, Array]:
                     both = jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
                 offset = here - other[..., None, :, :]
                 if drone_rot is None:
-                    gaps.append(_of(both, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
+                    gaps.append(_mask_absent(both, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
                     continue
                 inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
                 inside = rotation.matvec(inverse, offset)
                 rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
-                gaps.append(_of(both, distance(mine.shape, geom.shape, inside, rot)))
-        gap = jnp.where(chunk[:, None] == indices, jnp.inf, _smallest(gaps, own[0][1]))
+                gaps.append(_mask_absent(both, distance(mine.shape, geom.shape, inside, rot)))
+        gap = jnp.where(chunk[:, None] == indices, jnp.inf, _minimum(gaps, own[0][1]))
         return jnp.min(gap, axis=-1), _argmin(gap)
 
-    if n <= CHUNK:
+    if n <= DRONES_PER_CHUNK:
         return of_chunk(indices)
-    n_chunks = -(-n // CHUNK)
-    padded = jnp.minimum(jnp.arange(n_chunks * CHUNK, dtype=np.int32), n - 1).reshape(n_chunks, CHUNK)
+    n_chunks = -(-n // DRONES_PER_CHUNK)
+    padded = jnp.minimum(jnp.arange(n_chunks * DRONES_PER_CHUNK, dtype=np.int32), n - 1).reshape(
+        n_chunks, DRONES_PER_CHUNK
+    )
     gap, nearest = jax.lax.map(of_chunk, padded)
     return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest))  # type: ignore[return-value]
 

@@ -24,11 +24,11 @@ def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) 
     """
     is_of_body = mj_model.geom_bodyid == body_id(mj_model, body)
     contact = mjx_data._impl.contact
-    return _flags_of(contact.dist, contact.geom1, contact.geom2, is_of_body)
+    return _slot_flags(contact.dist, contact.geom1, contact.geom2, is_of_body)
 
 
 @jit_unless_traced()
-def _flags_of(dist: Array, geom1: Array, geom2: Array, is_of_body: Array) -> Array:
+def _slot_flags(dist: Array, geom1: Array, geom2: Array, is_of_body: Array) -> Array:
     """Return True for every slot that touches and has a geom of a body, given for each geom whether it is of it."""
     is_of_body = jnp.asarray(is_of_body)
     return (dist < 0) & ((geom1 >= 0) & is_of_body[geom1] | (geom2 >= 0) & is_of_body[geom2])

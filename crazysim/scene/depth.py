@@ -20,16 +20,16 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
 from crazysim.scene.first_hit import NOBODY
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
-from crazysim.scene.placement import Placing, place, placed_by
-from crazysim.scene.rays import Hits, RayKernels, cast_in_worlds
+from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
+from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays_in_worlds
 
 MAX_RAYS = 1 << 22
 """Most rays that XLA casts at a time; larger batches of worlds are split."""
 
 MAX_RAYS_OF_KERNEL = 1 << 28
-"""Most rays of a kernel; numbers of rays and places in tables are int32."""
+"""Most rays of a kernel; numbers of rays and indices of tables are int32."""
 
-TILE = 4
+TILE_SIDE = 4
 """Height and width of the tiles of pixels, whose rays follow each other: rays side by side in a kernel meet much the
 same geoms."""
 
@@ -62,7 +62,7 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
     Args:
         model: Compiled scene.
         name: Name or id.
-        objects: Bodies whose poses are in ``data.objects``, then those that are moved through ``mjx_data``.
+        objects: Bodies with poses in ``data.objects``, then bodies that are moved through ``mjx_data``.
 
     Raises:
         UnknownNameError: If there is no such camera.
@@ -78,10 +78,10 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
     if not ids:
         listed = ", ".join(dict.fromkeys(camera.rpartition(":")[0] or camera for camera in known))
         raise UnknownNameError(f"expected a camera of the scene, {listed or 'which has none'}, got {name!r}")
-    return [_camera(model, i, objects) for i in ids]
+    return [_read_camera(model, i, objects) for i in ids]
 
 
-def _camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> Camera:
+def _read_camera(model: mujoco.MjModel, i: int, objects: Sequence[str]) -> Camera:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -125,7 +125,7 @@ DepthFn = Callable[..., Hits]
 """``depth(data, mocap=None) -> Hits``."""
 
 
-def build(
+def build_depth_fn(
     model: CollisionModel,
     cameras: Sequence[Camera],
     width: int,
@@ -133,7 +133,7 @@ def build(
     drones: bool,
     hide_own: bool,
     along: Along,
-    plugins: Placing,
+    plugins: ListPlugins,
     kernels: RayKernels,
 ) -> DepthFn:
     """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``.
@@ -147,7 +147,7 @@ def build(
     for name, n in (("width", width), ("height", height)):
         if type(n) is not int or n < 1:
             raise ConfigError(f"expected an image of positive integer {name}, got {width} x {height} pixels")
-    h, w = (math.gcd(n, TILE) for n in (height, width))
+    h, w = (math.gcd(n, TILE_SIDE) for n in (height, width))
     order = np.arange(height * width).reshape(height // h, h, width // w, w).swapaxes(1, 2).reshape(-1)
     looks = np.zeros((len(cameras), height * width, 4))
     for camera, rays in zip(cameras, looks, strict=True):
@@ -157,8 +157,8 @@ def build(
 
     def of_worlds(data: SimData) -> Hits:
         eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1)
-                          for pos, rot in (_pose(camera, data) for camera in cameras)], axis=1)  # fmt: skip
-        hits = cast_in_worlds(in_data, data, eyes, looks, drones, kernels)
+                          for pos, rot in (_camera_pose(camera, data) for camera in cameras)], axis=1)  # fmt: skip
+        hits = cast_rays_in_worlds(in_data, data, eyes, looks, drones, kernels)
         cosine = jnp.asarray(-looks[..., 2].reshape(-1), eyes.dtype) if along == "axis" else 1.0
         hits = hits.replace(distance=hits.distance * cosine)
 
@@ -175,7 +175,7 @@ def build(
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
         require_poses(model, bodies, mocap)
-        data = with_mocap_bodies(model, place(data, placed_by(plugins(), bodies)), mocap)
+        data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
         most = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, at_a_time = data.core.n_worlds, max(1, most // n_rays)
         if n_worlds <= at_a_time:
@@ -192,7 +192,7 @@ def build(
     return depth
 
 
-def _pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
+def _camera_pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
     """Return the camera's position in every world, m (n_worlds, 3), and its axes as columns (n_worlds, 3, 3)."""
     states, n = data.states, data.states.pos.shape[0]
     pos, rot = (jnp.asarray(x, states.pos.dtype) for x in (camera.pos, camera.rot))

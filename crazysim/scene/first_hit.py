@@ -1,6 +1,6 @@
 """The first geom that a ray meets: a function of one ray, for kernels of all rays and for stages of a step.
 
-Geoms that do not move are in a hierarchy of boxes. For kernels of all rays, those of movable bodies and drones are in a
+Geoms that do not move are in a hierarchy of boxes. For kernels of all rays, geoms of movable bodies and drones are in a
 list with a ball around each, for every world.
 """
 
@@ -20,18 +20,18 @@ from crazysim.core.branches import any_lane, compute_where, table_rows
 from crazysim.core.data import SimData
 from crazysim.geometry import Shape
 from crazysim.geometry.bounds import bounding_box, bounding_radius
-from crazysim.geometry.fieldrays import PARALLEL, field_ray
+from crazysim.geometry.fieldrays import MIN_COMPONENT, field_ray
 from crazysim.geometry.points import Components
-from crazysim.geometry.rays import Interval, Sized, first_of, hit_distance
-from crazysim.geometry.shapes import SIZES
+from crazysim.geometry.rays import Interval, SizedShapes, first_distance, hit_distance
+from crazysim.geometry.shapes import N_SIZES
 from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 
 NOBODY, NO_DRONE = -1, -2
 """Drone that a ray passes through if it passes through none, and owner of geoms that belong to no drone."""
 
-SLACK = 1e-3
-"""Part of its radius by which a ball is larger, beside ``hierarchy.PADDING``, for rounding."""
+BALL_SLACK = 1e-3
+"""Part of its radius by which a ball is larger, beside ``hierarchy.BOX_PADDING``, for rounding."""
 
 Surface = Shape | str
 """A mesh or height field, or the kind of shapes that their sizes describe."""
@@ -77,7 +77,7 @@ class Hierarchy(NamedTuple):
     boxes: Array
     """Boxes of the nodes, one order after the other. (8 * n_nodes, 6)"""
     links: Array
-    """Place behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
+    """Index of the node behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
     geoms: Array
     """Geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
 
@@ -128,7 +128,7 @@ class Targets:
         self.fixed = [x for x in found if x.carrier == "world"]
         """Geoms that do not move."""
         self.movable = [x for carrier in ("object", "drone") for x in found if x.carrier == carrier]
-        """Geoms of movable objects, then those of drones."""
+        """Geoms of movable objects, then geoms of drones."""
         self.all = [*self.fixed, *self.movable]
         """All of them, in the order of their indices."""
         self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all))
@@ -139,14 +139,14 @@ class Targets:
         """Index of the surface of each geom, and the drone that it belongs to. (n, 2)"""
 
     def hierarchy(self, dtype: DTypeLike) -> Hierarchy:
-        """Return the fixed geoms; see ``hierarchy.build``."""
+        """Return the fixed geoms; see ``build_hierarchy``."""
         low, high = np.zeros((2, len(self.fixed), 3))
         for k, target in enumerate(self.fixed):
             rot = np.eye(3) if target.geom.rot is None else np.array(target.geom.rot)
             centre, half = bounding_box(target.geom.shape)
             centre, half = np.array(target.geom.pos) + rot @ centre, np.abs(rot) @ half
             low[k], high[k] = centre - half, centre + half
-        boxes, links = (x.reshape(-1, x.shape[-1]) for x in hierarchy.build(low, high))
+        boxes, links = (x.reshape(-1, x.shape[-1]) for x in hierarchy.build_hierarchy(low, high))
         geoms = np.array([x.numbers(np.array(x.geom.pos)) for x in self.fixed]).reshape(-1, 16)
         codes = self.codes[: len(self.fixed)]
         return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
@@ -175,7 +175,9 @@ class Targets:
             middles = [r @ bounding_box(t.geom.shape)[0] for r, t in zip(rot, some, strict=True)]
             radii = np.array([bounding_radius(t.geom.shape) for t in some])
             centre = pos + rotation.rotate(quat, jnp.asarray(own[:, :3] + np.array(middles), dtype))
-            radius = jnp.broadcast_to(jnp.asarray(radii * (1 + SLACK) + hierarchy.PADDING, dtype), centre.shape[:2])
+            radius = jnp.broadcast_to(
+                jnp.asarray(radii * (1 + BALL_SLACK) + hierarchy.BOX_PADDING, dtype), centre.shape[:2]
+            )
             balls.append(jnp.concatenate([centre, radius[..., None]], axis=-1))
             at = pos + rotation.rotate(quat, jnp.asarray(own[:, :3], dtype))
             axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
@@ -212,11 +214,11 @@ class Ray(NamedTuple):
     """Drone that it passes through, or ``NOBODY``."""
 
 
-Best = tuple[Array, Array]
+BestHit = tuple[Array, Array]
 """Distance to the first geom so far, m, infinite for none, and its index, -1 for none."""
 
 
-def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array) -> Best:
+def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array) -> BestHit:
     """Return the distance to the first geom that a ray meets, and the index of the geom; see ``Targets.all``.
 
     Of geoms at the same distance it is the one of the lowest index.
@@ -238,25 +240,25 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     ray = Ray((eye[0], eye[1], eye[2]), (x, y, z), passes.astype(jnp.int32))
     best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
 
-    best = first_fixed(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
+    best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
 
-    def turn(carry: tuple[Array, Best]) -> tuple[Array, Best]:
+    def turn(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
         k, best = carry
         row, geom = world * n_movable + k, n_fixed + k
         code, owner = table_rows(t.codes, geom)
         meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
 
-        def visit(best: Best) -> Best:
-            return _nearer(surfaces, code, geom, table_rows(t.movable, row), ray, meets, best)
+        def visit(best: BestHit) -> BestHit:
+            return _nearer_hit(surfaces, code, geom, table_rows(t.movable, row), ray, meets, best)
 
         return k + 1, compute_where(any_lane(meets), visit, best)
 
     return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
 
 
-def first_fixed(
-    surfaces: Sequence[Surface], tables: Hierarchy, ray: Ray, best: Best, n_nodes: Array | int | None = None
-) -> Best:
+def first_fixed_hit(
+    surfaces: Sequence[Surface], tables: Hierarchy, ray: Ray, best: BestHit, n_nodes: Array | int | None = None
+) -> BestHit:
     """Return the nearer of the best hit and the first fixed geom that a ray meets.
 
     Args:
@@ -267,33 +269,33 @@ def first_fixed(
         n_nodes: Nodes of an order of the hierarchy; None for as many as the tables have.
     """
     n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes
-    inverse = [1 / jnp.where(jnp.abs(d) < PARALLEL, PARALLEL, d) for d in ray.direction]
+    inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
     scaled = [o * i for o, i in zip(ray.origin, inverse, strict=True)]
     signs = [any_lane(d < 0) for d in ray.direction]
     start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
 
-    def walk(carry: tuple[Array, Best]) -> tuple[Array, Best]:
-        place, best = carry
-        box, (after, geom) = table_rows(tables.boxes, start + place), table_rows(tables.links, start + place)
+    def walk(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
+        node, best = carry
+        box, (after, geom) = table_rows(tables.boxes, start + node), table_rows(tables.links, start + node)
         meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
 
-        def visit(best: Best) -> Best:
+        def visit(best: BestHit) -> BestHit:
             code, _ = table_rows(tables.codes, geom)
-            return _nearer(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
+            return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
 
-        def go_in(carry: tuple[Array, Best]) -> tuple[Array, Best]:
-            return place + 1, compute_where(geom >= 0, visit, carry[1])
+        def go_in(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
+            return node + 1, compute_where(geom >= 0, visit, carry[1])
 
         return compute_where(any_lane(meets), go_in, (after, best))
 
     return lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))[1]
 
 
-def _larger(a: Array, b: Array) -> Array:
+def _maximum(a: Array, b: Array) -> Array:
     return jnp.where(a < b, b, a)
 
 
-def _smaller(a: Array, b: Array) -> Array:
+def _minimum(a: Array, b: Array) -> Array:
     return jnp.where(a > b, b, a)
 
 
@@ -310,10 +312,10 @@ def _meets_box(
         best: Distance to its best hit, m.
     """
     ends = [(a * i - s, b * i - s) for a, b, s, i in zip(low, high, scaled, inverse, strict=True)]
-    x, y, z = (_smaller(*pair) for pair in ends)
-    near = _larger(_larger(x, y), z)
-    x, y, z = (_larger(*pair) for pair in ends)
-    far = _smaller(_smaller(x, y), z)
+    x, y, z = (_minimum(*pair) for pair in ends)
+    near = _maximum(_maximum(x, y), z)
+    x, y, z = (_maximum(*pair) for pair in ends)
+    far = _minimum(_minimum(x, y), z)
     return (near <= far) & (far >= 0) & (near <= best)
 
 
@@ -328,15 +330,15 @@ def _meets_ball(ball: Sequence[Array], ray: Ray, best: Array) -> Array:
     return (square <= radius * radius) & (middle + radius >= 0) & (middle - radius <= best)
 
 
-def _nearer(
-    surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, meets: Array, best: Best
-) -> Best:
-    """Return the nearer of the best hit and, where a ray may meet it, that of geom ``k``, whose row is given."""
-    start, along = in_frame(row, ray.origin, ray.direction)
+def _nearer_hit(
+    surfaces: Sequence[Surface], code: Array, k: Array, row: Sequence[Array], ray: Ray, meets: Array, best: BestHit
+) -> BestHit:
+    """Return the best hit, or a nearer hit of geom ``k`` where a ray may meet it."""
+    start, along = ray_in_frame(row, ray.origin, ray.direction)
     for number, surface in enumerate(surfaces):
 
-        def of_surface(best: Best, surface: Surface = surface) -> Best:
-            far = _distance(surface, row, start, along)
+        def of_surface(best: BestHit, surface: Surface = surface) -> BestHit:
+            far = _ray_length(surface, row, start, along)
             closer = meets & ((far < best[0]) | ((far == best[0]) & (k < best[1])))
             return jnp.where(closer, far, best[0]), jnp.where(closer, k, best[1])
 
@@ -344,7 +346,7 @@ def _nearer(
     return best
 
 
-def in_frame(row: Sequence[Array], origin: Components, direction: Components) -> tuple[Components, Components]:
+def ray_in_frame(row: Sequence[Array], origin: Components, direction: Components) -> tuple[Components, Components]:
     """Return a ray in the frame of a geom, whose row is given."""
     away = [o - p for o, p in zip(origin, row, strict=False)]
     start, along = (
@@ -353,21 +355,21 @@ def in_frame(row: Sequence[Array], origin: Components, direction: Components) ->
     return start, along  # type: ignore[return-value]
 
 
-def shape_of(surface: Surface, row: Sequence[Array]) -> Shape | Sized:
+def geom_shape(surface: Surface, row: Sequence[Array]) -> Shape | SizedShapes:
     """Return the shape of a geom, whose row is given."""
-    return Sized(surface, row[13 : 13 + SIZES[surface]]) if isinstance(surface, str) else surface
+    return SizedShapes(surface, row[13 : 13 + N_SIZES[surface]]) if isinstance(surface, str) else surface
 
 
-def _distance(surface: Surface, row: Sequence[Array], start: Components, along: Components) -> Array:
+def _ray_length(surface: Surface, row: Sequence[Array], start: Components, along: Components) -> Array:
     """Return the distance along one ray in the frame of a geom, m. ()"""
     if isinstance(surface, str):
-        return hit_distance(shape_of(surface, row), start, along)
+        return hit_distance(geom_shape(surface, row), start, along)
     if surface.kind == "hfield":
         return field_ray(surface, jnp.stack(start), jnp.stack(along))[0]
-    return _first_of_planes(surface, start, along)
+    return _mesh_ray_length(surface, start, along)
 
 
-def _first_of_planes(shape: Shape, origin: Components, direction: Components) -> Array:
+def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) -> Array:
     """Return the distance along one ray to a mesh, in a loop over its planes, as ``hit_distance`` has it, m. ()"""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
@@ -376,7 +378,7 @@ def _first_of_planes(shape: Shape, origin: Components, direction: Components) ->
         x, y, z, offset = table_rows(planes, k)
         below = offset - (x * origin[0] + y * origin[1] + z * origin[2])
         rises = x * direction[0] + y * direction[1] + z * direction[2]
-        parallel = jnp.abs(rises) < PARALLEL
+        parallel = jnp.abs(rises) < MIN_COMPONENT
         t = below / jnp.where(parallel, 1.0, rises)
         near = jnp.where(~parallel & (rises < 0) & (t > near), t, near)
         far = jnp.where(~parallel & (rises > 0) & (t < far), t, far)
@@ -385,4 +387,4 @@ def _first_of_planes(shape: Shape, origin: Components, direction: Components) ->
     infinite = jnp.full_like(origin[0], jnp.inf)
     begin = jnp.int32(0), (-infinite, infinite, infinite > 0)
     (_, (near, far, meets)), _ = lax.scan(turn, begin, length=len(planes))
-    return first_of((near, far, meets & (near <= far)))
+    return first_distance((near, far, meets & (near <= far)))

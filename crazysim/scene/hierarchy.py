@@ -1,6 +1,6 @@
 """Bounding volume hierarchy of geoms that do not move, as a table that a ray walks without a stack.
 
-Nodes follow each other in the order of a visit, and each has the place behind its subtree, where a ray continues that
+Nodes follow each other in the order of a visit, and each has the index behind its subtree, where a ray continues that
 misses its box. There is an order for each of the eight octants of directions, so that what is nearer comes first.
 """
 
@@ -10,11 +10,11 @@ import dataclasses
 
 import numpy as np
 
-from crazysim.geometry.bounds import UNBOUNDED
+from crazysim.geometry.bounds import UNBOUNDED_LENGTH
 
 N_ORDERS = 8
 """Orders of the nodes: one for each octant of directions."""
-PADDING = 1e-4
+BOX_PADDING = 1e-4
 """Length by which boxes are larger on all sides, m, so that rounding makes no ray miss the box of what it meets: more
 than the spacing of numbers in float32 up to 1 km, which is 6e-5 m."""
 
@@ -33,7 +33,7 @@ class _Node:
     """Index of the geom of a leaf; -1 for others."""
 
 
-def build(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes of the hierarchy of some boxes, in all orders.
 
     Bit k of an order's number is set where directions along axis k are negative.
@@ -44,18 +44,18 @@ def build(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         Least and greatest corner of the box of each node, m. (8, n_nodes, 6)
-        The place behind its subtree, and the index of the geom of a leaf or -1. (8, n_nodes, 2)
+        Index of the node behind its subtree, and index of the geom of a leaf or -1. (8, n_nodes, 2)
     """
-    low, high = low - PADDING, high + PADDING
-    bounded = np.all(high - low < UNBOUNDED, axis=1)
+    low, high = low - BOX_PADDING, high + BOX_PADDING
+    bounded = np.all(high - low < UNBOUNDED_LENGTH, axis=1)
     roots = [_Node(low[k], high[k], geom=int(k)) for k in np.flatnonzero(~bounded)]
     if bounded.any():
-        roots.append(_tree(low, high, np.flatnonzero(bounded)))
-    rows = np.array([_ordered(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
+        roots.append(_build_tree(low, high, np.flatnonzero(bounded)))
+    rows = np.array([_node_rows(roots, order) for order in range(N_ORDERS)]).reshape(N_ORDERS, -1, 8)
     return rows[..., :6], rows[..., 6:].astype(np.int32)
 
 
-def _tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
+def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     """Return the tree of some boxes, split where the surfaces of both parts, times their counts, are least.
 
     No part has less than an eighth of the boxes, which bounds the depth.
@@ -65,7 +65,7 @@ def _tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     if n == 1:
         return node
     order = np.argsort(low[geoms] + high[geoms], axis=0, kind="stable")  # along each axis
-    a, b = low[geoms][order], high[geoms][order]  # (n, 3, 3): place, axis of the order, component
+    a, b = low[geoms][order], high[geoms][order]  # (n, 3, 3): position, axis of the order, component
 
     def surfaces(low: np.ndarray, high: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(high - low, -1, 0)
@@ -80,21 +80,21 @@ def _tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     at, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)
     halves = np.split(geoms[order[:, axis]], [int(at) + least + 1])
     node.axis, node.geom = int(axis), -1
-    node.children = _tree(low, high, halves[0]), _tree(low, high, halves[1])
+    node.children = _build_tree(low, high, halves[0]), _build_tree(low, high, halves[1])
     return node
 
 
-def _ordered(roots: list[_Node], order: int) -> list[list[float]]:
+def _node_rows(roots: list[_Node], order: int) -> list[list[float]]:
     """Return the rows of all nodes, in the order of an octant."""
     rows: list[list[float]] = []
 
     def visit(node: _Node) -> None:
-        place = len(rows)
+        index = len(rows)
         rows.append([])
         if node.children is not None:
             for child in node.children[:: -1 if order >> node.axis & 1 else 1]:
                 visit(child)
-        rows[place] = [*node.low, *node.high, len(rows), node.geom]
+        rows[index] = [*node.low, *node.high, len(rows), node.geom]
 
     for root in roots:
         visit(root)

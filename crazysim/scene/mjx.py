@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 __all__ = ["Data", "Model", "camlight", "collision", "com_pos", "kinematics", "put_data", "put_model"]
 
 
-def load() -> ModuleType:
+def load_module() -> ModuleType:
     """Return the module ``mujoco.mjx``."""
     # MJX prints two lines when Warp cannot be imported.
-    with _without_warp(), contextlib.redirect_stdout(io.StringIO()):
+    with _hide_warp(), contextlib.redirect_stdout(io.StringIO()):
         return importlib.import_module("mujoco.mjx")
 
 
 @contextlib.contextmanager
-def _without_warp() -> Iterator[None]:
+def _hide_warp() -> Iterator[None]:
     """Let imports of Warp fail, unless it has been imported."""
     if "warp" in sys.modules or "mujoco.mjx" in sys.modules:
         yield
@@ -43,4 +43,4 @@ def _without_warp() -> Iterator[None]:
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(load(), name)
+    return getattr(load_module(), name)

@@ -22,7 +22,7 @@ class MjxScene:
     """``mjx.Model`` and ``mjx.Data`` of one compiled scene."""
 
     def __init__(self, mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device, mesh: Mesh | None):
-        """Take the compiled scene; nothing is allocated yet.
+        """Keep the compiled scene; nothing is allocated yet.
 
         Args:
             mj_model: Compiled scene.

@@ -19,7 +19,7 @@ n_mocap, 4). In a function of one world both come without ``n_worlds``."""
 
 
 def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -> SimData:
-    """Return the data with the poses of a model's ``mocap_bodies`` behind those of the objects with handles.
+    """Return the data with the poses of a model's ``mocap_bodies`` appended to the poses of objects with handles.
 
     Args:
         model: Model that is queried.
@@ -30,7 +30,7 @@ def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -
         return data
     batched = data.states.pos.ndim == 3
     dtype, ids = data.states.pos.dtype, np.array(model.mocap_ids)
-    pos, quat = (jnp.take(x, ids, axis=-2).astype(dtype) for x in _pair(mocap, data if batched else None))
+    pos, quat = (jnp.take(x, ids, axis=-2).astype(dtype) for x in _pose_pair(mocap, data if batched else None))
     quat = jnp.roll(quat, -1, axis=-1)
     quat = quat / jnp.linalg.norm(quat, axis=-1, keepdims=True)
     if batched:
@@ -57,7 +57,7 @@ def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses
         )
 
 
-def _pair(mocap: MocapPoses, data: SimData | None) -> tuple[Array, Array]:
+def _pose_pair(mocap: MocapPoses, data: SimData | None) -> tuple[Array, Array]:
     pos, quat = mocap if isinstance(mocap, (tuple, list)) else (mocap.mocap_pos, mocap.mocap_quat)
     pos, quat = jnp.asarray(pos), jnp.asarray(quat)
     n = None if data is None else data.states.pos.shape[0]

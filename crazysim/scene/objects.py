@@ -23,7 +23,7 @@ from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
 MAX_OBJECTS = 100_000
 """Most objects that are added at once."""
-IDENTITY = (0.0, 0.0, 0.0, 1.0)
+IDENTITY_QUAT = (0.0, 0.0, 0.0, 1.0)
 """Identity attitude, xyzw."""
 Source = str | Path | mujoco.MjSpec | mujoco.MjsBody
 """Name of a primitive, path of an MJCF file, MJCF text, a spec, or a body of one."""
@@ -51,7 +51,6 @@ class Handle:
         return bool(self.rows)
 
     def __len__(self) -> int:
-        """Return the number of objects."""
         return len(self.numbers)
 
     def __getitem__(self, k: int | slice) -> Handle:
@@ -95,7 +94,7 @@ class Handle:
     def pose(self, data: SimData) -> tuple[Array, Array]:
         """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4)."""
         objects = self._objects(data)
-        return _rows(objects.pos, self.rows), _rows(objects.quat, self.rows)
+        return _select_rows(objects.pos, self.rows), _select_rows(objects.quat, self.rows)
 
     def _objects(self, data: SimData) -> Objects:
         if not self.movable:
@@ -109,12 +108,14 @@ class Handle:
         return data.objects  # type: ignore[return-value]
 
     def _with_rows(self, old: Array, what: str, value: ArrayLike, mask: Array | None) -> Array:
-        value = as_poses(value, what, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
-        return _moved(old, value, mask, self.rows, what == "quat")
+        value = require_pose_array(value, what, len(self), old.shape[-1], old.shape[0] if old.ndim == 4 else None)
+        return _replace_rows(old, value, mask, self.rows, what == "quat")
 
 
 @jit_unless_traced("numbers", "is_quat")
-def _moved(old: Array, value: Array | NDArray, mask: Array | None, numbers: tuple[int, ...], is_quat: bool) -> Array:
+def _replace_rows(
+    old: Array, value: Array | NDArray, mask: Array | None, numbers: tuple[int, ...], is_quat: bool
+) -> Array:
     """Return positions, attitudes or velocities of all objects with some rows replaced; attitudes are normalised."""
     n, size = len(numbers), old.shape[-1]
     value = jnp.asarray(value, old.dtype)
@@ -133,12 +134,12 @@ def _moved(old: Array, value: Array | NDArray, mask: Array | None, numbers: tupl
 
 
 @jit_unless_traced("numbers")
-def _rows(old: Array, numbers: tuple[int, ...]) -> Array:
+def _select_rows(old: Array, numbers: tuple[int, ...]) -> Array:
     """Return positions or attitudes of some objects. (n, k), or (n_worlds, n, k) for all worlds"""
     return (old if old.ndim == 2 else old[:, 0])[..., np.array(numbers), :]
 
 
-def as_poses(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
+def require_pose_array(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
     """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)
 
     Raises:
@@ -160,22 +161,21 @@ def as_poses(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | Non
     return array
 
 
-class Mark(NamedTuple):
-    """Contents of a scene at some time, to which ``take_back`` returns."""
+class SceneSnapshot(NamedTuple):
+    """Contents of a scene at some time, to which ``restore_snapshot`` returns."""
 
     names: list[set[str]]
     """Names of the elements of the spec, as ``_elements`` has them."""
     handles: list[Handle]
     """Handles of all objects."""
     initial: list[tuple[NDArray, NDArray]]
-    """Initial poses of those that can be moved."""
+    """Initial poses of the movable objects."""
 
 
 class SceneObjects:
     """The objects that were added to a scene."""
 
     def __init__(self, n_worlds: int):
-        """Begin without objects."""
         self._n_worlds = n_worlds
         self._handles: list[Handle] = []
         self._initial: list[tuple[NDArray, NDArray]] = []
@@ -207,7 +207,9 @@ class SceneObjects:
             )
         n_worlds = self._n_worlds if check_flag("mocap", mocap) else None
         poses = [
-            np.broadcast_to(np.asarray(as_poses(x, what, count, size, n_worlds)), (n_worlds or 1, count, size))
+            np.broadcast_to(
+                np.asarray(require_pose_array(x, what, count, size, n_worlds)), (n_worlds or 1, count, size)
+            )
             for x, what, size in ((pos, "pos", 3), (quat, "quat", 4))
         ]
         poses[1] = poses[1] / np.linalg.norm(poses[1], axis=-1, keepdims=True)
@@ -223,17 +225,19 @@ class SceneObjects:
         """Return the number of objects of a kind, or of a body of that name: 0 if it was not added."""
         return sum(len(handle) for handle in self._handles if handle.name == name)
 
-    def mark(self, spec: mujoco.MjSpec) -> Mark:
-        """Return the contents of a spec as they are now, for ``take_back``."""
-        return Mark([{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial[:])
+    def take_snapshot(self, spec: mujoco.MjSpec) -> SceneSnapshot:
+        """Return the contents of a spec as they are now, for ``restore_snapshot``."""
+        return SceneSnapshot(
+            [{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial[:]
+        )
 
-    def take_back(self, spec: mujoco.MjSpec, mark: Mark) -> bool:
-        """Take out of a spec what was added since a mark, and return whether there was anything."""
-        pairs = zip(_elements(spec), mark.names, strict=True)
+    def restore_snapshot(self, spec: mujoco.MjSpec, snapshot: SceneSnapshot) -> bool:
+        """Remove what was added to a spec since a snapshot, and return whether there was anything."""
+        pairs = zip(_elements(spec), snapshot.names, strict=True)
         added = [x for elements, names in pairs for x in elements if x.name not in names]
         for element in added:
             spec.delete(element)
-        self._handles, self._initial = mark.handles, mark.initial
+        self._handles, self._initial = snapshot.handles, snapshot.initial
         return bool(added)
 
     def record(self, before: Objects | None, mocap_ids: list[int]) -> Objects | None:

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError, UnknownNameError
 
-RED = (1.0, 0.0, 0.0, 1.0)
+DEFAULT_COLOR = (1.0, 0.0, 0.0, 1.0)
 """Default colour, rgba."""
 
-CORNERS = {
+IMAGE_CORNERS = {
     "top left": mujoco.mjtGridPos.mjGRID_TOPLEFT,
     "top right": mujoco.mjtGridPos.mjGRID_TOPRIGHT,
     "bottom left": mujoco.mjtGridPos.mjGRID_BOTTOMLEFT,
@@ -62,14 +62,14 @@ class Overlays:
 
     def label(self, text: str, point: NDArray) -> None:
         """Add a line of text at a point, world frame, m, in front of everything. (3,)"""
-        self._add([(mujoco.mjtGeom.mjGEOM_LABEL, 0.0, point, _readable(text, MAX_LABEL))], (1, 1, 1, 1))
+        self._add([(mujoco.mjtGeom.mjGEOM_LABEL, 0.0, point, _printable_text(text, MAX_LABEL))], (1, 1, 1, 1))
 
     def text(self, text: str, corner: str) -> None:
         """Add text to a corner of the image, below earlier text."""
-        if corner not in CORNERS:
-            raise UnknownNameError(f"expected corner {' or '.join(map(repr, CORNERS))}, got {corner!r}")
+        if corner not in IMAGE_CORNERS:
+            raise UnknownNameError(f"expected corner {' or '.join(map(repr, IMAGE_CORNERS))}, got {corner!r}")
         above = self._texts.get(corner)
-        self._texts[corner] = _readable(text) if above is None else f"{above}\n{_readable(text)}"
+        self._texts[corner] = _printable_text(text) if above is None else f"{above}\n{_printable_text(text)}"
 
     def _add(self, geoms: list[tuple], rgba: ArrayLike, emission: float = 0.0) -> None:
         if len(self) + len(geoms) > self.limit:
@@ -104,7 +104,7 @@ class Overlays:
     def write_text(self, pixels: mujoco.MjrRect, context: mujoco.MjrContext) -> None:
         """Write the text of the corners over an image that has just been drawn."""
         for corner, text in self._texts.items():
-            mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, CORNERS[corner], pixels, text, "", context)
+            mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, IMAGE_CORNERS[corner], pixels, text, "", context)
 
     def clear(self) -> None:
         """Remove all geoms and text."""
@@ -116,11 +116,11 @@ class Overlays:
         return Overlays(self.limit, list(self._geoms), dict(self._texts))
 
     def restore(self, overlays: Overlays) -> None:
-        """Replace geoms and text by those of a copy."""
+        """Replace geoms and text by the contents of a copy."""
         self._geoms[:], self._texts = overlays._geoms, dict(overlays._texts)
 
 
-def _readable(text: str, longest: int | None = None) -> str:
+def _printable_text(text: str, longest: int | None = None) -> str:
     """Return text that MuJoCo's font can show.
 
     Raises:

@@ -14,7 +14,7 @@ from crazysim.core.settings import as_rgba
 from crazysim.errors import ConfigError
 from crazysim.tables import LENGTH
 
-TOUCHED_BY_DRONES = {"contype": 0, "conaffinity": 2}
+DRONE_TOUCH_BITS = {"contype": 0, "conaffinity": 2}
 """Bits of geoms that touch drones only, so that no object is in contact with the floor it stands on."""
 
 Geoms = list[dict[str, Any]]
@@ -113,5 +113,5 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
             raise ConfigError(f"expected positive lengths of {name!r}, in m, up to {LENGTH.high:g}, got {settings}")
         geom["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{geom['type'].upper()}")
         geom["size"] = (*geom["size"], 0, 0)[:3]
-        geom |= {"rgba": rgba, **TOUCHED_BY_DRONES}
+        geom |= {"rgba": rgba, **DRONE_TOUCH_BITS}
     return geoms

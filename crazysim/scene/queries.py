@@ -24,15 +24,14 @@ from crazysim.scene.objects import Handle
 from crazysim.scene.scene import Scene
 
 MAX_SIZE = 256
-"""Largest ``size_of`` a contact report that gets a kernel: it takes 20 s to compile for 64 movable boxes. XLA takes 1 s
-for any number, and 1.4 times as long in each call."""
+"""Largest ``kernel_size`` of a contact report that gets a kernel, which takes 20 s to compile for 64 movable boxes. XLA
+takes 1 s for any number, and 1.4 times as long in each call."""
 
 
 class SceneQueries:
     """Queries with the arguments seen so far, compiled until the scene changes."""
 
     def __init__(self, scene: Scene):
-        """Take the scene."""
         self._scene = scene
         self._reported: set[str] = set()
         self._compiled: tuple[mujoco.MjModel | None, dict[tuple[Any, ...], Callable[..., Any]]] = None, {}
@@ -64,7 +63,7 @@ class SceneQueries:
             _, compiled = self._compiled = self._scene.mj_model, {}
         first = (name, *settings) not in compiled
         if first:
-            compiled[name, *settings] = jax.jit(_of_poses(build(), data))
+            compiled[name, *settings] = jax.jit(_as_function_of_poses(build(), data))
         states, objects = data.states, data.objects
         # Only what the query needs: a compiled call costs by the number of its arrays.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
@@ -77,21 +76,21 @@ class SceneQueries:
         # The data come with the objects of plugins at their poses.
         model, kernels = self._scene.collision_model, self._scene.ray_kernels
         platform = kernels.platform
-        by_xla = contact_report.build(model, objects, floor, drones)
-        if platform is None or contact_report.size_of(model, objects) > MAX_SIZE:
+        by_xla = contact_report.build_contact_fn(model, objects, floor, drones)
+        if platform is None or contact_report.kernel_size(model, objects) > MAX_SIZE:
             return by_xla
         # Their poses become part of the data before the kernel runs, which is for data alone.
         in_data = model.without_mocap_bodies()
         queries: list[Query] = []
-        if floor or contact_report.choose(in_data, objects):
-            queries.append(("drone", contact_report.build(in_data, objects, floor, drones=False)))
+        if floor or contact_report.select_bodies(in_data, objects):
+            queries.append(("drone", contact_report.build_contact_fn(in_data, objects, floor, drones=False)))
         if drones:
-            queries.append(("world", contact_report.build(in_data, (), floor=False)))
+            queries.append(("world", contact_report.build_contact_fn(in_data, (), floor=False)))
 
         def contacts(data: SimData, mocap: MocapPoses) -> ContactReport:
             try:
                 found = query(queries, with_mocap_bodies(model, data, mocap), platform)
-                return functools.reduce(ContactReport.joined, found)
+                return functools.reduce(ContactReport.merge, found)
             except UnsupportedError as error:
                 if not isinstance(error, LimitError):
                     problem = f"the contact report has no kernel: {error.reason}"
@@ -102,17 +101,17 @@ class SceneQueries:
         return contacts
 
 
-def _of_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
+def _as_function_of_poses(fn: Callable[..., Any], data: SimData) -> Callable[..., Any]:
     """Return a function of data and mocap poses as one of poses alone; the rest of the data is left out."""
-    bare = jax.tree.map(lambda _: None, data)
+    poses_only = jax.tree.map(lambda _: None, data)
 
     def of_poses(
         pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: MocapPoses
     ) -> Any:
-        states, objects = bare.states.replace(pos=pos, quat=quat), bare.objects
-        core = bare.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
+        states, objects = poses_only.states.replace(pos=pos, quat=quat), poses_only.objects
+        core = poses_only.core.replace(drone_id=jnp.broadcast_to(jnp.arange(pos.shape[-2]), pos.shape[:-1]))
         if objects is not None:
             objects = objects.replace(pos=objects_pos, quat=objects_quat)
-        return fn(bare.replace(states=states, objects=objects, core=core, plugins={}), mocap)
+        return fn(poses_only.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 
     return of_poses

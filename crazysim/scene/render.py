@@ -12,26 +12,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError, short_repr
 from crazysim.scene.overlays import Overlays
-from crazysim.scene.software import quality
-from crazysim.scene.window import Window
+from crazysim.scene.scene_window import SceneWindow
+from crazysim.scene.software import rendering_quality
 
 MAX_SIZES = 4
 """Most image sizes that keep a context of their own."""
 
-MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
+RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 """Modes of ``Sim.render``."""
 
 
-class Viewer:
+class ModelRenderer:
     """Renderer of one model: offscreen in any size, or in a window. Contexts are made when first used."""
 
     def __init__(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData, max_geom: int):
-        """Take the model; nothing is opened yet."""
         self._model, self._data, self._max_geom = mj_model, mj_data, max_geom
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-        self._windows: list[Window] = []
+        self._windows: list[SceneWindow] = []
         # Contexts must be freed before the interpreter exits, even without a call of close.
-        weakref.finalize(self, _free, self._renderers, self._windows)
+        weakref.finalize(self, _close_all, self._renderers, self._windows)
 
     def render(
         self,
@@ -43,13 +42,13 @@ class Viewer:
         overlays: Overlays,
     ) -> NDArray | tuple[NDArray, NDArray] | None:
         """Return or show an image; see ``Sim.render``."""
-        if mode not in MODES:
-            raise UnknownNameError(f"expected mode {' or '.join(map(repr, MODES))}, got {mode!r}")
+        if mode not in RENDER_MODES:
+            raise UnknownNameError(f"expected mode {' or '.join(map(repr, RENDER_MODES))}, got {mode!r}")
         require_size(width, height)
         cam = self._camera(camera, cam_config)
         if mode == "human":
             if not self._windows:
-                self._windows.append(Window(self._model, self._max_geom, width, height))
+                self._windows.append(SceneWindow(self._model, self._max_geom, width, height))
             self._windows[0].draw(self._data, cam, overlays, width, height)
             return None
         renderer = self._renderer(width, height)
@@ -67,8 +66,8 @@ class Viewer:
         bodies = renderer.scene.ngeom
         overlays.write(renderer.scene)
         if mode == "rgb_array":
-            return _image(renderer, overlays)
-        color = _image(renderer, overlays) if mode == "rgbd_tuple" else None
+            return _read_image(renderer, overlays)
+        color = _read_image(renderer, overlays) if mode == "rgbd_tuple" else None
         renderer.scene.ngeom = bodies  # depth does not include overlays
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
@@ -82,7 +81,7 @@ class Viewer:
 
     def close(self) -> None:
         """Close the window and free the contexts."""
-        _free(self._renderers, self._windows)
+        _close_all(self._renderers, self._windows)
 
     def _camera(self, camera: int | str, cam_config: Mapping[str, ArrayLike] | None) -> mujoco.MjvCamera:
         cam = mujoco.MjvCamera()
@@ -111,7 +110,7 @@ class Viewer:
             # Buffers are made once per context; a larger image than any before needs a new context.
             buffers.offwidth, buffers.offheight = max(buffers.offwidth, width), max(buffers.offheight, height)
             try:
-                with quality(self._model):
+                with rendering_quality(self._model):
                     renderer = mujoco.Renderer(self._model, height, width, self._max_geom, font_scale(height))
             except ConfigError:
                 raise
@@ -161,7 +160,7 @@ def font_scale(height: int) -> mujoco.mjtFontScale:
     return mujoco.mjtFontScale(int(np.clip(50 * (height // 240), 50, 300)))
 
 
-def _image(renderer: mujoco.Renderer, overlays: Overlays) -> NDArray:
+def _read_image(renderer: mujoco.Renderer, overlays: Overlays) -> NDArray:
     image = renderer.render().copy()
     if overlays.has_text:  # mujoco.Renderer has no text: it is written into its buffer, which is read again
         overlays.write_text(renderer._rect, renderer._mjr_context)
@@ -170,7 +169,7 @@ def _image(renderer: mujoco.Renderer, overlays: Overlays) -> NDArray:
     return image
 
 
-def _free(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[Window]) -> None:
+def _close_all(renderers: dict[tuple[int, int], mujoco.Renderer], windows: list[SceneWindow]) -> None:
     for holder in (*renderers.values(), *windows):
         holder.close()
     renderers.clear()

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.settings import positive_integer
 from crazysim.scene.batch_render import BatchRenderer
 from crazysim.scene.overlays import Overlays
-from crazysim.scene.render import Viewer
+from crazysim.scene.render import ModelRenderer
 
 
 class SceneRenderer:
@@ -20,11 +20,10 @@ class SceneRenderer:
 
     overlays: Overlays
     """Lines, points, labels and text of the next image."""
-    viewer: Viewer | None
+    viewer: ModelRenderer | None
     """Renderer of one world; None before the first image."""
 
     def __init__(self, device: jax.Device):
-        """Prepare for a device that holds the poses; nothing is opened yet."""
         self._device = device
         self.overlays = Overlays()
         self.viewer = None
@@ -42,7 +41,7 @@ class SceneRenderer:
     ) -> NDArray | tuple[NDArray, NDArray] | None:
         """Return or show an image of one world with the overlays, and clear those; see ``Sim.render``."""
         if self.viewer is None:
-            self.viewer = Viewer(model, data, self.overlays.limit + model.ngeom)
+            self.viewer = ModelRenderer(model, data, self.overlays.limit + model.ngeom)
         image = self.viewer.render(mode, camera, cam_config, width, height, self.overlays)
         self.overlays.clear()
         return image

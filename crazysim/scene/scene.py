@@ -21,11 +21,11 @@ from crazysim.errors import ConfigError
 from crazysim.scene import build, collision, contact_report, depth, mjx
 from crazysim.scene.collision import CollisionModel
 from crazysim.scene.mjx_scene import MjxScene
-from crazysim.scene.objects import IDENTITY, Handle, SceneObjects, Source
-from crazysim.scene.placement import Placing
-from crazysim.scene.rays import RayKernels
+from crazysim.scene.object_poses import ListPlugins
+from crazysim.scene.objects import IDENTITY_QUAT, Handle, SceneObjects, Source
+from crazysim.scene.ray_casting import RayKernels
 from crazysim.scene.renderer import SceneRenderer
-from crazysim.scene.sync import sync_one_world, with_poses_of
+from crazysim.scene.sync import sync_one_world, with_data_poses
 
 LARGE_SWARM = 64
 """Drones per world from which on MJX checks two pairs per drone instead of every pair."""
@@ -46,12 +46,12 @@ class Scene:
     """Renderers and the overlays of the next image."""
     added: SceneObjects
     """Objects that were added with ``add``."""
-    plugins: Placing
-    """Returns the plugins of the simulation, some of which place objects."""
+    plugins: ListPlugins
+    """Function that returns the plugins of the simulation."""
     ray_kernels: RayKernels
     """Choice of what casts rays and answers contact reports."""
     revision: int
-    """Number of edits of the spec. The compiled model is that of one of them, and so are the objects and mocap ids in
+    """Number of edits of the spec. The compiled model belongs to one of them, as do the objects and mocap ids in
     the data."""
 
     def __init__(
@@ -63,7 +63,7 @@ class Scene:
         freq: int,
         device: jax.Device,
         mesh: Mesh | None,
-        plugins: Placing,
+        plugins: ListPlugins,
         ray_kernels: RayKernels,
     ):
         """Build and compile the spec.
@@ -76,14 +76,14 @@ class Scene:
             freq: Physics steps per second, Hz.
             device: Device of the scene of all worlds.
             mesh: Devices over which the worlds are spread instead; None for one device.
-            plugins: Returns the plugins of the simulation, some of which place objects.
+            plugins: Function that returns the plugins of the simulation.
             ray_kernels: Choice of what casts rays and answers contact reports.
 
         Raises:
             ConfigError: If the scene cannot be read or compiled.
         """
         self.n_worlds, self.n_drones, self.device, self.mesh = n_worlds, n_drones, device, mesh
-        self.kinds = _kinds(airframes)
+        self.kinds = _airframe_groups(airframes)
         self.max_geom_pairs = -1 if n_drones < LARGE_SWARM else 2 * n_drones
         self.renderer = SceneRenderer(device)
         self.spec = build.build_spec(xml_path, airframes, freq, self.max_geom_pairs)
@@ -100,7 +100,7 @@ class Scene:
         *,
         count: int = 1,
         pos: ArrayLike = (0.0, 0.0, 0.0),
-        quat: ArrayLike = IDENTITY,
+        quat: ArrayLike = IDENTITY_QUAT,
         mocap: bool = True,
         **options: Any,
     ) -> Handle:
@@ -127,7 +127,7 @@ class Scene:
         return handle
 
     def add_once(self, what: Source, name: str, count: int) -> None:
-        """Add objects, unless there are as many of that name: those of a plugin stay when it is removed or replaced.
+        """Add objects, unless there are as many of that name. Objects of a plugin stay when it is removed or replaced.
 
         Raises:
             ConfigError: If there are others.
@@ -143,12 +143,12 @@ class Scene:
 
     @contextlib.contextmanager
     def unchanged_on_error(self) -> Iterator[None]:
-        """Take objects that are added within the block out of the scene again where an error ends the block."""
-        mark = self.added.mark(self.spec)
+        """Remove objects that were added within the block if an error ends the block."""
+        snapshot = self.added.take_snapshot(self.spec)
         try:
             yield
         except BaseException:
-            if self.added.take_back(self.spec, mark):
+            if self.added.restore_snapshot(self.spec, snapshot):
                 self.revision += 1
             raise
 
@@ -207,7 +207,7 @@ class Scene:
         return self.added.record(before, self._ids(movable) if self._is_edited else self._object_ids)
 
     def _ids(self, names: Sequence[str]) -> list[int]:
-        """Return mocap ids in the spec, which are those of the compiled model; nothing is compiled.
+        """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled.
 
         Raises:
             ConfigError: If the spec lacks one of the bodies.
@@ -261,7 +261,7 @@ class Scene:
         Raises:
             ConfigError: If nothing is requested, or an object does not exist.
         """
-        return contact_report.build(self.collision_model, objects, floor, drones, self.plugins)
+        return contact_report.build_contact_fn(self.collision_model, objects, floor, drones, self.plugins)
 
     def depth_fn(
         self,
@@ -294,7 +294,7 @@ class Scene:
         """
         objects = (*self.added.movable, *self.visual_model.mocap_bodies)
         cameras = depth.find_cameras(self.mj_model, camera, objects)
-        return depth.build(
+        return depth.build_depth_fn(
             self.visual_model, cameras, width, height, drones, hide_own, along, self.plugins, self.ray_kernels
         )
 
@@ -313,7 +313,7 @@ class Scene:
         return self._mjx.data
 
     def assign_mjx(self, mjx_data: mjx.Data) -> None:
-        """Take ``mjx_data`` of a user; ``Sim.mjx_data`` also clears the flag of the data."""
+        """Store the ``mjx_data`` of a user; ``Sim.mjx_data`` also clears the flag of the data."""
         self._mjx.data = mjx_data
 
     @property
@@ -322,7 +322,7 @@ class Scene:
         return self._mjx.is_allocated
 
     def mocap_poses(self) -> tuple[Array, Array]:
-        """Return poses of mocap bodies that are moved through ``mjx_data``; those of all others may be out of date.
+        """Return poses of mocap bodies that are moved through ``mjx_data``; all other poses may be out of date.
 
         Returns:
             Positions, m (n_worlds, n_mocap, 3), and attitudes, wxyz (n_worlds, n_mocap, 4).
@@ -380,7 +380,7 @@ class Scene:
             ConfigError: If the camera is the free one or does not exist, or the size is invalid.
         """
         self.compile_if_edited()
-        poses = with_poses_of(data, worlds, self._mjx.poses(worlds))
+        poses = with_data_poses(data, worlds, self._mjx.poses(worlds))
         return self.renderer.render_worlds(self._mj_model, poses, camera, width, height)
 
     def close(self) -> None:
@@ -388,7 +388,7 @@ class Scene:
         self.renderer.close()
 
 
-def _kinds(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
+def _airframe_groups(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
     """Return the indices of the drones of each airframe; None for all."""
     found: dict[int, list[int]] = {}
     for k, airframe in enumerate(airframes):

@@ -12,11 +12,11 @@ from mujoco.rendering.classic import gl_context
 
 from crazysim.errors import ConfigError
 
-VARIABLE = "CRAZYSIM_RENDERING"
-"""Environment variable: ``full`` for the scene's quality on every machine, ``fast`` for that of CPUs."""
-SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
+QUALITY_VARIABLE = "CRAZYSIM_RENDERING"
+"""Environment variable: ``full`` for the scene's quality on every machine, ``fast`` for the quality of CPUs."""
+CPU_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
 """Names of OpenGL's renderers that run on CPUs."""
-LIMITS = {"offsamples": 0, "shadowsize": 0, "numslices": 16, "numstacks": 8}
+QUALITY_LIMITS = {"offsamples": 0, "shadowsize": 0, "numslices": 16, "numstacks": 8}
 """Largest settings of MuJoCo's quality where a CPU draws.
 
 Samples of a pixel; width of the map of shadows, pixels, 0 for no shadows; meridians and parallels of round shapes. With
@@ -32,9 +32,9 @@ def is_fast() -> bool:
     Raises:
         ConfigError: If the environment variable is neither ``full`` nor ``fast``.
     """
-    chosen = os.environ.get(VARIABLE, "")
+    chosen = os.environ.get(QUALITY_VARIABLE, "")
     if chosen not in ("", "full", "fast"):
-        raise ConfigError(f"expected full or fast in {VARIABLE}, got {chosen!r}. Correct it, or unset it.")
+        raise ConfigError(f"expected full or fast in {QUALITY_VARIABLE}, got {chosen!r}. Correct it, or unset it.")
     return chosen == "fast" or (not chosen and is_software())
 
 
@@ -52,23 +52,23 @@ def is_software() -> bool:
             context.free()
     except Exception:  # bindings raise errors of any type, which the renderer itself reports
         return False
-    return any(x in name for x in SOFTWARE)
+    return any(x in name for x in CPU_RENDERERS)
 
 
 @contextlib.contextmanager
-def quality(model: mujoco.MjModel) -> Iterator[None]:
+def rendering_quality(model: mujoco.MjModel) -> Iterator[None]:
     """Give a model the settings for this machine while a context is made, which reads them then."""
     if not is_fast():
         yield
         return
     settings = model.vis.quality
-    before = [getattr(settings, name) for name in LIMITS]
-    for (name, limit), value in zip(LIMITS.items(), before, strict=True):
+    before = [getattr(settings, name) for name in QUALITY_LIMITS]
+    for (name, limit), value in zip(QUALITY_LIMITS.items(), before, strict=True):
         setattr(settings, name, min(value, limit))
     try:
         yield
     finally:
-        for name, value in zip(LIMITS, before, strict=True):
+        for name, value in zip(QUALITY_LIMITS, before, strict=True):
             setattr(settings, name, value)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.core.data import SimData
 from crazysim.eager import fetch_rows, jit_unless_traced
 from crazysim.scene import mjx
-from crazysim.scene.kinematics import ONLY_DUMMY, kinematics
+from crazysim.scene.kinematics import N_DUMMY_JOINTS, update_kinematics
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
 """Modes of cameras that follow a centre of mass; a sync computes it for them only."""
@@ -36,13 +36,13 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
             mocap_quat=mjx_data.mocap_quat.at[:, ids].set(jnp.roll(quat, 1, axis=-1)),
         )
 
-    has_joints = mjx_model.njnt > ONLY_DUMMY
+    has_joints = mjx_model.njnt > N_DUMMY_JOINTS
     if not has_joints:
-        mjx_data = kinematics(mjx_model, mjx_data)
+        mjx_data = update_kinematics(mjx_model, mjx_data)
 
     def of_world(world: mjx.Data) -> mjx.Data:
         if has_joints:
-            world = mjx.kinematics(_carry_children(mjx_model, world), world)
+            world = mjx.kinematics(_model_with_mocap_poses(mjx_model, world), world)
         if np.isin(mjx_model.cam_mode, COM_CAMERAS).any():
             world = mjx.com_pos(mjx_model, world)
         world = mjx.camlight(mjx_model, world)
@@ -56,17 +56,17 @@ def _poses(data: SimData) -> list[tuple[Array, Array, Array]]:
     """Return mocap ids, positions and attitudes of drones and of objects with handles."""
     owned = [(data.core.drone_mocap_ids, data.states.pos, data.states.quat)]
     if data.objects is not None:
-        owned.append((data.objects.mocap_ids, *_without_axis(data.objects.pos, data.objects.quat)))
+        owned.append((data.objects.mocap_ids, *_drop_drone_axis(data.objects.pos, data.objects.quat)))
     return owned
 
 
 @jit_unless_traced()
-def _without_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
+def _drop_drone_axis(pos: Array, quat: Array) -> tuple[Array, Array]:
     """Return poses of objects without the axis of drones. (n_worlds, n, k)"""
     return pos[:, 0], quat[:, 0]
 
 
-def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
+def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
     """Return a model with the mocap bodies at this world's poses, if any of them has children.
 
     MJX 3.17 applies mocap poses after it has traversed the tree, which leaves the children at the model's poses.
@@ -82,7 +82,7 @@ def _carry_children(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
 
 
 @jit_unless_traced()
-def with_poses_of(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
     """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
 
     Args:

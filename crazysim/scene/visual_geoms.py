@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from crazysim.scene.collision import VISIBLE_GROUPS
 
-KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+GEOM_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 """Types of geoms, by MJCF's names."""
-UNCOLORED = (0.5, 0.5, 0.5, 1.0)
+DEFAULT_COLOR = (0.5, 0.5, 0.5, 1.0)
 """Colour that MuJoCo gives to geoms without a colour, rgba."""
 
 
@@ -21,7 +21,7 @@ class VisualGeom:
     """One visible geom, in the frame of the mocap body that carries it, or in the world frame."""
 
     kind: str
-    """One of ``KINDS``."""
+    """One of ``GEOM_KINDS``."""
     size: NDArray
     """Radii and half sizes, m, as in MJCF. (3,)"""
     rgba: NDArray
@@ -48,7 +48,7 @@ def visual_geoms(model: mujoco.MjModel, data: mujoco.MjData) -> list[VisualGeom]
     return [
         _geom(model, data, geom)
         for geom in range(model.ngeom)
-        if model.geom_group[geom] in VISIBLE_GROUPS and _kind(model, geom) in KINDS and _color(model, geom)[3] > 0
+        if model.geom_group[geom] in VISIBLE_GROUPS and _kind(model, geom) in GEOM_KINDS and _color(model, geom)[3] > 0
     ]
 
 
@@ -82,7 +82,7 @@ def _geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> VisualGeom:
 def _color(model: mujoco.MjModel, geom: int) -> NDArray:
     """Return a geom's own colour, or its material's times the mean colour of its texture. (4,)"""
     material = int(model.geom_matid[geom])
-    if material < 0 or not np.allclose(model.geom_rgba[geom], UNCOLORED):
+    if material < 0 or not np.allclose(model.geom_rgba[geom], DEFAULT_COLOR):
         return model.geom_rgba[geom].astype(float)
     color = model.mat_rgba[material].astype(float)
     texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])

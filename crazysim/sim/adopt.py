@@ -17,18 +17,18 @@ from crazysim.core.population import Population
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.build import read_spec
 
-Kind = AirframeSource | type[Population]
+VehicleKind = AirframeSource | type[Population]
 """An airframe, or a subclass of ``Population``."""
 
 
-def known_kinds() -> dict[str, Kind]:
+def known_kinds() -> dict[str, VehicleKind]:
     """Return the built-in airframes and populations by the prefix of names."""
     from crazysim.plugins.vehicles import Bicycles, Cars  # imported where a file is adopted
 
     return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}
 
 
-NAME = re.compile(r"([A-Za-z][A-Za-z0-9]*)_(\d+)")
+VEHICLE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9]*)_(\d+)")
 """Names of vehicles: prefix and number."""
 
 
@@ -37,7 +37,7 @@ class Vehicle(NamedTuple):
 
     name: str
     """Name of its body."""
-    kind: Kind
+    kind: VehicleKind
     """Its airframe or population."""
     pos: np.ndarray
     """Position, world frame, m. (3,)"""
@@ -46,16 +46,16 @@ class Vehicle(NamedTuple):
 
 
 def read_vehicles(
-    xml_path: str | Path, kinds: Mapping[str, Kind]
+    xml_path: str | Path, kinds: Mapping[str, VehicleKind]
 ) -> tuple[mujoco.MjSpec, list[Vehicle], dict[type[Population], list[Vehicle]]]:
     """Return the spec of an MJCF without its vehicles, its drones, and the members of each population.
 
     Args:
         xml_path: MJCF file.
-        kinds: Airframe or population by prefixes besides those of ``known_kinds``.
+        kinds: Airframe or population by further prefixes, besides ``known_kinds``.
 
     Raises:
-        UnknownNameError: If a prefix is unknown, with those that are known.
+        UnknownNameError: If a prefix is unknown; the message lists the known ones.
         ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
     """
     spec = read_spec(xml_path)
@@ -73,7 +73,7 @@ def read_vehicles(
     return spec, drones, populations
 
 
-def poses_of(vehicles: list[Vehicle], like: Array) -> tuple[Array, Array]:
+def vehicle_poses(vehicles: list[Vehicle], like: Array) -> tuple[Array, Array]:
     """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4), of vehicles in all worlds.
 
     Args:
@@ -85,7 +85,7 @@ def poses_of(vehicles: list[Vehicle], like: Array) -> tuple[Array, Array]:
     return pos, quat
 
 
-def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, Kind]) -> list[Vehicle]:
+def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list[Vehicle]:
     """Return the vehicles of a spec, and remove their bodies from it.
 
     Vehicles are children of the world that can move and whose names are a prefix and a number.
@@ -95,12 +95,12 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, Kind]) -> list[Vehicl
         kinds: Airframe or population by prefix.
 
     Raises:
-        UnknownNameError: If a prefix is unknown, with those that are known.
+        UnknownNameError: If a prefix is unknown; the message lists the known ones.
         ConfigError: If two bodies have the same name.
     """
     found = []
     for body in spec.worldbody.bodies:
-        match = NAME.fullmatch(body.name)
+        match = VEHICLE_NAME.fullmatch(body.name)
         if match is None or not (body.mocap or len(body.joints)):
             continue
         prefix = match.group(1)
@@ -119,5 +119,5 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, Kind]) -> list[Vehicl
     return [vehicle for _, vehicle in found]
 
 
-def _is_population(kind: Kind) -> TypeGuard[type[Population]]:
+def _is_population(kind: VehicleKind) -> TypeGuard[type[Population]]:
     return isinstance(kind, type) and issubclass(kind, Population)

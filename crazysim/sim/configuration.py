@@ -69,7 +69,7 @@ class Configuration:
     """True to raise an error where a slower engine would be taken with a warning."""
 
     def check(self, data: Any, like: SimData) -> None:
-        """Check that data are those of a simulation with these settings; it takes some microseconds.
+        """Check that data belong to a simulation with these settings; it takes some microseconds.
 
         The axes of each leaf are checked by the step.
 
@@ -91,8 +91,8 @@ class Configuration:
         needed = self.n_worlds, self.n_drones, self.freq, self.control, fitted
         if given != needed:
             raise ConfigError(
-                f"expected data of {_described(*needed)}, got data of {_described(*given)}. Use data of this "
-                f"simulation, or of one with the same settings."
+                f"expected data of {_describe_settings(*needed)}, got data of {_describe_settings(*given)}. Use data "
+                f"of this simulation, or of one with the same settings."
             )
         require_same_controllers(controls, like.controls, getattr(self.controller, "name", None))
 
@@ -146,8 +146,8 @@ class Configuration:
         )  # fmt: skip
 
 
-def plugins_of(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
-    """Return the plugins that a simulation is made with: those of its shorthands, then the listed ones.
+def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
+    """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones.
 
     Raises:
         ConfigError: If an argument of ``Sim`` is invalid.
@@ -166,7 +166,7 @@ def plugins_of(plugins: Sequence[Plugin], estimator: str | Estimator | None, aer
     return [*found, *plugin_list("plugins", plugins)]
 
 
-def _described(n_worlds: int, n_drones: int, freq: int, control: Control, fitted: bool) -> str:
+def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, fitted: bool) -> str:
     """Return the settings of data for a message."""
     dynamics = "fitted" if fitted else "first-principles"
     return (

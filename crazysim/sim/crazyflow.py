@@ -33,7 +33,9 @@ def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) ->
     Raises:
         ConfigError: If the mask has another shape or type.
     """
-    return record.replace(**{name: _selected(mask, new, getattr(record, name)) for name, new in changes.items()})
+    return record.replace(
+        **{name: _select_in_worlds(mask, new, getattr(record, name)) for name, new in changes.items()}
+    )
 
 
 def world_mask(tree: Tree) -> Tree:
@@ -42,7 +44,7 @@ def world_mask(tree: Tree) -> Tree:
 
 
 def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None = None) -> Tree:
-    """Return a tree whose batched leaves are those of another tree in the worlds of a mask.
+    """Return a tree with the batched leaves of another tree in the worlds of a mask.
 
     Args:
         tree: Tree to change.
@@ -54,7 +56,7 @@ def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None 
         ConfigError: If the mask has another shape or type.
     """
     return jax.tree.map(
-        lambda old, new, is_batched: _selected(mask, new, old) if is_batched else old,
+        lambda old, new, is_batched: _select_in_worlds(mask, new, old) if is_batched else old,
         tree,
         new_tree,
         batched,
@@ -89,7 +91,7 @@ def render_depth(
     return jnp.where(jnp.isfinite(depth[:, 0]), depth[:, 0], -1.0)
 
 
-def _selected(mask: Any, new: Any, old: Any) -> Array:
+def _select_in_worlds(mask: Any, new: Any, old: Any) -> Array:
     """Return new values in the worlds of a mask, and old ones elsewhere; the mask is checked."""
     new = jnp.asarray(new)
     n_worlds = np.broadcast_shapes(new.shape, np.shape(old))[:1]

@@ -21,13 +21,13 @@ from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
 from crazysim.eager import is_on_host, jit_unless_traced
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.plugins.registry import PluginRegistry
+from crazysim.plugins.plugin_registry import PluginRegistry
 from crazysim.pytree import PyTree
 
-Stage = Callable[[Array | NDArray, Array | NDArray | None], None]
+StageCommand = Callable[[Array | NDArray, Array | NDArray | None], None]
 """Stages a command of all drones, and its feedforward."""
 
-DRONE = "drone"
+DRONE_POPULATION = "drone"
 """Population of the drones."""
 
 
@@ -40,13 +40,13 @@ class Member:
     population: str
     """Name of its population; ``"drone"`` for a drone."""
 
-    def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage: Stage):
+    def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage: StageCommand):
         """Take the simulation, the name, the index in the population, the population and the function that stages.
 
         A ``plugin`` of None is for drones.
         """
         self._sim, self.name, self.index, self._plugin, self._stage = sim, name, index, plugin, stage
-        self.population, self.lock = DRONE if plugin is None else plugin.name, sim.lock
+        self.population, self.lock = DRONE_POPULATION if plugin is None else plugin.name, sim.lock
 
     def __getattr__(self, field: str) -> Array:
         """Return a field of the record. (n_worlds, ...)
@@ -57,7 +57,7 @@ class Member:
         value: Any = None if field.startswith("_") else getattr(self._record(), field, None)
         if np.ndim(value) < 2:
             raise AttributeError(f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}.")
-        return _row(value, self.index)
+        return _read_row(value, self.index)
 
     @locked
     def set(self, **values: ArrayLike) -> None:
@@ -82,7 +82,7 @@ class Member:
     def command(self, command: ArrayLike) -> None:
         """Stage a command for this one alone: (k,), or (n_worlds, k) for each world.
 
-        A drone takes the command of the simulation's level, a member of a population that of its population.
+        A drone takes a command of the simulation's level, a member a command of its population's level.
 
         Raises:
             ConfigError: If the population takes no commands.
@@ -102,7 +102,7 @@ class Member:
             command = self._for_rotors(command, command_shape(data, level)[-1])
         staged = self._with_checked_row(f"{level.value} command of {self.name}", staged, command)
         # the feedforward of the other drones stays
-        feedforward = [_with_row(x, self.index, _row(F.feedforward_of(staged), self.index)) for x in before]
+        feedforward = [_replace_row(x, self.index, _read_row(F.feedforward_of(staged), self.index)) for x in before]
         self._stage(staged, *feedforward)
 
     def _for_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
@@ -122,7 +122,7 @@ class Member:
             value = np.asarray(value, x.dtype)
             if not np.all(np.isfinite(value)):
                 raise ValueError(f"expected finite numbers as {what}, got NaN or infinity. Check its computation.")
-        return _with_row(x, self.index, value)
+        return _replace_row(x, self.index, value)
 
     def _record(self) -> PyTree:
         return self._sim.data.states if self._plugin is None else self._plugin.read(self._sim.data)
@@ -138,39 +138,39 @@ class Member:
         return f"<{self.name}: {self.population} {self.index}>"
 
 
-def _row(x: Array | NDArray, index: int) -> Any:
+def _read_row(x: Array | NDArray, index: int) -> Any:
     """Return the row of one drone or member. (n_worlds, ...)"""
     if isinstance(x, np.ndarray):
         return x[:, index]
     if is_on_host(x) and not jaxcompat.is_key(x):
         return jaxcompat.put_host_array(np.asarray(x)[:, index].copy(), x.sharding)
-    return _row_on_device(x, index)
+    return _read_row_on_device(x, index)
 
 
-def _with_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
+def _replace_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
     """Return rows with that of one drone or member replaced, on the host if all are there. (n_worlds, n, ...)"""
     if is_on_host(x) and not isinstance(value, jax.Array):
         rows = np.array(x)
         rows[:, index] = value
         return rows
-    return _with_row_on_device(x, index, value)
+    return _replace_row_on_device(x, index, value)
 
 
 @jit_unless_traced()
-def _row_on_device(x: Array, index: Array | int) -> Array:
+def _read_row_on_device(x: Array, index: Array | int) -> Array:
     return x[:, index]
 
 
 @jit_unless_traced()
-def _with_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Array:
+def _replace_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Array:
     return x.at[:, index].set(value)
 
 
-def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage: Stage) -> Member:
+def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage: StageCommand) -> Member:
     """Return the view of a drone or member of a population among the plugins.
 
     Raises:
-        UnknownNameError: If there is none of that name, with those that are probably meant.
+        UnknownNameError: If there is none of that name; the message suggests similar names.
     """
     if name in (drones := sim.names[: sim.n_drones]):
         return Member(sim, name, drones.index(name), None, stage)

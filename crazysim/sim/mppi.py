@@ -24,14 +24,14 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
 
-Cost = Callable[[SimState, Setpoint, Array], Array]
+CostFn = Callable[[SimState, Setpoint, Array], Array]
 """States of one drone, its setpoint at the same time and its command to the cost of one control step. ()"""
 
-NAME = "mppi"
+RECORD_NAME = "mppi"
 """Key in ``data.plugins`` of a rollout's record."""
 MAX_KNOTS = 64
 """Largest number of knots; the engine selects among that many."""
-LEVELS = (Control.attitude, Control.body_rate, Control.force_torque, Control.rotor_vel)
+COMMAND_LEVELS = (Control.attitude, Control.body_rate, Control.force_torque, Control.rotor_vel)
 """Command levels that can be sampled."""
 
 
@@ -112,18 +112,18 @@ class MPPI:
         freq: int | None = None,
         noise: ArrayLike | None = None,
         temperature: float = 0.05,
-        cost: Cost = tracking_cost,
+        cost: CostFn = tracking_cost,
         seed: int = 0,
     ):
         """Build the rollouts.
 
         Args:
-            sim: Simulation that is controlled; its settings and plugins at this time are those of the rollouts.
+            sim: Simulation that is controlled; the rollouts have its settings and plugins of this time.
             horizon: Number of control steps of a rollout.
             samples: Number of rollouts for each world.
             substeps: Physics steps of a control step.
             knots: Number of commands that make a plan, 2 to ``MAX_KNOTS``.
-            freq: Rate of the rollouts' physics, Hz; None for that of the simulation. A control step lasts
+            freq: Rate of the rollouts' physics, Hz; None for the simulation's. A control step lasts
                 ``substeps / freq`` s, and ``command`` must be called once in that time.
             noise: Standard deviation of the samples around the plan, in the units of the command, (k,); None for a
                 default of the level.
@@ -135,9 +135,9 @@ class MPPI:
             ConfigError: If a setting is invalid.
         """
         c = sim.configuration
-        if c.control not in LEVELS:
+        if c.control not in COMMAND_LEVELS:
             raise ConfigError(
-                f"expected a simulation with control as one of {', '.join(map(repr, map(str, LEVELS)))}, got "
+                f"expected a simulation with control as one of {', '.join(map(repr, map(str, COMMAND_LEVELS)))}, got "
                 f"{c.control.value!r}. Use Sim(control='attitude')."
             )
         self.horizon, self.samples = positive_integer("horizon", horizon), positive_integer("samples", samples)
@@ -226,7 +226,7 @@ class MPPI:
             cost=jnp.zeros((n_worlds * self.samples, n_drones, 1), plan.dtype),
         )
         final = self._step(self._rollouts(data, record), self.horizon * self.substeps)
-        costs = final.plugins[NAME].cost.reshape(n_worlds, self.samples, n_drones)
+        costs = final.plugins[RECORD_NAME].cost.reshape(n_worlds, self.samples, n_drones)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         excess = costs - jnp.min(costs, axis=1, keepdims=True)
         finite = jnp.isfinite(excess)  # a drone whose rollouts all failed keeps its plan
@@ -236,7 +236,7 @@ class MPPI:
         weights = jnp.where(finite, jnp.exp(-jnp.where(finite, excess, 0.0) / (self.temperature * spread + 1e-9)), 0.0)
         weights = weights / jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), 1e-9)
         moved = plan + jnp.einsum("wsd,wsdkc->wdkc", weights, knots - plan[:, None])
-        return moved[:, :, 0], MPPIMemory(self._shifted(moved), memory.count + 1)
+        return moved[:, :, 0], MPPIMemory(self._shift_plan(moved), memory.count + 1)
 
     # Rollouts -------------------------------------------------------------------------------------------------------
 
@@ -244,7 +244,7 @@ class MPPI:
         return jnp.repeat(x, self.samples, axis=0)
 
     def _rollouts(self, data: SimData, record: RolloutRecord) -> SimData:
-        """Return the data of the rollouts: that of the simulation, once for every sample, at step 0."""
+        """Return the data of the rollouts: the data of the simulation, once for every sample, at step 0."""
         template = self._sim.data
         if data.plugins.keys() != template.plugins.keys():
             raise ConfigError(
@@ -267,36 +267,36 @@ class MPPI:
             world_id=template.core.world_id,
             drone_mocap_ids=template.core.drone_mocap_ids,
         )
-        return started.replace(core=core, plugins=started.plugins | {NAME: record})
+        return started.replace(core=core, plugins=started.plugins | {RECORD_NAME: record})
 
     def _control_tick(self, data: SimData) -> Array:
         return data.core.steps % self.substeps == 0
 
     def _command_stage(self, data: SimData) -> SimData:
         """Stage the command of the plan at this time."""
-        return stage_command(data, self._planned(data, data.core.steps))
+        return stage_command(data, self._command_at(data, data.core.steps))
 
     def _cost_stage(self, data: SimData) -> SimData:
         """Add the cost of the control step that ends; the clock has moved on."""
-        record = data.plugins[NAME]
+        record = data.plugins[RECORD_NAME]
         t = data.core.steps.astype(record.cost.dtype) / data.core.freq
-        command = self._planned(data, data.core.steps - self.substeps)
+        command = self._command_at(data, data.core.steps - self.substeps)
         cost = self.cost(data.states, setpoint_after(record.setpoint, t), command)
         record = record.replace(cost=record.cost + jnp.reshape(cost, (1,)))
-        return data.replace(plugins=data.plugins | {NAME: record})
+        return data.replace(plugins=data.plugins | {RECORD_NAME: record})
 
-    def _planned(self, data: SimData, step: Array) -> Array:
+    def _command_at(self, data: SimData, step: Array) -> Array:
         """Return the command of one drone's plan at a step. (k,)"""
-        knots = data.plugins[NAME].knots
-        place = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
-        below = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, self.knots - 2)
-        return knots[below] + (place - below) * (knots[below + 1] - knots[below])
+        knots = data.plugins[RECORD_NAME].knots
+        knot = step.astype(knots.dtype) * ((self.knots - 1) / ((self.horizon - 1) * self.substeps))
+        below = jnp.clip(jnp.floor(knot).astype(jnp.int32), 0, self.knots - 2)
+        return knots[below] + (knot - below) * (knots[below + 1] - knots[below])
 
-    def _shifted(self, plan: Array) -> Array:
+    def _shift_plan(self, plan: Array) -> Array:
         """Return the plan one control step later; its end is held."""
-        place = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
-        below = np.minimum(np.floor(place).astype(int), self.knots - 2)
-        share = np.minimum(place - below, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
+        knot = np.arange(self.knots) + (self.knots - 1) / (self.horizon - 1)
+        below = np.minimum(np.floor(knot).astype(int), self.knots - 2)
+        share = np.minimum(knot - below, 1.0).astype(np.asarray(self.noise).dtype)[:, None]
         return plan[:, :, below] + share * (plan[:, :, below + 1] - plan[:, :, below])
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.cache import keep_programs
 from crazysim.control import Control, Controller
-from crazysim.control.controllers import DEFAULT
+from crazysim.control.controllers import DEFAULT_CONTROLLER
 from crazysim.core import functional as F
 from crazysim.core.airframes import AirframeSource, airframe_of, drone_names
 from crazysim.core.data import SimData, as_key
@@ -35,7 +35,7 @@ from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
 from crazysim.plugins.estimators import Estimator
-from crazysim.plugins.registry import P, PluginRegistry
+from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
 from crazysim.scene import mjx
 from crazysim.scene.build import use_boxes
@@ -44,13 +44,13 @@ from crazysim.scene.contacts import body_id
 from crazysim.scene.depth import Along
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.queries import SceneQueries
-from crazysim.scene.rays import RayKernels
-from crazysim.scene.render import Viewer
+from crazysim.scene.ray_casting import RayKernels
+from crazysim.scene.render import ModelRenderer
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
-from crazysim.sim.adopt import Kind, poses_of, read_vehicles
+from crazysim.sim.adopt import VehicleKind, read_vehicles, vehicle_poses
 from crazysim.sim.built_pipeline import BuiltPipeline
-from crazysim.sim.configuration import Configuration, plugins_of
+from crazysim.sim.configuration import Configuration, initial_plugins
 from crazysim.sim.members import Member, find_member
 
 __all__ = [
@@ -101,7 +101,7 @@ class Sim:
         mesh: Mesh | None = None,
         engine: str = "auto",
         strict: bool = False,
-        controller: str | Controller | Sequence[str | Controller] = DEFAULT,
+        controller: str | Controller | Sequence[str | Controller] = DEFAULT_CONTROLLER,
         switch: Callable[..., Array] | ArrayLike | None = None,
         estimator: str | Estimator | None = None,
         aero: str | None = None,
@@ -157,7 +157,7 @@ class Sim:
             n_worlds, n_drones, drone, dynamics, control, integrator, freq, rates, device, mesh, engine, strict,
             controller, switch,
         )  # fmt: skip
-        parts = plugins_of(plugins, estimator, aero)
+        parts = initial_plugins(plugins, estimator, aero)
         self.n_worlds, self.n_drones, self.freq = c.n_worlds, c.n_drones, c.freq
         self.dynamics, self.control, self.integrator = c.dynamics, c.control, c.integrator
         self.airframes = c.airframes
@@ -189,25 +189,25 @@ class Sim:
         xml_path: str | Path,
         n_worlds: int = 1,
         *,
-        kinds: Mapping[str, Kind] | None = None,
+        kinds: Mapping[str, VehicleKind] | None = None,
         plugins: Sequence[Plugin] = (),
         **settings: Any,
     ) -> Sim:
         """Return a simulation with the vehicles of an MJCF, at their poses; everything else there is the scene.
 
         Vehicles are the children of the world with a joint, or mocap bodies, whose names are a prefix and a number:
-        ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by those of the airframes.
+        ``Crazyflie_0``, ``Bumblebee_2``. They keep their names. Their bodies are replaced by the airframes' bodies.
 
         Args:
             xml_path: MJCF file.
             n_worlds: Number of worlds.
             kinds: Airframes, or subclasses of ``Population``, by further prefixes; ``crazysim.sim.adopt.known_kinds``
-                returns those that are known.
+                returns the known ones.
             plugins: Plugins, which are added when all vehicles are at their poses.
             **settings: Further arguments of ``Sim``.
 
         Raises:
-            UnknownNameError: If a prefix is unknown, with those that are known.
+            UnknownNameError: If a prefix is unknown; the message lists the known ones.
             ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
         """
         plugin_list("plugins", plugins)
@@ -215,11 +215,11 @@ class Sim:
         sim = cls(n_worlds, len(drones), [v.kind for v in drones], xml_path=spec, **settings)  # type: ignore[arg-type]
         sim.drone_names = tuple([v.name for v in drones])
         states = sim.data.states
-        pos, quat = poses_of(drones, states.pos)
+        pos, quat = vehicle_poses(drones, states.pos)
         sim.data = sim.data.replace(states=states.replace(pos=pos, quat=quat))
         for kind, members in populations.items():
             plugin = sim.add(kind([v.name for v in members]))
-            record = plugin.with_poses(plugin.read(sim.data), *poses_of(members, states.pos))
+            record = plugin.with_poses(plugin.read(sim.data), *vehicle_poses(members, states.pos))
             sim.data = plugin.write(sim.data, record)
         sim.build_default_data()
         for plugin in plugins:
@@ -552,7 +552,7 @@ class Sim:
 
     @locked
     def reset(self, mask: ArrayLike | None = None) -> None:
-        """Return all worlds, or those of a mask, to ``default_data``, and run the reset pipeline.
+        """Return all worlds, or the worlds of a mask, to ``default_data``, and run the reset pipeline.
 
         Args:
             mask: True in worlds to reset, of type bool; None for all. (n_worlds,)
@@ -627,7 +627,7 @@ class Sim:
         self._scene.renderer.max_visual_geom = limit
 
     @property
-    def viewer(self) -> Viewer | None:
+    def viewer(self) -> ModelRenderer | None:
         """Renderer of one world; None before the first image."""
         return self._scene.renderer.viewer
 
@@ -649,15 +649,15 @@ class Sim:
         Raises:
             ValueError: If the world does not exist.
         """
-        data = self._placed()
+        data = self._data_with_moved_objects()
         if world is not None:
             self._scene.sync_one(data, world)
         elif not self._stepper.synced:
             self._stepper.data = self._scene.sync(data)
 
-    def _placed(self) -> SimData:
+    def _data_with_moved_objects(self) -> SimData:
         """Return the data with the objects of plugins, such as loads, at their poses."""
-        return self.plugins.with_placed_objects(self.data)
+        return self.plugins.with_moved_objects(self.data)
 
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after a sync if anything has changed.
@@ -693,7 +693,7 @@ class Sim:
         Raises:
             ValueError: If nothing is requested, or an object does not exist.
         """
-        return self._queries.contact_report(self._placed(), objects, floor, drones)
+        return self._queries.contact_report(self._data_with_moved_objects(), objects, floor, drones)
 
     def depth(
         self,
@@ -711,7 +711,7 @@ class Sim:
         Raises:
             ValueError: If the camera does not exist, or the resolution is not positive.
         """
-        return self._queries.depth(self._placed(), camera, width, height, drones, hide_own, along)
+        return self._queries.depth(self._data_with_moved_objects(), camera, width, height, drones, hide_own, along)
 
     def render(
         self,
@@ -740,7 +740,7 @@ class Sim:
             ValueError: If the world, camera, mode or a setting does not exist.
             RenderError: If this machine cannot draw.
         """
-        self._scene.sync_one(self._placed(), world)
+        self._scene.sync_one(self._data_with_moved_objects(), world)
         before = self.overlays.copy()
         try:
             self.plugins.draw(world)

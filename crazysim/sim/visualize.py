@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.settings import as_rgba, check_flag
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.scene.overlays import RED
+from crazysim.scene.overlays import DEFAULT_COLOR
 from crazysim.sim.sim import Sim
 
 
@@ -27,7 +27,7 @@ def draw_line(
     Raises:
         ValueError: If the points have a wrong shape.
     """
-    sim.overlays.line(_points(points), RED if rgba is None else rgba, start_size, end_size)
+    sim.overlays.line(_points(points), DEFAULT_COLOR if rgba is None else rgba, start_size, end_size)
 
 
 def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size: float = 0.01) -> None:
@@ -42,7 +42,7 @@ def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size
     Raises:
         ValueError: If the points have a wrong shape.
     """
-    sim.overlays.points(_points(points), RED if rgba is None else rgba, size)
+    sim.overlays.points(_points(points), DEFAULT_COLOR if rgba is None else rgba, size)
 
 
 def draw_capsule(
@@ -69,7 +69,7 @@ def draw_capsule(
     first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
     if first.shape != (3,) or last.shape != (3,):
         raise ValueError(f"expected ends of shape (3,), got {first.shape} and {last.shape}")
-    sim.overlays.capsule(first, last, radius, RED if rgba is None else rgba, check_flag("cylinder", cylinder))
+    sim.overlays.capsule(first, last, radius, DEFAULT_COLOR if rgba is None else rgba, check_flag("cylinder", cylinder))
 
 
 def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
@@ -120,7 +120,7 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
     if not 0 <= world < sim.n_worlds:
         raise ConfigError(f"expected a world from 0 to {sim.n_worlds - 1}, got {world}")
     setpoints = np.asarray(sim.data.controls.state.staged_cmd[world, :, :3], float)
-    sim.overlays.points(setpoints, RED if rgba is None else rgba, size)
+    sim.overlays.points(setpoints, DEFAULT_COLOR if rgba is None else rgba, size)
 
 
 def change_material(

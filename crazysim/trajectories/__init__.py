@@ -2,6 +2,7 @@
 
 from crazysim.trajectories import formation
 from crazysim.trajectories.approaches import Approach
+from crazysim.trajectories.curves import circle, figure_eight, helix, hover, line, lissajous
 from crazysim.trajectories.files import (
     load_csv,
     pack_compressed,
@@ -9,7 +10,6 @@ from crazysim.trajectories.files import (
     save_samples,
 )
 from crazysim.trajectories.limits import Limits, Report, Violation, check
-from crazysim.trajectories.shapes import circle, figure_eight, helix, hover, line, lissajous
 from crazysim.trajectories.smoothest import smoothest
 from crazysim.trajectories.splines import of_bezier, spline
 from crazysim.trajectories.trajectory import Trajectory

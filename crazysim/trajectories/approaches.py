@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crazysim.trajectories.bezier import to_bernstein
+from crazysim.trajectories.bezier import bernstein_matrix
 from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 
-CELL = 0.4
+CELL_DURATION = 0.4
 """Length of a cell at the first level, s."""
-SPLIT = 4
+N_SPLITS = 4
 """Number of parts into which a cell is split."""
-BATCH = 500_000
+CELLS_PER_BATCH = 500_000
 """Number of cells, of all pairs, that are examined at once, which bounds the memory."""
-TABLE = 4_000_000
+MAX_TABLE_CELLS = 4_000_000
 """Largest number of cells, of all drones, for which the motion of every drone is computed once and looked up."""
-SHORTEST = 1e-6
+MIN_CELL_DURATION = 1e-6
 """Length below which a cell is not split, s: only a jump of a position leads there."""
 
 
@@ -37,9 +37,9 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     """Return the closest approach of every pair, nearest pair first.
 
     In a cell of time, the relative motion deviates from its chord by at most ``dt^2 / 8`` times its largest
-    acceleration, plus ``dt / 4`` times the jumps of the velocity, plus those of the position. The distance to the chord
-    less this bound is a lower bound of the distance; cells whose bound exceeds the smallest distance found, less the
-    tolerance, are dropped, and the others split. The relative acceleration is bounded by acceleration and jerk in
+    acceleration, plus ``dt / 4`` times the jumps of the velocity, plus the jumps of the position. The distance to the
+    chord less this bound is a lower bound of the distance; cells whose bound exceeds the smallest distance found, less
+    the tolerance, are dropped, and the others split. The relative acceleration is bounded by acceleration and jerk in
     the middle and the largest snaps, so that drones in formation need no short cells.
 
     Args:
@@ -51,21 +51,21 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
     if not len(first):
         return []
     best, when = np.full(len(first), np.inf), np.zeros(len(first))
-    n_cells = int(np.ceil(pieces.duration / CELL))
+    n_cells = int(np.ceil(pieces.duration / CELL_DURATION))
     dt, motion = pieces.duration / n_cells, _Motion(pieces)
     pair, cell = np.repeat(np.arange(len(first)), n_cells), np.tile(np.arange(n_cells), len(first))
-    while len(pair) and dt > SHORTEST:
-        worthwhile = n_cells * pieces.n_drones <= min(TABLE, len(pair))
+    while len(pair) and dt > MIN_CELL_DURATION:
+        worthwhile = n_cells * pieces.n_drones <= min(MAX_TABLE_CELLS, len(pair))
         table = motion.table(n_cells, dt) if worthwhile else None
         keep = np.zeros(len(pair), bool)
-        for k in range(0, len(pair), BATCH):
-            part = slice(k, k + BATCH)
+        for k in range(0, len(pair), CELLS_PER_BATCH):
+            part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
             one, other = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
             lower = _lower_bounds(pieces, one, other, (i, j), pair[part], cell[part], dt, best, when)
             keep[part] = lower < best[pair[part]] - tolerance
-        pair, cell = np.repeat(pair[keep], SPLIT), (cell[keep][:, None] * SPLIT + np.arange(SPLIT)).ravel()
-        dt, n_cells = dt / SPLIT, n_cells * SPLIT
+        pair, cell = np.repeat(pair[keep], N_SPLITS), (cell[keep][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel()
+        dt, n_cells = dt / N_SPLITS, n_cells * N_SPLITS
     order = np.argsort(best, kind="stable")
     return [Approach((int(first[k]), int(second[k])), float(best[k]), float(when[k])) for k in order]
 
@@ -76,7 +76,7 @@ class _Motion:
     def __init__(self, pieces: PieceTable) -> None:
         self.pieces = pieces
         snap = pieces.coefficients_of(4)[:, :3]
-        control_points = snap @ to_bernstein(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
+        control_points = snap @ bernstein_matrix(snap.shape[-1] - 1).T  # a polynomial lies in their convex hull
         self.snaps = np.cumsum(np.max(np.linalg.norm(control_points, axis=1), axis=-1))
         jumps = np.zeros((4, len(pieces.drone)))
         piece = np.flatnonzero(pieces.drone[1:] == pieces.drone[:-1])
@@ -93,7 +93,7 @@ class _Motion:
     def in_cells(self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None) -> tuple[Floats, ...]:
         """Return positions at start and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
 
-        The bound is that of the deviation from the chord, less the part of the derivatives in the middle.
+        It bounds the deviation from the chord, less the part of the derivatives in the middle.
         """
         if table is not None:
             return tuple(x[drone, cell] for x in table)

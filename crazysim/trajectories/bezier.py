@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 @lru_cache
-def _to_power(degree: int) -> NDArray:
+def _power_matrix(degree: int) -> NDArray:
     """Return the matrix from control points to coefficients. (degree + 1, degree + 1)"""
     matrix = np.zeros((degree + 1, degree + 1))
     for j in range(degree + 1):
@@ -20,7 +20,7 @@ def _to_power(degree: int) -> NDArray:
 
 
 @lru_cache
-def to_bernstein(degree: int) -> NDArray:
+def bernstein_matrix(degree: int) -> NDArray:
     """Return the matrix from coefficients to control points. (degree + 1, degree + 1)"""
     matrix = np.zeros((degree + 1, degree + 1))
     for i in range(degree + 1):
@@ -29,7 +29,7 @@ def to_bernstein(degree: int) -> NDArray:
     return matrix
 
 
-def power_of(points: NDArray) -> NDArray:
+def power_coefficients(points: NDArray) -> NDArray:
     """Return the coefficients of a Bezier curve of u in [0, 1], constant term first.
 
     Args:
@@ -38,7 +38,7 @@ def power_of(points: NDArray) -> NDArray:
     Returns:
         (k, degree + 1)
     """
-    return (_to_power(len(points) - 1) @ points).T
+    return (_power_matrix(len(points) - 1) @ points).T
 
 
 def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
@@ -54,10 +54,10 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
     n = coefficients.shape[1]
     raised = n - 1 if degree is None else degree
     padded = np.pad(coefficients, ((0, 0), (0, raised + 1 - n)))
-    return to_bernstein(raised) @ padded.T
+    return bernstein_matrix(raised) @ padded.T
 
 
-def restricted(coefficients: NDArray, start: float, end: float) -> NDArray:
+def restrict_interval(coefficients: NDArray, start: float, end: float) -> NDArray:
     """Return polynomials of u in [0, 1] as polynomials on the part from ``start`` to ``end``, scaled to [0, 1].
 
     Args:

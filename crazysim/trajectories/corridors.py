@@ -14,11 +14,11 @@ Vectors = tuple[Floats, Floats, Floats]
 
 N_SAMPLES = 65
 """Number of times at which the deviation of each piece is sampled, and of those around each maximum."""
-MARGIN = 0.01
+RADIUS_MARGIN = 0.01
 """Part of the radius that is kept free, so that the iteration ends; half of it is left at the end."""
-CLOSE = 2e-5
+HEIGHT_TOLERANCE = 2e-5
 """Distance by which a curve may be below the lowest height or above the largest one, m."""
-N_ROUNDS = 100
+MAX_ITERATIONS = 100
 """Largest number of rounds; a few are typical."""
 
 
@@ -49,10 +49,10 @@ def fill_in_corridors(
     unit = float(np.mean(durations))
     powers = unit ** np.arange(nodes.shape[1])[:, None]
     scaled, lengths = nodes * powers, durations / unit
-    filled = interpolation.fill(scaled, lengths)
+    filled = interpolation.fill_derivatives(scaled, lengths)
     program = _Program(scaled, filled, lengths)
-    inner, limit = radii * (1 - MARGIN), radii * (1 - MARGIN / 2)
-    for _ in range(N_ROUNDS):
+    inner, limit = radii * (1 - RADIUS_MARGIN), radii * (1 - RADIUS_MARGIN / 2)
+    for _ in range(MAX_ITERATIONS):
         paths = interpolation.unit_coefficients(filled, lengths)
 
         def deviation(piece: np.ndarray, u: Floats, paths: Floats = paths) -> Vectors:
@@ -63,19 +63,19 @@ def fill_in_corridors(
         leaves = distance > limit[piece]
         piece, normal = piece[leaves], outside[leaves] / distance[leaves, None]
         cuts = [(piece, u[leaves], normal, np.sum(normal * nearest[leaves], axis=-1) + inner[piece])]
-        cuts += [_beyond(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)]
+        cuts += [_height_half_spaces(paths[:, 2], height, sign) for height, sign in zip(heights, (-1, 1), strict=True)]
         piece, u, normal, reach = (np.concatenate(parts) for parts in zip(*cuts, strict=True))
         if not len(piece):
             return filled / powers
         program.add(piece, u, normal, reach)
         filled = program.solve()
     raise OutsideError(
-        f"expected a curve inside its corridors and heights after {N_ROUNDS} rounds, got one whose piece {piece[0]} is "
-        f"not. Make the corridor wider, or add a waypoint."
+        f"expected a curve inside its corridors and heights after {MAX_ITERATIONS} rounds, got one whose piece "
+        f"{piece[0]} is not. Make the corridor wider, or add a waypoint."
     )
 
 
-def _beyond(heights: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
+def _height_half_spaces(heights: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
     """Return the half-spaces that touch a height where curves are farthest beyond it.
 
     Args:
@@ -93,7 +93,7 @@ def _beyond(heights: Floats, limit: float, sign: int) -> tuple[np.ndarray, Float
         )
 
     piece, u = _maxima(excess, np.full(len(heights), -np.inf if np.isfinite(limit) else np.inf))
-    beyond = excess(piece, u) > CLOSE
+    beyond = excess(piece, u) > HEIGHT_TOLERANCE
     n = int(np.sum(beyond))
     return piece[beyond], u[beyond], np.tile([0.0, 0.0, float(sign)], (n, 1)), np.full(n, sign * limit)
 
@@ -167,7 +167,7 @@ class _Program:
         new = np.concatenate(columns, axis=0).T
         size = np.linalg.norm(new, axis=-1)
         if np.any((size < 1e-9) & (slack < 0)):
-            raise _infeasible()
+            raise _infeasible_error()
         size = np.maximum(size, 1e-9)
         self.rows = np.concatenate([self.rows, new / size[:, None]])
         self.slack = np.concatenate([self.slack, slack / size])
@@ -181,7 +181,7 @@ class _Program:
         right = np.append(np.zeros(len(system) - 1), 1.0)
         residual = system @ nnls(system, right, maxiter=30 * system.shape[1])[0] - right
         if -residual[-1] < 1e-12:
-            raise _infeasible()
+            raise _infeasible_error()
         step = -residual[:-1] / residual[-1] * scale
         filled, first = self.filled.copy(), 0
         for axis, factor in enumerate(self.factors):
@@ -192,7 +192,7 @@ class _Program:
         return filled
 
 
-def _infeasible() -> OutsideError:
+def _infeasible_error() -> OutsideError:
     return OutsideError(
         "expected a curve inside its corridors and heights, got fixed derivatives that lead out of them. Leave them "
         "free, or make the corridors wider."

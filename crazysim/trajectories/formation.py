@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import grid_2d
 from crazysim.core.settings import positive_integer
 from crazysim.errors import ConfigError
-from crazysim.trajectories.shapes import as_positive, as_vector
+from crazysim.trajectories.curves import require_positive, require_vector
 
 CENTER = (0.0, 0.0, 1.0)
 """Default centre of a formation, m."""
@@ -28,8 +28,8 @@ def line(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    x = as_positive("spacing", spacing) * (np.arange(positive_integer("n", n)) - (n - 1) / 2)
-    return _placed(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
+    x = require_positive("spacing", spacing) * (np.arange(positive_integer("n", n)) - (n - 1) / 2)
+    return _turn_and_move(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
 
 
 def grid(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 0.0) -> np.ndarray:
@@ -44,7 +44,7 @@ def grid(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    return _placed(grid_2d(positive_integer("n", n), as_positive("spacing", spacing)), center, yaw)
+    return _turn_and_move(grid_2d(positive_integer("n", n), require_positive("spacing", spacing)), center, yaw)
 
 
 def circle(
@@ -70,11 +70,11 @@ def circle(
         raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")
     angle = 2 * math.pi * np.arange(positive_integer("n", n)) / n
     if radius is None:
-        side = as_positive("spacing", 1.0 if spacing is None else spacing)
+        side = require_positive("spacing", 1.0 if spacing is None else spacing)
         radius = side / (2 * math.sin(math.pi / n)) if n > 1 else 0.0
     else:
-        radius = as_positive("radius", radius)
-    return _placed(radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1), center, yaw)
+        radius = require_positive("radius", radius)
+    return _turn_and_move(radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1), center, yaw)
 
 
 def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
@@ -100,8 +100,8 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
     return b[linear_sum_assignment(squares)[1]]
 
 
-def _placed(level: np.ndarray, center: ArrayLike, yaw: ArrayLike) -> np.ndarray:
+def _turn_and_move(level: np.ndarray, center: ArrayLike, yaw: ArrayLike) -> np.ndarray:
     """Return level places, (n, 2), turned around the origin and moved to a centre. (n, 3)"""
-    angle, middle = float(as_vector("yaw", yaw, ())), as_vector("center", center)
+    angle, middle = float(require_vector("yaw", yaw, ())), require_vector("center", center)
     cos, sin = math.cos(angle), math.sin(angle)
     return np.pad(level @ np.array([[cos, sin], [-sin, cos]]), ((0, 0), (0, 1))) + middle

@@ -79,7 +79,7 @@ def cost_matrices(durations: Floats, order: int) -> Floats:
     return unit_cost(order) * durations[:, None, None] ** _exponents(order)
 
 
-def fill(nodes: Floats, durations: Floats) -> Floats:
+def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
     """Return the derivatives at all waypoints that minimise the integral of the squared k-th derivative.
 
     Each axis is solved on its own, since different derivatives may be free in each. Times are scaled by the mean
@@ -123,9 +123,9 @@ def _fill_axis(nodes: Floats, blocks: Floats) -> Floats:
     return values.reshape(nodes.shape)
 
 
-def cost(nodes: Floats, durations: Floats) -> float:
+def derivative_cost(nodes: Floats, durations: Floats) -> float:
     """Return the integral of the squared k-th derivative, summed over the axes."""
-    ends = pairs(nodes)
+    ends = end_derivatives(nodes)
     return float(np.einsum("pia,pij,pja->", ends, cost_matrices(durations, nodes.shape[1]), ends))
 
 
@@ -135,16 +135,16 @@ def cost_gradient(nodes: Floats, durations: Floats) -> Floats:
     At a minimum over the free derivatives it is the partial derivative, with those held (envelope theorem).
 
     Args:
-        nodes: Derivatives at the minimum, as from ``fill``. (n_pieces + 1, k, n_axes)
+        nodes: Derivatives at the minimum, as from ``fill_derivatives``. (n_pieces + 1, k, n_axes)
         durations: Length of each piece, s. (n_pieces,)
     """
     order = nodes.shape[1]
     slopes = cost_matrices(durations, order) * _exponents(order) / durations[:, None, None]
-    ends = pairs(nodes)
+    ends = end_derivatives(nodes)
     return np.einsum("pia,pij,pja->p", ends, slopes, ends)
 
 
-def pairs(nodes: Floats) -> Floats:
+def end_derivatives(nodes: Floats) -> Floats:
     """Return the derivatives at both ends of each piece. (n_pieces, 2k, n_axes)"""
     return np.concatenate([nodes[:-1], nodes[1:]], axis=1)
 
@@ -161,7 +161,7 @@ def unit_coefficients(nodes: Floats, durations: Floats) -> Floats:
     """
     order = nodes.shape[1]
     powers = durations[:, None] ** np.tile(np.arange(order), 2)
-    return np.einsum("cj,pj,pja->pac", hermite_basis(order), powers, pairs(nodes))
+    return np.einsum("cj,pj,pja->pac", hermite_basis(order), powers, end_derivatives(nodes))
 
 
 def pad_degree(coefficients: ArrayLike, degree: int) -> Floats:

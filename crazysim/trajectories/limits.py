@@ -18,7 +18,7 @@ from crazysim.trajectories.peaks import QUANTITIES, Peak, peaks
 from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
-ROUNDING = 1e-4
+LIMIT_TOLERANCE = 1e-4
 """Part of a limit by which a value may exceed it, of 1 m for heights below that: derivatives of polynomials in float32
 are that exact."""
 
@@ -56,7 +56,7 @@ class Limits:
         """Check the limits.
 
         Raises:
-            ConfigError: If a limit other than the floor is not positive, the weight is not within those of the thrust,
+            ConfigError: If a limit other than the floor is not positive, the weight is not within the thrust limits,
                 or the floor is not below the largest height.
         """
         check_settings(self)
@@ -73,7 +73,7 @@ class Limits:
                 f"expected a smallest thrust of less than 1 weight, got {self.min_thrust}. With more, it must climb."
             )
 
-    def given(self) -> dict[str, float]:
+    def as_dict(self) -> dict[str, float]:
         """Return the limits that are not None, by name."""
         fields = dataclasses.fields(self)
         return {field.name: getattr(self, field.name) for field in fields if getattr(self, field.name) is not None}
@@ -162,8 +162,8 @@ class Report:
         return "\n".join([*lines, *map(str, self.violations)])
 
 
-def size_of(name: str, limit: float) -> float:
-    """Return the size of a limit that its tolerances are parts of: that of a height is at least 1 m."""
+def limit_size(name: str, limit: float) -> float:
+    """Return the size of a limit for relative tolerances; for a height it is at least 1 m."""
     return max(abs(limit), 1.0) if QUANTITIES[name].orders == (0,) else abs(limit)
 
 
@@ -179,7 +179,7 @@ def check(
 ) -> Report:
     """Check trajectories against limits, and find the closest approach of every pair.
 
-    Thrust and body rate are those of a drone without drag that flies its trajectory exactly (differential flatness).
+    Thrust and body rate belong to a drone without drag that flies its trajectory exactly (differential flatness).
 
     Args:
         trajectories: One trajectory, or one for each drone: a sequence, or a record with one leading axis. One
@@ -193,7 +193,7 @@ def check(
         tolerance: Largest error of a distance, m.
 
     Raises:
-        ConfigError: If there is no trajectory, or the number of names or starts differs from that of the trajectories,
+        ConfigError: If there is no trajectory, the number of names or starts differs from the number of trajectories,
             or the tolerance is not positive.
     """
     several = trajectories.unstacked() if isinstance(trajectories, Trajectory) else list(trajectories)
@@ -207,20 +207,20 @@ def check(
         )
     if not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
-    allowed = (limits if airframe is None else limits.of_airframe(airframe)).given()
+    allowed = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
     found, closest = peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
     violations = []
     for name, peak in found.items():
         if name not in allowed:
             continue
         limit, sign = allowed[name], QUANTITIES[name].sign
-        for k in np.flatnonzero(sign * (peak.value - limit) > ROUNDING * size_of(name, limit)):
+        for k in np.flatnonzero(sign * (peak.value - limit) > LIMIT_TOLERANCE * limit_size(name, limit)):
             violations.append(
                 Violation(name, (int(k),), float(peak.time[k]), float(peak.value[k]), limit, (labels[k],))
             )
     separation = allowed.get("separation", 0.0)
     for pair in closest:
-        if pair.distance < separation * (1 - ROUNDING):
+        if pair.distance < separation * (1 - LIMIT_TOLERANCE):
             who = tuple(labels[k] for k in pair.drones)
             violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
     return Report(tuple(violations), closest, found, labels, table.duration)

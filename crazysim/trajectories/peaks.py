@@ -18,9 +18,9 @@ REFINED_PART = 0.05
 """Part of the range of the samples by which one may lie below the largest and still be refined."""
 N_SECTIONS = 40
 """Golden sections: they shorten two intervals to 1e-10 of a piece."""
-CHUNKS = (64, 4096)
+BATCH_SIZES = (64, 4096)
 """Numbers of times at which rates are computed at once, few or many, so that two compilations serve all."""
-PIECES = 2048
+PIECES_PER_BATCH = 2048
 """Number of pieces that are sampled at once, which bounds the memory."""
 
 
@@ -50,7 +50,7 @@ def _body_rate(pos: Floats, vel: Floats, acc: Floats, jerk: Floats) -> Floats:
     """Return the size of the angular velocity of a drone that flies these derivatives exactly."""
     columns = (_specific_thrust(acc), jerk[..., :3], pos[..., 3:], vel[..., 3:])
     rows = np.concatenate(columns, axis=-1).reshape(-1, 8)
-    few, many = CHUNKS
+    few, many = BATCH_SIZES
     chunk = few if len(rows) <= few else many
     padded = np.zeros((-(-len(rows) // chunk) * chunk, 8))
     padded[: len(rows)] = rows
@@ -117,7 +117,9 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
         values = [np.swapaxes(c @ powers[: c.shape[-1]], 1, 2) for c in derivatives]
         return quantity.sign * quantity.compute(*values)
 
-    samples = np.concatenate([sampled(slice(k, k + PIECES)) for k in range(0, len(table.drone), PIECES)])
+    samples = np.concatenate(
+        [sampled(slice(k, k + PIECES_PER_BATCH)) for k in range(0, len(table.drone), PIECES_PER_BATCH)]
+    )
     high = np.maximum.reduceat(samples.max(axis=1), table.first)
     low = np.minimum.reduceat(samples.min(axis=1), table.first)
     piece, at = _candidates(samples, (high - REFINED_PART * (high - low))[table.drone])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories.bezier import restricted
+from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import N_DERIVATIVES, Trajectory
 
 Floats = NDArray[np.float64]
@@ -135,29 +135,29 @@ def _pieces(t: Trajectory, start: float, duration: float, size: int) -> tuple[Fl
         start -= period * max(0.0, np.floor(-start / period))  # rounds that have ended before time zero
     n_rounds = max(1, int(np.ceil((duration - start) / period - 1e-9))) if t.repeats else 1
     starts = (start + period * np.arange(n_rounds)[:, None] + starts).ravel()
-    begun = _since_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
+    begun = _cut_at_zero(starts, np.tile(lengths, n_rounds), np.tile(c, (n_rounds, 1, 1)))
     parts = [begun]
     first, last = c[0, :, :1], c[-1].sum(axis=-1, keepdims=True)
     end = max(start + period * n_rounds, 0.0)
     if start > 0:
-        parts.insert(0, _rest(0.0, start, first, size))
+        parts.insert(0, _rest_piece(0.0, start, first, size))
     if end < duration:
-        parts.append(_rest(end, duration - end, last, size))
+        parts.append(_rest_piece(end, duration - end, last, size))
     starts, lengths, c = (np.concatenate(x) for x in zip(*parts, strict=True))
     inside = starts < duration
     return starts[inside], lengths[inside], c[inside]
 
 
-def _since_zero(starts: Floats, lengths: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the pieces that end after time zero, of which the first is cut there."""
+def _cut_at_zero(starts: Floats, lengths: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the pieces that end after time zero; the first one is cut there."""
     later = starts + lengths > 0
     starts, lengths, c = starts[later], lengths[later], c[later]
     if len(starts) and starts[0] < 0:
-        c[0] = restricted(c[0], -starts[0] / lengths[0], 1.0)
+        c[0] = restrict_interval(c[0], -starts[0] / lengths[0], 1.0)
         lengths[0], starts[0] = lengths[0] + starts[0], 0.0
     return starts, lengths, c
 
 
-def _rest(start: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:
+def _rest_piece(start: float, length: float, at: Floats, size: int) -> tuple[Floats, Floats, Floats]:
     """Return a piece that stays at one position and yaw, (4, 1)."""
     return np.array([start]), np.array([length]), np.pad(at, ((0, 0), (0, size - 1)))[None]

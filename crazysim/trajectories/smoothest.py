@@ -13,7 +13,7 @@ from crazysim.trajectories.trajectory import Trajectory
 def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Trajectory, Array]:
     """Return the trajectory through waypoints with the smallest integral of a squared derivative, and this integral.
 
-    It is that of ``minimum_snap`` for order 4 and of ``minimum_jerk`` for order 3, at rest at both ends and free
+    The trajectory equals ``minimum_snap`` for order 4 and ``minimum_jerk`` for order 3, at rest at both ends and free
     elsewhere, without corridors and with zero yaw. It has gradients with respect to waypoints and durations, and works
     in ``jax.jit`` and ``jax.vmap``. Nothing is checked. In float32, up to about ten pieces whose durations vary by less
     than a factor of five are accurate to 1e-3 of the distances; use float64 for more.

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
-from crazysim.trajectories.bezier import power_of
+from crazysim.trajectories.bezier import power_coefficients
 from crazysim.trajectories.trajectory import Trajectory
 
 SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
@@ -54,11 +54,11 @@ def spline(
     if not np.all(np.isfinite(at)) or not np.all(durations > 0):
         raise ConfigError(f"expected finite, ascending times, got {at.tolist()}. Remove points that share their time.")
     nodes = np.full((len(at), SPLINE_ORDERS[degree], 4), np.nan)
-    nodes[:, 0] = np.concatenate([finite(x, "points"), unwrapped(yaw, len(at))[:, None]], axis=1)
+    nodes[:, 0] = np.concatenate([require_finite(x, "points"), unwrap_yaw(yaw, len(at))[:, None]], axis=1)
     if at_rest:
         nodes[[0, -1], 1:] = 0.0
-    filled = interpolation.fill(nodes, durations)
-    return of_unit_pieces(durations, interpolation.unit_coefficients(filled, durations))
+    filled = interpolation.fill_derivatives(nodes, durations)
+    return trajectory_of_unit_pieces(durations, interpolation.unit_coefficients(filled, durations))
 
 
 def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: bool = False) -> Trajectory:
@@ -95,11 +95,14 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
             f"expected finite, positive, ascending ends, got {at.tolist()}. Remove curves without length."
         )
     degree = max(len(curve) for curve in curves) - 1
-    pieces = [interpolation.pad_degree(power_of(finite(curve, "control points")), degree) for curve in curves]
-    return of_unit_pieces(durations, np.stack(pieces), repeats)
+    pieces = [
+        interpolation.pad_degree(power_coefficients(require_finite(curve, "control points")), degree)
+        for curve in curves
+    ]
+    return trajectory_of_unit_pieces(durations, np.stack(pieces), repeats)
 
 
-def of_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
+def trajectory_of_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
     """Return the trajectory of polynomials of each piece's time divided by its length.
 
     Args:
@@ -111,7 +114,7 @@ def of_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool 
     return Trajectory.of_pieces(lengths, c / lengths[:, None, None] ** np.arange(c.shape[-1]), repeats)
 
 
-def unwrapped(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
+def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
     """Return the yaw at each point, rad, without jumps of a revolution. (n_points,)
 
     Args:
@@ -121,7 +124,7 @@ def unwrapped(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
     Raises:
         ConfigError: If the shape does not fit or a number is not finite.
     """
-    angles = finite(np.asarray(yaw, float), "yaw")
+    angles = require_finite(np.asarray(yaw, float), "yaw")
     if angles.shape not in ((), (n_points,)):
         raise ConfigError(
             f"expected one yaw, or one for each of {n_points} points, got shape {angles.shape}. Pass a number, or an "
@@ -130,7 +133,7 @@ def unwrapped(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
     return np.unwrap(np.broadcast_to(angles, (n_points,)))
 
 
-def finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+def require_finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     """Return the values.
 
     Args:

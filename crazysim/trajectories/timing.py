@@ -10,22 +10,22 @@ from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation
 from crazysim.trajectories.corridors import OutsideError
 from crazysim.trajectories.interpolation import Floats
-from crazysim.trajectories.limits import Limits, size_of
+from crazysim.trajectories.limits import Limits, limit_size
 from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
-MARGIN = 1e-4
+LIMIT_MARGIN = 1e-4
 """Part of a limit that is left unused, for the rounding of trajectories in float32. Heights, on which
 waypoints may lie, may be exceeded by half of it instead."""
 PRECISION = 1e-5
 """Relative precision of the factor of time."""
-STEP = 1.25
+DURATION_FACTOR = 1.25
 """Factor by which the durations are changed until the limits are met, then until they are not."""
 N_STEPS = 50
 """Largest number of such steps: a factor of 70,000."""
 
 
-def trapezoids(distances: Floats, limits: Limits) -> Floats:
+def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
     """Return the shortest durations from rest to rest over distances at bounded speed and acceleration. (n_pieces,)
 
     Only the ratios matter, so 1 m/s and one second to speed up serve where there is no limit.
@@ -56,8 +56,8 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
 
     def logarithm_of_cost(ratios: Floats) -> tuple[float, Floats]:
         lengths = of(ratios)
-        filled = interpolation.fill(nodes, lengths)
-        cost = interpolation.cost(filled, lengths)
+        filled = interpolation.fill_derivatives(nodes, lengths)
+        cost = interpolation.derivative_cost(filled, lengths)
         slope = interpolation.cost_gradient(filled, lengths) * lengths
         return float(np.log(cost)), (slope - lengths / total * np.sum(slope)) / cost
 
@@ -67,25 +67,25 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
     return of(found.x)
 
 
-def violated(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
+def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
     """Return the names of the limits that polynomials exceed.
 
     Args:
         durations: Length of each piece, s. (n_pieces,)
         coefficients: Coefficients of x, y, z and yaw, of a piece's time divided by its length.
             (n_pieces, 4, degree + 1)
-        limits: Limits; the separation is that of a table, and not checked.
+        limits: Limits; the separation concerns several trajectories and is not checked.
     """
-    given = {name: limit for name, limit in limits.given().items() if name in QUANTITIES}
+    given = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
     found = peaks(table, tuple(given))
     excess = {name: QUANTITIES[name].sign * (found[name].value[0] - limit) for name, limit in given.items()}
-    margins = {name: -MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * MARGIN for name in given}
-    return [name for name, limit in given.items() if excess[name] > margins[name] * size_of(name, limit)]
+    margins = {name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in given}
+    return [name for name, limit in given.items() if excess[name] > margins[name] * limit_size(name, limit)]
 
 
-def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
+def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
     """Return the durations, in the same ratios, at which a trajectory just meets its limits.
 
     The search starts slow. A smallest thrust can be exceeded at one speed and met again at a higher one, where the
@@ -102,7 +102,7 @@ def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limit
 
     def excess(factor: float) -> list[str]:
         try:
-            return violated(durations * factor, solve(durations * factor), limits)
+            return violated_limits(durations * factor, solve(durations * factor), limits)
         except OutsideError:  # fixed velocities lead out at this speed
             return ["corridors or heights"]
 
@@ -111,17 +111,17 @@ def shortest(solve: Callable[[Floats], Floats], durations: Floats, limits: Limit
         names = excess(high)
         if not names:
             break
-        high *= STEP
+        high *= DURATION_FACTOR
     else:
         raise ConfigError(
             f"expected waypoints that can be flown within the limits, got some that exceed {' and '.join(names)} "
             f"however slow the flight. Raise the limit, or change waypoints or fixed derivatives."
         )
-    low = high / STEP
+    low = high / DURATION_FACTOR
     for _ in range(N_STEPS):
         if excess(low):
             break
-        low, high = low / STEP, low
+        low, high = low / DURATION_FACTOR, low
     else:
         raise ConfigError(
             f"expected limits that bound the speed of the flight, got {limits}. Set a limit of speed or acceleration, "

@@ -19,7 +19,7 @@ from crazysim.errors import ConfigError, short_repr
 from crazysim.pytree import PyTree, float_dtype, leaf
 from crazysim.trajectories.interpolation import unit_coefficients
 
-COUNTED = 16
+MAX_COUNTED_PIECES = 16
 """Largest number of pieces for which the piece at a time is found by counting; above it, by bisection."""
 N_DERIVATIVES = 4
 """Highest derivative of a setpoint: snap."""
@@ -129,12 +129,12 @@ class Trajectory(PyTree):
                 not read; None for the largest. (4,)
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
-        end, repeats = _at(ends, index, ends.shape[1] - 1), _at(jnp.asarray(self.repeats), index)
+        end, repeats = _entry_at(ends, index, ends.shape[1] - 1), _entry_at(jnp.asarray(self.repeats), index)
         local, inside = _local_time(jnp.asarray(t, ends.dtype), end, repeats)
         piece = _piece(ends, index, local)
-        start = jnp.where(piece > 0, _at(ends, index, piece - 1), 0.0)
-        inverse = _inverse(jnp, _at(ends, index, piece) - start)
-        u, of_piece = (local - start) * inverse, _at(coefficients, index, piece)
+        start = jnp.where(piece > 0, _entry_at(ends, index, piece - 1), 0.0)
+        inverse = _inverse(jnp, _entry_at(ends, index, piece) - start)
+        u, of_piece = (local - start) * inverse, _entry_at(coefficients, index, piece)
         degrees = [self.degree] * 4 if degrees is None else degrees
         rows: dict[int, list[Array]] = {}
         for degree in sorted(set(degrees)):
@@ -154,7 +154,7 @@ class Trajectory(PyTree):
         Returns:
             Values, their first derivatives, and so on. (4,) each
         """
-        xp, n = _module(self), self.n_pieces
+        xp, n = _array_module(self), self.n_pieces
         starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
         # One row of a table for each piece: a single lookup, whose parts begin at multiples of four.
         numbers = [starts, _inverse(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
@@ -190,7 +190,7 @@ class Trajectory(PyTree):
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
         n_pieces, degree = max(t.n_pieces for t in trajectories), max(t.degree for t in trajectories)
         padded = [t.padded(n_pieces, degree) for t in trajectories]
-        xp = _module(padded)
+        xp = _array_module(padded)
         return jax.tree.map(lambda *leaves: xp.stack(leaves), *padded)
 
     def unstacked(self) -> list[Trajectory]:
@@ -204,7 +204,7 @@ class Trajectory(PyTree):
 
         Further pieces have no length and stay at the last point.
         """
-        xp = _module(self)
+        xp = _array_module(self)
         more, higher = max(0, n_pieces - self.n_pieces), max(0, degree - self.degree)
         ends = xp.concatenate([self.ends, xp.broadcast_to(self.ends[-1:], (more,))])
         coefficients = xp.pad(self.coefficients, ((0, 0), (0, 0), (0, higher)))
@@ -229,7 +229,7 @@ class Trajectory(PyTree):
             return self.replace(repeats=np.bool_(True))
         if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
             raise ConfigError(f"expected a number of rounds of at least 1, got {n!r}. Use None for no end.")
-        xp = _module(self)
+        xp = _array_module(self)
         rounds = xp.arange(n, dtype=self.ends.dtype)[:, None] * self.ends[-1]
         return Trajectory(
             (rounds + self.ends).reshape(-1),
@@ -272,7 +272,7 @@ class Trajectory(PyTree):
             return self.then(piece).then(other.replace(coefficients=turned))
         degree = max(self.degree, other.degree)
         first, second = self.padded(0, degree), other.padded(0, degree)
-        xp = _module([first, second])
+        xp = _array_module([first, second])
         return first.replace(
             ends=xp.concatenate([first.ends, first.ends[-1] + second.ends]),
             coefficients=xp.concatenate([first.coefficients, second.coefficients]),
@@ -303,7 +303,7 @@ class Trajectory(PyTree):
             finite = is_known and array.dtype.kind in "iuf" and np.all(np.isfinite(array))
             if array.shape != shape or (is_known and not finite):
                 raise ConfigError(f"expected {name} as finite numbers of shape {shape}, got {short_repr(value)}")
-        xp = _module([self, offset, yaw])
+        xp = _array_module([self, offset, yaw])
         c, offset = self.coefficients, xp.asarray(offset, self.coefficients.dtype)
         cos, sin = xp.cos(yaw).astype(c.dtype), xp.sin(yaw).astype(c.dtype)
         x, y = cos * c[..., 0, :] - sin * c[..., 1, :], sin * c[..., 0, :] + cos * c[..., 1, :]
@@ -312,12 +312,12 @@ class Trajectory(PyTree):
         return self.replace(coefficients=xp.concatenate([constant, turned[..., 1:]], axis=-1))
 
 
-def _module(tree: object) -> Any:
+def _array_module(tree: object) -> Any:
     """Return ``jax.numpy`` if there is an array of JAX, else NumPy, which compiles nothing."""
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 
-def _at(x: Array, *index: Array | int) -> Array:
+def _entry_at(x: Array, *index: Array | int) -> Array:
     """Return an entry of an array; an index that is too large or too small means the last or first one."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
@@ -325,7 +325,7 @@ def _at(x: Array, *index: Array | int) -> Array:
 def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
     """Return the time between start and end at which a trajectory is at a time, s, and whether it moves. () each"""
     local = jnp.where(t < 0, 0.0, t)
-    # A remainder by floor, which is a vector instruction where that of lax.rem is a call for each number.
+    # A remainder by floor is a vector instruction; lax.rem is a call for each number.
     local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
     local = jnp.where(local > end, end, jnp.where(local < 0, 0.0, local))
     return local, (t >= 0) & (repeats | (t <= end))
@@ -357,14 +357,14 @@ def _setpoint(derivatives: list[Array]) -> Setpoint:
 
 
 def _piece(ends: Array, index: Array | int, t: Array) -> Array:
-    """Return the number of ends of a trajectory up to a time, at most that of its last piece. ()"""
+    """Return the number of ends of a trajectory up to a time, at most the index of its last piece. ()"""
     n = ends.shape[1]
-    if len(ends) == 1 and n <= COUNTED:
+    if len(ends) == 1 and n <= MAX_COUNTED_PIECES:
         return jnp.sum(ends[0, :-1] <= t, dtype=jnp.int32)
     low = jnp.zeros(jnp.shape(t), jnp.int32)
     for k in reversed(range((n - 1).bit_length())):
         middle = jnp.minimum(low + 2**k, n - 1)
-        low = jnp.where(_at(ends, index, middle - 1) <= t, middle, low)
+        low = jnp.where(_entry_at(ends, index, middle - 1) <= t, middle, low)
     return low
 
 

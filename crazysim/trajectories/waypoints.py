@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from crazysim.errors import ConfigError
 from crazysim.trajectories import interpolation, timing
-from crazysim.trajectories.corridors import CLOSE, fill_in_corridors
+from crazysim.trajectories.corridors import HEIGHT_TOLERANCE, fill_in_corridors
 from crazysim.trajectories.interpolation import Floats
 from crazysim.trajectories.limits import Limits
-from crazysim.trajectories.splines import finite, of_unit_pieces, unwrapped
+from crazysim.trajectories.splines import require_finite, trajectory_of_unit_pieces, unwrap_yaw
 from crazysim.trajectories.trajectory import Trajectory
 
 YAW_ORDER = 2
@@ -41,7 +41,7 @@ def minimum_snap(
         durations: Time from each waypoint to the next, s. None for the shortest in ratios of least snap that meet the
             limits. (n - 1,)
         limits: Limits, needed without durations. The path stays between floor and height; with durations the others are
-            checked. The separation is that of a fleet, which ``check`` compares.
+            checked. The separation concerns a fleet, which ``check`` compares.
         yaw: Yaw at the waypoints, rad: one for all, or one for each, between which the drone turns the shorter way with
             the smallest integral of the squared angular acceleration. () or (n,)
         corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one for all
@@ -99,12 +99,12 @@ def _plan(
     nodes = _nodes(waypoints, fixed)
     n_pieces = len(nodes) - 1
     angles = np.full((n_pieces + 1, YAW_ORDER, 1), np.nan)
-    angles[:, 0, 0], angles[[0, -1], 1:] = unwrapped(yaw, n_pieces + 1), 0.0
+    angles[:, 0, 0], angles[[0, -1], 1:] = unwrap_yaw(yaw, n_pieces + 1), 0.0
     radii, heights = _radii(corridors, n_pieces), _heights(limits, nodes[:, 0, 2])
 
     def solve(lengths: Floats) -> Floats:
         try:
-            filled = interpolation.fill(nodes, lengths)
+            filled = interpolation.fill_derivatives(nodes, lengths)
             if np.any(np.isfinite([*radii, *heights])):
                 filled = fill_in_corridors(nodes, lengths, radii, heights)
         except np.linalg.LinAlgError as error:
@@ -113,19 +113,19 @@ def _plan(
                 f"waypoints, or fix the derivatives at the ends."
             ) from error
         paths = interpolation.unit_coefficients(filled, lengths)
-        turns = interpolation.unit_coefficients(interpolation.fill(angles, lengths), lengths)
+        turns = interpolation.unit_coefficients(interpolation.fill_derivatives(angles, lengths), lengths)
         return np.concatenate([paths, interpolation.pad_degree(turns, paths.shape[-1] - 1)], axis=1)
 
     if durations is not None:
-        lengths = _given(durations, n_pieces)
+        lengths = _piece_durations(durations, n_pieces)
         coefficients = solve(lengths)
-        if limits is not None and (names := timing.violated(lengths, coefficients, limits)):
-            factor = timing.shortest(solve, lengths, limits)[0] / lengths[0]
+        if limits is not None and (names := timing.violated_limits(lengths, coefficients, limits)):
+            factor = timing.shortest_durations(solve, lengths, limits)[0] / lengths[0]
             raise ConfigError(
                 f"expected durations that meet the limits, got a trajectory that exceeds {' and '.join(names)}. "
                 f"Multiply the durations by {factor * 1.001:.4g}, or omit them."
             )
-        return of_unit_pieces(lengths, coefficients)
+        return trajectory_of_unit_pieces(lengths, coefficients)
     if limits is None:
         raise ConfigError("expected durations or limits, got neither. Pass limits=Limits(speed=..., acceleration=...).")
     distances = np.linalg.norm(np.diff(nodes[:, 0], axis=0), axis=-1)
@@ -135,13 +135,13 @@ def _plan(
             f"expected waypoints that differ from their neighbours, got {nodes[k, 0].tolist()} as number {k} and "
             f"{k + 1}. Remove one, or pass durations."
         )
-    guess = timing.best_ratios(nodes, timing.trapezoids(distances, limits))
+    guess = timing.best_ratios(nodes, timing.trapezoid_durations(distances, limits))
     is_scalable = np.all(np.nan_to_num(nodes[:, 1:]) == 0)  # then the path is the same at any speed
     if is_scalable:
         coefficients = solve(guess)
-        return of_unit_pieces(timing.shortest(lambda _: coefficients, guess, limits), coefficients)
-    lengths = timing.shortest(solve, guess, limits)
-    return of_unit_pieces(lengths, solve(lengths))
+        return trajectory_of_unit_pieces(timing.shortest_durations(lambda _: coefficients, guess, limits), coefficients)
+    lengths = timing.shortest_durations(solve, guess, limits)
+    return trajectory_of_unit_pieces(lengths, solve(lengths))
 
 
 def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
@@ -152,7 +152,7 @@ def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
             f"expected waypoints (n, 3), at least two, got shape {at.shape}. Pass an array with a row for each point."
         )
     nodes = np.full((len(at), len(fixed) + 1, 3), np.nan)
-    nodes[:, 0] = finite(at, "waypoints")
+    nodes[:, 0] = require_finite(at, "waypoints")
     for k, (name, values) in enumerate(zip(("velocities", "accelerations", "jerks"), fixed, strict=False), start=1):
         if values is None:
             nodes[[0, -1], k] = 0.0
@@ -180,7 +180,7 @@ def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
     low, high = (None, None) if limits is None else (limits.floor, limits.height)
     bounds = -np.inf if low is None else low, np.inf if high is None else high
     for k, z in enumerate(heights):
-        if not bounds[0] - CLOSE <= z <= bounds[1] + CLOSE:
+        if not bounds[0] - HEIGHT_TOLERANCE <= z <= bounds[1] + HEIGHT_TOLERANCE:
             beyond, name, limit = ("above", "floor", low) if z < bounds[0] else ("below", "height", high)
             raise ConfigError(
                 f"expected waypoints {beyond} the {name} of {limit} m, got number {k} at {z:g} m. Move it, or set "
@@ -189,7 +189,7 @@ def _heights(limits: Limits | None, heights: Floats) -> tuple[float, float]:
     return bounds
 
 
-def _given(durations: ArrayLike, n_pieces: int) -> Floats:
+def _piece_durations(durations: ArrayLike, n_pieces: int) -> Floats:
     """Return the durations of the pieces, s. (n_pieces,)"""
     lengths = np.asarray(durations, float)
     if lengths.shape != (n_pieces,) or not np.all(np.isfinite(lengths)) or not np.all(lengths > 0):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import ContactLog, Placement, Plugin, PyTree, Sim, leaf, rotation, stage
+from crazysim import ContactLog, Plugin, PyTree, Sim, StagePlacement, leaf, rotation, stage
 from crazysim.core import world_keys
 from crazysim.media import Film, View
 
@@ -40,7 +40,7 @@ class Progress(Plugin):
         return ProgressData(jnp.zeros((N_WORLDS, 1), jnp.int32), jnp.zeros((N_WORLDS, 1, 3)))
 
     def stages(self, sim):
-        return [Placement(stage("drone")(self.count), before="increment_steps")]
+        return [StagePlacement(stage("drone")(self.count), before="increment_steps")]
 
     def count(self, data):
         """Count the next gate if its plane was crossed in this step."""

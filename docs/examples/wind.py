@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from crazysim import Placement, Plugin, PyTree, Sim, leaf, stage
+from crazysim import Plugin, PyTree, Sim, StagePlacement, leaf, stage
 from crazysim.core import drone_key
 
 STEADY = np.array([20e-3, 0.0, 0.0])  # N; the drone weighs 426 mN
@@ -32,7 +32,7 @@ class Gusts(Plugin):
         return GustData(jnp.zeros_like(sim.data.states.force))
 
     def stages(self, sim):
-        return [Placement(stage("drone")(self.vary))]
+        return [StagePlacement(stage("drone")(self.vary))]
 
     def vary(self, data):
         """Advance the gust at one drone by a step."""

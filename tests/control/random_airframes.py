@@ -8,7 +8,7 @@ from crazysim import Sim, load_airframe
 from crazysim.commands.airframe_check import MAX_PRECESSION_RATIO
 from crazysim.control import Auto
 from crazysim.control.allocation import allocation_matrix
-from crazysim.control.bandwidth import authority, precession
+from crazysim.control.bandwidth import max_ang_acc, precession_rate
 from crazysim.core.pipeline import remove_fn
 from crazysim.errors import ConfigError
 
@@ -44,7 +44,7 @@ def draw(rng, n, name):
         size = rng.uniform(0.3, 1.0) * mass
         inertia = size * np.array([np.mean(y**2), np.mean(x**2), 0]) * rng.uniform(0.8, 1.25, 3)
         inertia[2] = (inertia[0] + inertia[1]) * rng.uniform(0.65, 0.98)
-        # Propellers: thrust coefficient, and inertia of a rod of 15 g at 0.279 m, as in crazysim.drones.estimate.
+        # Propellers: thrust coefficient, and inertia of a rod of 15 g at 0.279 m, see airframe_estimate.
         diameter = 2 * arm * np.sin(np.pi / n) * rng.uniform(0.6, 1.0)
         curve = rng.uniform(0.09, 0.15) * 1.225 * diameter**4 / 3600
         rod = 0.015 * (diameter / 0.279) ** 2 * diameter**2 / 12
@@ -78,10 +78,10 @@ def draw(rng, n, name):
             )
         except ConfigError:
             continue
-        acc = authority(airframe)
-        if not np.all(acc > LEAST) or 2 * TURN * precession(airframe) > np.min(acc[:2]):
+        acc = max_ang_acc(airframe)
+        if not np.all(acc > LEAST) or 2 * TURN * precession_rate(airframe) > np.min(acc[:2]):
             continue
-        if precession(airframe) < MAX_PRECESSION_RATIO * np.sqrt(Auto().params(airframe).stiffness[0]):
+        if precession_rate(airframe) < MAX_PRECESSION_RATIO * np.sqrt(Auto().params(airframe).stiffness[0]):
             return airframe
 
 

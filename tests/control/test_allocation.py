@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from crazysim import load_airframe
 from crazysim.control import COMMAND_FIELDS, AllocationParams, Control, command_size, force_torque2rotor_vel
 from crazysim.control.levels import allocation_matrix
-from crazysim.dynamics.rotor import curve
+from crazysim.dynamics.rotor import quadratic_curve
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -31,13 +31,13 @@ def test_a_wrench_within_the_limits_is_given_exactly(name, thrusts):
     arms = [airframe.arm, airframe.arm, airframe.value("controller.thrust2torque")]
     torque = arms * (airframe.mixing_matrix @ thrusts)
     rotor_vel = allocate(np.array([np.sum(thrusts), *torque]), params=params)
-    np.testing.assert_allclose(curve(rotor_vel, params.rpm2thrust), thrusts, rtol=1e-9)
+    np.testing.assert_allclose(quadratic_curve(rotor_vel, params.rpm2thrust), thrusts, rtol=1e-9)
 
 
 @given(cmd=arrays(np.float64, 4, elements=st.floats(-1, 1, allow_subnormal=False)))
 def test_law_09_every_rotor_stays_within_its_limits_or_stands(cmd):
     _, params = setup()
-    thrusts = curve(allocate(cmd, params=params), params.rpm2thrust)
+    thrusts = quadratic_curve(allocate(cmd, params=params), params.rpm2thrust)
     if cmd[0] <= 0:
         np.testing.assert_array_equal(thrusts, np.zeros(4))
     else:

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe, rotation
 from crazysim.control.allocation import yaw_arm
-from crazysim.control.auto import DAMPING, STIFFNESS, Auto, AutoParams, error_of_quat
-from crazysim.control.bandwidth import authority, rotor_rate
+from crazysim.control.auto import DAMPING_RATIO, STIFFNESS_RATIO, Auto, AutoParams, quat_error
+from crazysim.control.bandwidth import max_ang_acc, rotor_rate
 from crazysim.core import functional as F
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.models import supported_drones
@@ -193,7 +193,7 @@ def test_the_rotation_error_is_a_shortest_tilt_and_a_turn(body, desired):
         np.testing.assert_allclose(found[2], expected[2], atol=5e-3)
 
 
-jitted_quat = jax.jit(error_of_quat)
+jitted_quat = jax.jit(quat_error)
 
 
 def test_upside_down_the_error_is_a_full_turn_about_x():
@@ -204,11 +204,11 @@ def test_upside_down_the_error_is_a_full_turn_about_x():
 
 def test_the_gains_are_damped_as_documented():
     """Poles of s^3 / a + s^2 + kd s + kp over a, and of s^2 / a + s + kd: the numbers of the module's docstring."""
-    poles = np.roots([1, 1, DAMPING, STIFFNESS])
+    poles = np.roots([1, 1, DAMPING_RATIO, STIFFNESS_RATIO])
     real, pair = poles[np.abs(poles.imag) < 1e-9].real, poles[poles.imag > 0]
     np.testing.assert_allclose(real, -0.31, atol=0.005)
     np.testing.assert_allclose(-pair.real / np.abs(pair), 0.55, atol=0.005)
-    rate = np.roots([1, 1, DAMPING])[0]
+    rate = np.roots([1, 1, DAMPING_RATIO])[0]
     damping = -rate.real / abs(rate)
     np.testing.assert_allclose(damping, 0.645, atol=0.001)
     np.testing.assert_allclose(np.exp(-np.pi * damping / np.sqrt(1 - damping**2)), 0.07, atol=0.002)
@@ -250,11 +250,11 @@ def test_authority_by_hand():
     }
     hover = 9.81 / 4
     least = hover - 0.1
-    np.testing.assert_allclose(authority(load_airframe(quad)), [40 * least, 40 * least, 4 * least], rtol=1e-6)
+    np.testing.assert_allclose(max_ang_acc(load_airframe(quad)), [40 * least, 40 * least, 4 * least], rtol=1e-6)
     quad["rotors"]["thrust_max"] = 3.0
-    np.testing.assert_allclose(authority(load_airframe(quad)), [40 * 1.45, 40 * 1.45, 4 * (3 - hover)], rtol=1e-6)
+    np.testing.assert_allclose(max_ang_acc(load_airframe(quad)), [40 * 1.45, 40 * 1.45, 4 * (3 - hover)], rtol=1e-6)
     # Quick rotors: the rate follows from the authority, so that the rotors can brake each turn.
-    p, (roll, _, yaw) = AutoParams.create(load_airframe(quad), 500, 100), authority(load_airframe(quad))
+    p, (roll, _, yaw) = AutoParams.create(load_airframe(quad), 500, 100), max_ang_acc(load_airframe(quad))
     np.testing.assert_allclose(p.lead, 1.0)
     np.testing.assert_allclose((p.stiffness / p.damping) ** 2 * [2, 2, 1], [roll, roll, yaw], rtol=1e-5)
 

@@ -12,7 +12,7 @@ from cases import with_states
 
 from crazysim import ConfigError, Sim
 from crazysim.control import AllocationParams, CFirmware, Control, Controller, firmware
-from crazysim.dynamics.rotor import curve, rotor_vel_of_thrust
+from crazysim.dynamics.rotor import quadratic_curve, rotor_vel_of_thrust
 from crazysim.engine.backends import native
 from crazysim.pytree import PyTree, leaf
 
@@ -203,7 +203,7 @@ def test_motor_commands_have_the_unit_that_was_named(library, motors):
     thrust = np.clip(given * (most if motors == "throttle" else 1.0), least, most)
     assert commanded[0] == 0
     # The inverse of the curve is a square root in float32.
-    np.testing.assert_allclose(curve(commanded, params.rpm2thrust)[1:], thrust[1:], rtol=1e-4)
+    np.testing.assert_allclose(quadratic_curve(commanded, params.rpm2thrust)[1:], thrust[1:], rtol=1e-4)
 
 
 def test_the_step_is_split_without_a_warning_and_explained(library):
@@ -245,7 +245,7 @@ def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
     memory = np.asarray(controller.memory(None).words)
     x = np.arange(1.0, 40.0, dtype=np.float32) / 8  # time, dt, pos, quat, vel, ang_vel, command
     pos, quat, vel, gyro, command = x[2:5], x[5:9], x[9:12], x[12:15], x[15:31]
-    words, motors = firmware._call(controller._copy, 0, 4, memory[None], x[None])
+    words, motors = firmware._call_library(controller._copy, 0, 4, memory[None], x[None])
     degrees = np.rad2deg(1.0)
     sums = [
         command[0] + 2 * command[4] + 4 * command[8] + 8 * command[12],

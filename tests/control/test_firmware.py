@@ -12,7 +12,7 @@ from crazysim.control.mellinger import Mellinger, rotation_error
 from crazysim.control.pid import PID
 from crazysim.control.power_distribution import PowerDistributionParams, distribute, rotor_vel_of_pwm
 from crazysim.drones import load_airframe
-from crazysim.dynamics.rotor import curve
+from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.errors import ConfigError
 from crazysim.lab.validate import firmware_controllers as flown
 
@@ -75,7 +75,7 @@ def test_thrust_is_proportional_to_pwm_and_idle_is_off(motors):
     rotor_vel = np.asarray(jax.jit(rotor_vel_of_pwm)(pwm, params=motors))
     assert rotor_vel[0] == 0
     np.testing.assert_allclose(
-        np.asarray(curve(rotor_vel, np.asarray(motors.rpm2thrust)))[1:], 0.12 * pwm[1:] / 65535, rtol=1e-3
+        np.asarray(quadratic_curve(rotor_vel, np.asarray(motors.rpm2thrust)))[1:], 0.12 * pwm[1:] / 65535, rtol=1e-3
     )
 
 

@@ -19,7 +19,7 @@ from crazysim.control.flatness import Attitude
 from crazysim.control.geometric import Geometric, GeometricParams, attitude_errors, geometric_control
 from crazysim.control.priority import prioritized_wrench
 from crazysim.plugins.follow import Follow
-from crazysim.trajectories import shapes
+from crazysim.trajectories import curves
 
 ZERO, LEVEL = np.zeros(3), np.array([0.0, 0, 0, 1])
 control = jax.jit(geometric_control, static_argnames="feedforward")
@@ -253,7 +253,7 @@ def test_it_recovers_from_upside_down():
 @pytest.mark.parametrize("freq", [100, 500])
 def test_figure_eight_in_a_simulation(freq):
     """By ``Follow`` and ``Sim(controller=Geometric(...))``: 2 cm RMS in the step itself, which is fused."""
-    eight = shapes.figure_eight(2.0, 1.0, speed=2.0)
+    eight = curves.figure_eight(2.0, 1.0, speed=2.0)
     sim = Sim(control="state", controller=Geometric(freq=freq), strict=True)
     sim.add(Follow(eight))
     start_at(sim, figure_eight)

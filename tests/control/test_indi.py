@@ -12,7 +12,7 @@ from flights import figure_eight, fly, hover, rms, setpoint_of, simulation, star
 
 from crazysim import Sim, load_airframe
 from crazysim.control.geometric import GeometricParams, geometric_control
-from crazysim.control.indi import INDI, INDIMemory, INDIParams, filtered, indi_control, steady
+from crazysim.control.indi import INDI, INDIMemory, INDIParams, apply_filter, indi_control, steady_filter_states
 from crazysim.control.low_pass import butterworth
 
 
@@ -20,7 +20,7 @@ def test_the_filter_is_that_of_scipy():
     b, a = scipy.signal.butter(2, 12.0, fs=500.0)
     np.testing.assert_allclose(butterworth(12.0, 500.0), [b[0], *a[1:]], rtol=1e-12)
     x = np.random.default_rng(0).normal(size=(50, 2))
-    state, out, one = np.zeros(4, np.float32), [], jax.jit(filtered)
+    state, out, one = np.zeros(4, np.float32), [], jax.jit(apply_filter)
     for value in x:
         y, state = one(np.float32(value), state, np.float32(butterworth(12.0, 500.0)))
         out.append(y)
@@ -29,8 +29,8 @@ def test_the_filter_is_that_of_scipy():
 
 def test_a_filter_in_its_steady_state_stays_there():
     x, c = np.float32([3.0, -1.0]), np.float32(butterworth(12.0, 500.0))
-    rest = jax.jit(steady)(x, c)
-    y, state = jax.jit(filtered)(x, rest, c)
+    rest = jax.jit(steady_filter_states)(x, c)
+    y, state = jax.jit(apply_filter)(x, rest, c)
     np.testing.assert_allclose(y, x, rtol=1e-5)
     np.testing.assert_allclose(state, rest, rtol=1e-5)
 

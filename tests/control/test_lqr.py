@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
 from crazysim.control import Setpoint
-from crazysim.control.linear import linearize, load_derivative, rod_angles, rod_direction
+from crazysim.control.linear_models import linearize, load_derivative, rod_angles, rod_direction
 from crazysim.control.load_lqr import LoadLQR, LoadLQRParams, load_gain, load_lqr_control, load_reference
-from crazysim.control.lqr import LQR, LQRParams, as_weights, hover_gain, lqr_control, reference_of, state_error
+from crazysim.control.lqr import LQR, LQRParams, flat_reference, hover_gain, lqr_control, state_error, weight_matrix
 from crazysim.control.tracking_lqr import (
     TrackingLQR,
     error_derivative,
@@ -101,7 +101,7 @@ def test_wrong_weights(case):
 def test_weights_may_be_singular_matrices():
     """That of the sum of two states, whose least eigenvalue is zero but for rounding."""
     direction = np.array([0.1, 0.7, 0.3])
-    np.testing.assert_array_equal(as_weights("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
+    np.testing.assert_array_equal(weight_matrix("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
 
 
 def a_setpoint():
@@ -144,7 +144,7 @@ def test_error_dynamics_are_those_of_the_drone(knots):
     p = jax.tree.map(np.asarray, LQRParams.create(load_airframe("bumblebee"), 500))
     sp = jax.tree.map(lambda x: np.asarray(x, np.float64)[7], knots)
     sp = sp.replace(yaw_rate=np.array([0.7]), yaw_acc=np.array([-0.4]))
-    reference = jax.tree.map(np.asarray, jax.jit(reference_of)(sp, p))
+    reference = jax.tree.map(np.asarray, jax.jit(flat_reference)(sp, p))
     w = reference.ang_vel
     ang_acc = np.linalg.solve(p.J, reference.wrench[1:] - np.cross(w, p.J @ w))
     size, h = 1e-5, 1e-5

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import Sim, load_airframe
 from crazysim.control import Auto
-from crazysim.control.bandwidth import authority
+from crazysim.control.bandwidth import max_ang_acc
 from crazysim.drones import estimate_airframe
 
 STEPS = {
@@ -37,7 +37,7 @@ def test_setpoints_are_reached_from_any_throw(n, seed, count):
     for k, airframe in enumerate(airframes):
         position = Auto().params(airframe).position
         frequency, acc = float(np.sqrt(position.stiffness[0])), float(np.min(position.acc_max))
-        turn = 2 * np.sqrt(np.pi / authority(airframe)[2])
+        turn = 2 * np.sqrt(np.pi / max_ang_acc(airframe)[2])
         promised = distances[:, :, k].max(0) * frequency / acc + 14 / frequency + turn
         assert np.all(times[:, k] < promised), (airframe.name, times[:, k], promised)
         assert heights[:, :, k].max() < 4.0, airframe.name

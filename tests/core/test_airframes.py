@@ -117,7 +117,7 @@ def test_worlds_and_drones_may_be_equally_many(n_worlds):
 def test_hover_of_a_mixed_fleet_carries_the_weight_of_each():
     params = Sim(1, drone=FLEET).data.params
     speed = first_principles.hover_rotor_vel(params)
-    thrust = np.sum(jax.jit(first_principles.curve)(speed, params.rpm2thrust), axis=-1)
+    thrust = np.sum(jax.jit(first_principles.quadratic_curve)(speed, params.rpm2thrust), axis=-1)
     np.testing.assert_allclose(thrust, 9.81 * np.asarray(params.mass)[..., 0], rtol=1e-5)
     np.testing.assert_array_equal(np.asarray(speed)[0, 0, 4:], 0)
 

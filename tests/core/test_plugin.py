@@ -21,11 +21,11 @@ from crazysim import (
     Integrator,
     Latency,
     MotorFailure,
-    Placement,
     Plugin,
     PyTree,
     RangeFinder,
     Sim,
+    StagePlacement,
     Wind,
     WindField,
     leaf,
@@ -329,14 +329,14 @@ class Place(Plugin):
     def record(self, sim):
         return self.filled(sim, PlaceData)
 
-    def begin_episode(self, data):
+    def reset_episode(self, data):
         return self.write(data, PlaceData(data.states.pos + 0.0))
 
 
 class LatePlace(Place):
     """Note where a drone is after the integration of the first step."""
 
-    begins_before: ClassVar[str | None] = "increment_steps"
+    reset_before: ClassVar[str | None] = "increment_steps"
     name: str = "late"
 
 
@@ -367,7 +367,7 @@ def test_all_parts_of_the_package_begin_episodes_by_one_method():
     sim.add(WindField(Grid(np.zeros((2, 2, 2, 3))), spread=(1.0, 1.0, 1.0)))
     begin = {name: stage.fn for name, stage in sim.step_pipeline.items() if stage.when is is_first_step}
     names = ("imu", "motion_capture", "kalman", "eskf", "complementary", "barometer", "wind_field")
-    assert begin == {f"{name}_begin": sim.plugins[name].begin_episode for name in names}
+    assert begin == {f"{name}_begin": sim.plugins[name].reset_episode for name in names}
     assert [*sim.reset_pipeline] == ["reset", "wind_field"], "the others begin at the state that they measure"
 
 
@@ -416,7 +416,7 @@ def test_a_plugin_of_functions():
         return data.replace(states=data.states.replace(force=data.states.force + jnp.array([0, 0, 1.0])))
 
     record = WakeData(np.zeros((2, 1, 3), np.float32), np.ones(1, np.float32))
-    sim.add(FunctionPlugin("count", record, [Placement(count, before="increment_steps")], push))
+    sim.add(FunctionPlugin("count", record, [StagePlacement(count, before="increment_steps")], push))
     sim.step(3)
     np.testing.assert_array_equal(sim.data.plugins["count"].vel, 3.0)
     # less the drag, which takes 0.57 per s
@@ -432,7 +432,7 @@ class Nameless(FunctionPlugin):
     order: ClassVar[int] = 3
 
     def stages(self, sim):
-        return [Placement(lambda data: data, name="clip_floor_pos")]
+        return [StagePlacement(lambda data: data, name="clip_floor_pos")]
 
 
 class Late(Plugin):
@@ -447,9 +447,9 @@ class Late(Plugin):
 
     def stages(self, sim):
         fn = 3 if self.fails == "pipeline" else lambda data: data
-        return [Placement(fn, before="lunch" if self.fails == "stages" else "integration")]
+        return [StagePlacement(fn, before="lunch" if self.fails == "stages" else "integration")]
 
-    def begin_episode(self, data):
+    def reset_episode(self, data):
         return data
 
 
@@ -486,7 +486,7 @@ class Unlisted(Plugin):
     name: str = "unlisted"
 
     def stages(self, sim):
-        return Placement(lambda data: data)
+        return StagePlacement(lambda data: data)
 
 
 class Undeclared(Plugin):
@@ -504,7 +504,7 @@ class Undeclared(Plugin):
     (lambda sim: sim.add(Wake(), name=""), ConfigError, "non-empty string as name of a Wake"),
     (lambda sim: sim.add(Wake(), name="mine"), ConfigError, "already has a record 'mine'"),
     (lambda sim: sim.add(Nameless()), ConfigError, "already has a stage 'clip_floor_pos'"),
-    (lambda sim: sim.add(FunctionPlugin("a", None, [Placement(lambda data: data, before="lunch")])),
+    (lambda sim: sim.add(FunctionPlugin("a", None, [StagePlacement(lambda data: data, before="lunch")])),
      UnknownNameError, "No stage named 'lunch'"),
     (lambda sim: sim.add(Unlisted()), ConfigError, "expected stages of plugin 'unlisted' to return a list"),
     (lambda sim: sim.add(Undeclared()), ConfigError, "expected record of plugin 'undeclared' to return a PyTree or"),

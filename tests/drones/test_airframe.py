@@ -13,15 +13,15 @@ from crazysim.control import AllocationParams, AttitudeParams, StateParams
 from crazysim.drones import Airframe, Drone, airframe_names, load_airframe
 from crazysim.drones.body import body_geoms, outline
 from crazysim.drones.keys import LAYOUT, TABLES
-from crazysim.drones.loading import FOLDER
+from crazysim.drones.loading import AIRFRAME_FOLDER
 from crazysim.dynamics import Dynamics, first_principles, fitted, supported_drones, supported_dynamics
 from crazysim.errors import AirframeWarning
 
-FILES = sorted(FOLDER.glob("*.toml"))
+FILES = sorted(AIRFRAME_FOLDER.glob("*.toml"))
 
 
 def raw(name):
-    return tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
+    return tomllib.loads((AIRFRAME_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def numbers(node, path=""):
@@ -162,7 +162,7 @@ def test_rotors_of_built_in_airframes_are_in_bitcrazes_order_and_turn_as_its_mot
 
 
 def test_names_files_and_dicts_give_the_same_airframe(tmp_path):
-    text = (FOLDER / "cf2x_L250.toml").read_text(encoding="utf-8")
+    text = (AIRFRAME_FOLDER / "cf2x_L250.toml").read_text(encoding="utf-8")
     path = tmp_path / "mine.toml"
     path.write_text(text, encoding="utf-8")
     by_name, by_str, by_path = load_airframe(Drone.cf2x_L250), load_airframe(str(path)), load_airframe(path)
@@ -226,7 +226,7 @@ def test_a_toml_file_anywhere_on_disk_flies(tmp_path):
     """No file of the package is touched, and none but the user's is needed."""
     path = tmp_path / "heavy.toml"
     path.write_text(
-        (FOLDER / "cf21B_500.toml").read_text(encoding="utf-8").replace("0.0434", "0.0500"), encoding="utf-8"
+        (AIRFRAME_FOLDER / "cf21B_500.toml").read_text(encoding="utf-8").replace("0.0434", "0.0500"), encoding="utf-8"
     )
     sim = Sim(drone=path, control="rotor_vel")
     assert sim.drone == "heavy"
@@ -613,7 +613,7 @@ def test_figure_of_merit_at_hover(name):
     torque = float(np.polyval(airframe.value("rotors.torque_curve")[::-1], rotor_vel))
     ideal = thrust**1.5 / np.sqrt(2 * 1.225 * np.pi * radius**2)
     merit = ideal / (torque * rotor_vel * 2 * np.pi / 60)
-    text = (FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+    text = (AIRFRAME_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
     assert f"igure of merit {merit:.2f} at hover" in text or f"a figure of merit of {merit:.2f}," in text
     assert (merit < 0.2) == (name in ("crazyflie", "bumblebee_lab"))
 

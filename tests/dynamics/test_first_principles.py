@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import load_airframe
 from crazysim.dynamics import first_principles
-from crazysim.dynamics.rotor import curve
+from crazysim.dynamics.rotor import quadratic_curve
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -88,7 +88,7 @@ def test_nothing_accelerates_at_hover(name):
 def test_limits_of_rotor_speed_are_those_of_thrust(name):
     airframe = load_airframe(name)
     p = first_principles.Params.create(airframe)
-    ends = curve(jnp.stack([p.rotor_vel_min, p.rotor_vel_max]), p.rpm2thrust)[:, 0]
+    ends = quadratic_curve(jnp.stack([p.rotor_vel_min, p.rotor_vel_max]), p.rpm2thrust)[:, 0]
     expected = [airframe.value("rotors.thrust_min"), airframe.value("rotors.thrust_max")]
     np.testing.assert_allclose(ends, expected, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose(p.J @ p.J_inv, np.eye(3), atol=1e-12)
@@ -134,7 +134,7 @@ def test_every_rotor_can_have_constants_of_its_own():
     for a, b in zip(model(*args, params=params), model(*args, params=same), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
     weak = same.replace(rpm2thrust=same.rpm2thrust.at[2].multiply(0.5))
-    thrust = float(curve(jnp.asarray(15e3), params.rpm2thrust[0]))
+    thrust = float(quadratic_curve(jnp.asarray(15e3), params.rpm2thrust[0]))
     difference = model(*args, params=weak)[1] - model(*args, params=same)[1]
     np.testing.assert_allclose(difference, [0, 0, -0.5 * thrust / 0.0434], atol=1e-12)
     hover = first_principles.hover_rotor_vel

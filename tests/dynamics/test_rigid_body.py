@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from crazysim.dynamics.rigid_body import (
-    EXPLICIT_UP_TO,
-    STABLE_FROM,
+    MAX_EXPLICIT_ANGLE,
+    MIN_STABLE_ANGLE,
     angular_acceleration,
     linear_acceleration,
     stable_angular_acceleration,
@@ -59,10 +59,10 @@ def test_slow_rotation_has_the_exact_derivative(torque, rotor_momentum, ang_vel,
     """Up to 20 rad/s at 500 Hz an Euler step is explicit, to the last bit."""
     ang_vel = rate * ang_vel / max(np.linalg.norm(ang_vel), 1.0) * (1 - 1e-12)
     args = (torque, ang_vel, J, np.linalg.inv(J), rotor_momentum)
-    np.testing.assert_array_equal(accelerate_stably(*args, EXPLICIT_UP_TO / 20), accelerate(*args))
+    np.testing.assert_array_equal(accelerate_stably(*args, MAX_EXPLICIT_ANGLE / 20), accelerate(*args))
 
 
-@pytest.mark.parametrize("rotation_per_step", [STABLE_FROM + 1e-9, 0.12, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("rotation_per_step", [MIN_STABLE_ANGLE + 1e-9, 0.12, 0.3, 0.6, 1.0])
 def test_law_08_a_fast_spin_does_not_feed_its_wobble(rotation_per_step):
     """Law 8: a disc wobbles as fast as it spins, the worst case: |1 + z| of explicit Euler is 1 + x^2 / 2 and more.
 

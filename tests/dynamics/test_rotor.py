@@ -14,7 +14,7 @@ from crazysim.drones import load_airframe
 from crazysim.dynamics import first_principles
 from crazysim.dynamics.rigid_body import angular_acceleration
 from crazysim.dynamics.rotor import (
-    curve,
+    quadratic_curve,
     reaction_torque,
     rotor_acceleration,
     rotor_momentum,
@@ -55,14 +55,18 @@ def test_law_07_rotor_acceleration_has_the_gradient_of_one_side_where_rise_turns
 def test_curve_is_a_polynomial_one_for_all_or_one_per_rotor(rotor_vel):
     each = np.array([[1e-3, -3e-7, 4e-10], [0, 1e-7, 5e-10], [0, 0, 6e-10], [2e-3, 0, 0]])
     expected = [np.polyval(k[::-1], r) for k, r in zip(each, rotor_vel, strict=True)]
-    np.testing.assert_allclose(curve(rotor_vel, each), expected, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(curve(rotor_vel, each[:1]), np.polyval(each[0][::-1], rotor_vel), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(quadratic_curve(rotor_vel, each), expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        quadratic_curve(rotor_vel, each[:1]), np.polyval(each[0][::-1], rotor_vel), rtol=1e-12, atol=1e-15
+    )
 
 
 @given(thrust=arrays(np.float64, 4, elements=st.floats(0, 0.3)))
 def test_rotor_vel_of_thrust_undoes_the_curve(thrust):
     coefficients = np.array([[0.0, -3.1e-7, 4.4e-10]])
-    np.testing.assert_allclose(curve(rotor_vel_of_thrust(thrust, coefficients), coefficients), thrust, atol=1e-15)
+    np.testing.assert_allclose(
+        quadratic_curve(rotor_vel_of_thrust(thrust, coefficients), coefficients), thrust, atol=1e-15
+    )
 
 
 def test_law_07_rotor_vel_of_thrust_is_finite_below_the_least_thrust_of_the_curve():

@@ -7,7 +7,7 @@ import pytest
 from oracle import DRONES, SHAPES, check_finite, check_pair, check_slopes, judge, poses, rotations
 
 from crazysim.geometry import Shape, distance
-from crazysim.geometry.shapes import SIZES
+from crazysim.geometry.shapes import N_SIZES
 
 PAIRS = [(a, b) for a in ("capsule", "box") for b in ("cylinder", "ellipsoid", "mesh")] + [("box", "box")]
 N = 1250
@@ -60,7 +60,7 @@ def test_law_01_one_drone_then_many(x64, rng):
 
 def test_every_kind_has_a_distance():
     """Every drone shape has a distance to every kind of shape that a scene may contain."""
-    shapes = {kind: Shape(kind, (0.3,) * n) for kind, n in SIZES.items() if kind not in ("mesh", "hfield")}
+    shapes = {kind: Shape(kind, (0.3,) * n) for kind, n in N_SIZES.items() if kind not in ("mesh", "hfield")}
     for b in shapes.values():
         for a in DRONES.values():
             out = jax.eval_shape(lambda p, r, a=a, b=b: distance(a, b, p, r), jnp.zeros(3), jnp.zeros((3, 3)))

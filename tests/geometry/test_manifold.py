@@ -8,7 +8,7 @@ import pytest
 from oracle import rotations, unit
 
 from crazysim.geometry import manifold
-from crazysim.geometry.heightfield import FAR
+from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
 
 HALF_A, HALF_B = (0.1, 0.05, 0.08), (0.12, 0.2, 0.06)
 EYE, ZERO = np.eye(3), np.zeros(3)
@@ -35,8 +35,8 @@ def of_pairs(fn, *cores):
     return call
 
 
-boxes = of_pairs(manifold.boxes, *[(3,), (3,), (3, 3)] * 2)
-ball_on_box = of_pairs(manifold.ball_on_box, (), (3,), (3,), (3,), (3, 3))
+boxes = of_pairs(manifold.box_contacts, *[(3,), (3,), (3, 3)] * 2)
+ball_on_box = of_pairs(manifold.ball_box_contacts, (), (3,), (3,), (3,), (3, 3))
 
 
 def all_boxes(pos, rot_a, rot_b):
@@ -86,8 +86,8 @@ def test_rounding_takes_no_face_for_an_edge(rng):
     offset = np.stack([*rng.uniform(-0.01, 0.01, (2, N)), 0.2 + rng.uniform(-1e-7, 1e-7, N)], axis=-1)
     first = (0.1, 0.1, 0.1), np.einsum("nij,nj->ni", world, offset), world @ turned
     found = boxes(*first, (0.1, 0.1, 0.1), ZERO, world)
-    assert (found.gap[:, -1] == FAR).all()
-    assert (found.gap[:, :-1] < FAR).sum(axis=1).min() >= 4
+    assert (found.gap[:, -1] == OUTSIDE_DISTANCE).all()
+    assert (found.gap[:, :-1] < OUTSIDE_DISTANCE).sum(axis=1).min() >= 4
 
 
 def test_points_that_do_not_exist_are_at_the_boxes_too(rng):
@@ -170,10 +170,16 @@ def test_law_07_values_and_gradients_are_finite(rng):
     rot_a, rot_b = (np.concatenate([r, np.tile(EYE, (3, 1, 1))]) for r in (rot_a, rot_b))
 
     def total(p, r, s):
-        found = manifold.boxes(jnp.asarray(HALF_A), p, r, jnp.asarray(HALF_B), jnp.zeros(3), s)
-        return jnp.sum(jnp.where(found.gap < FAR, found.gap, 0.0)) + jnp.sum(found.normal) + jnp.sum(found.point)
+        found = manifold.box_contacts(jnp.asarray(HALF_A), p, r, jnp.asarray(HALF_B), jnp.zeros(3), s)
+        return (
+            jnp.sum(jnp.where(found.gap < OUTSIDE_DISTANCE, found.gap, 0.0))
+            + jnp.sum(found.normal)
+            + jnp.sum(found.point)
+        )
 
     of_boxes = jax.jit(jax.vmap(jax.value_and_grad(total, argnums=(0, 1))))(pos, rot_a, rot_b)
-    of_balls = jax.jit(jax.value_and_grad(lambda p: jnp.sum(manifold.balls(0.1, p, 0.1, jnp.zeros(3)).gap)))(ZERO)
+    of_balls = jax.jit(jax.value_and_grad(lambda p: jnp.sum(manifold.ball_contacts(0.1, p, 0.1, jnp.zeros(3)).gap)))(
+        ZERO
+    )
     for leaf in jax.tree.leaves((of_boxes, of_balls)):
         assert np.isfinite(leaf).all()

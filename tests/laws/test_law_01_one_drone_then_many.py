@@ -14,13 +14,20 @@ from cases import FITTED
 
 import crazysim
 from crazysim import Dynamics, Sim, load_airframe
-from crazysim.control import AllocationParams, AttitudeParams, StateParams, allocation, attitude, state
+from crazysim.control import (
+    AllocationParams,
+    AttitudeParams,
+    StateParams,
+    allocation,
+    attitude_controller,
+    state_controller,
+)
 from crazysim.control.controllers import CONTROLLERS
 from crazysim.dynamics import drag, first_principles, fitted, inflow, rigid_body, rotor
 
 BATCH = (3, 2)
 AIRFRAME = load_airframe("cf21B_500")
-MODULES = (rigid_body, rotor, inflow, drag, first_principles, fitted, allocation, attitude, state)
+MODULES = (rigid_body, rotor, inflow, drag, first_principles, fitted, allocation, attitude_controller, state_controller)
 
 
 def functions_of(module):
@@ -43,7 +50,7 @@ def parameters(module, model):
     """Return the shared parameters that the functions of a module take."""
     if module is fitted:
         return fitted.Params.create(AIRFRAME, Dynamics(model))
-    records = {allocation: AllocationParams, attitude: AttitudeParams, state: StateParams}
+    records = {allocation: AllocationParams, attitude_controller: AttitudeParams, state_controller: StateParams}
     return records.get(module, first_principles.Params).create(AIRFRAME)
 
 
@@ -51,7 +58,7 @@ def command(module, function, rng):
     """Return commands that reach limits and switches too, some of them without thrust."""
     if module in (rotor, first_principles):
         return rng.uniform(-2e3, 3e4, (*BATCH, 4))
-    if module is state:
+    if module is state_controller:
         return rng.normal(size=(*BATCH, 16))
     thrust, others = rng.uniform(-0.2, 0.8, (*BATCH, 1)), rng.uniform(-1, 1, (*BATCH, 3))
     if function is allocation.force_torque2rotor_vel:

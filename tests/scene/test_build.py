@@ -123,7 +123,7 @@ def test_a_swarm_built_in_chunks_is_the_swarm_built_one_by_one(monkeypatch):
     """How bodies come into the spec leaves no trace in the model: every array of it is the same."""
     airframe = load_airframe("cf21B_500")
     whole = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
-    monkeypatch.setattr(build, "CHUNK", 3)
+    monkeypatch.setattr(build, "DRONES_PER_CHUNK", 3)
     parts = compile_spec(build_spec(None, [airframe] * 7, 500, -1))
     arrays = [name for name in dir(whole) if isinstance(getattr(whole, name), np.ndarray)]
     assert len(arrays) > 100

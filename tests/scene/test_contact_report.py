@@ -9,7 +9,7 @@ import pytest
 from crazysim import ConfigError, ContactLog, Sim
 from crazysim.core.stage import stage
 from crazysim.engine import Step
-from crazysim.scene.contact_report import CHUNK
+from crazysim.scene.contact_report import DRONES_PER_CHUNK
 from crazysim.sim.sim import use_box_collision
 
 N_WORLDS, N_DRONES = 40, 3
@@ -157,7 +157,7 @@ def test_the_distance_has_the_slope_of_the_way_to_the_object(flown):
 
 
 def test_large_swarms_are_computed_in_chunks():
-    n = CHUNK + 9
+    n = DRONES_PER_CHUNK + 9
     sim = Sim(n_worlds=2, n_drones=n, control="attitude")
     rng = np.random.default_rng(1)
     pos = np.float32(rng.uniform(0, 3, (2, n, 3)))

@@ -198,7 +198,7 @@ def test_rays_in_a_step_meet_loads_where_they_are_now():
     beside = np.asarray(sim.data.states.pos) + np.float32([1.1, 0, 0])
     aside = load.write(sim.data, load.read(sim.data).replace(pos=beside))
     seen, placed_before = (
-        np.asarray(look(d).distance)[:, 0, 1, 1] for d in (aside, sim.plugins.with_placed_objects(aside))
+        np.asarray(look(d).distance)[:, 0, 1, 1] for d in (aside, sim.plugins.with_moved_objects(aside))
     )
     np.testing.assert_allclose(seen, placed_before)
     assert np.all(seen < 1.1)
@@ -293,7 +293,7 @@ def test_law_09_wrong_cameras_and_resolutions_are_refused(room):
 
 def test_rays_are_those_of_c_mujoco(room, rng):
     """Many rays in all directions, at what moves, stands, and lies around."""
-    from crazysim.scene.rays import cast
+    from crazysim.scene.ray_casting import cast_rays
 
     sim, _, box = room
     data = box.set_pose(sim.data, [-1.0, 0.3, 1.2], [0.3, -0.1, 0.5, 0.7])
@@ -301,7 +301,7 @@ def test_rays_are_those_of_c_mujoco(room, rng):
     origin, direction = rng.uniform([-2, -2, 0.2], [2, 2, 2], (n, 3)), rng.normal(size=(n, 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     rays = (np.tile(np.float32(x), (2, 1, 1)) for x in (origin, direction))
-    hits = jax.jit(lambda data, *rays: cast(sim.scene.visual_model, data, *rays, drones=False))(data, *rays)
+    hits = jax.jit(lambda data, *rays: cast_rays(sim.scene.visual_model, data, *rays, drones=False))(data, *rays)
     distance = np.asarray(hits.distance)[0]
     sim.scene.sync_one(data, 0)
     group = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # drones are in groups 2 and 3
@@ -340,7 +340,7 @@ def crowd():
 def one_by_one(sim, own):
     """Return functions from data and rays to hits: by a kernel, by XLA, and for each world as a stage of it does it."""
     from crazysim.core.stage import Axes
-    from crazysim.scene.rays import RayKernels, cast
+    from crazysim.scene.ray_casting import RayKernels, cast_rays
 
     model = sim.scene.collision_model
     # Every other geom: compiling the gradients of each world takes long.
@@ -348,10 +348,10 @@ def one_by_one(sim, own):
     model = dataclasses.replace(model, objects=some)
 
     def together(data, origin, direction):
-        return cast(model, data, origin, direction, own, kernels=RayKernels("cpu", strict=True))
+        return cast_rays(model, data, origin, direction, own, kernels=RayKernels("cpu", strict=True))
 
     def by_xla(data, origin, direction):
-        return cast(model, data, origin, direction, own)
+        return cast_rays(model, data, origin, direction, own)
 
     def each(data, origin, direction):
         axes = Axes(data)
@@ -359,7 +359,7 @@ def one_by_one(sim, own):
         one = [x[:, 0] if scope == "world" else x for x, scope in zip(jax.tree.leaves(data), axes.scopes, strict=True)]
 
         def of_world(leaves, start, along):
-            return cast(model, axes.treedef.unflatten(leaves), start, along, own)
+            return cast_rays(model, axes.treedef.unflatten(leaves), start, along, own)
 
         mapped = jax.vmap(of_world, ([over.get(scope) for scope in axes.scopes], 0, 0))
         return mapped(one, origin, direction)
@@ -417,12 +417,14 @@ def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
 
 def test_rays_meet_geoms_of_every_kind_where_c_mujoco_has_them(crowd, rng):
     n = 300
-    from crazysim.scene.rays import cast
+    from crazysim.scene.ray_casting import cast_rays
 
     origin, direction = some_rays(rng, n)
     direction[0, :3] = np.nan * np.eye(3)
     rays = [x.astype(np.float32) for x in (origin, direction)]
-    hits = jax.jit(lambda data, *rays: cast(crowd.scene.visual_model, data, *rays, drones=False))(crowd.data, *rays)
+    hits = jax.jit(lambda data, *rays: cast_rays(crowd.scene.visual_model, data, *rays, drones=False))(
+        crowd.data, *rays
+    )
     assert not np.isfinite(hits.distance[0, :3]).any()
     crowd.scene.sync_one(crowd.data, 1)
     geom, group, met = np.zeros(1, np.int32), np.array([1, 1, 0, 0, 0, 0], np.uint8), set()
@@ -457,7 +459,7 @@ def forest():
 @pytest.mark.parametrize("platform", [None, "cpu"])
 def test_each_of_many_equal_geoms_is_known_by_name(forest, rng, platform):
     """The body that C MuJoCo's ray meets: one of 140, so that an index that is off by one shows."""
-    from crazysim.scene.rays import RayKernels, cast
+    from crazysim.scene.ray_casting import RayKernels, cast_rays
 
     n, sim = 500, forest
     origin, direction = rng.uniform([-6, -6, 0.2], [6, 6, 3], (n, 3)), rng.normal(size=(n, 3))
@@ -465,7 +467,7 @@ def test_each_of_many_equal_geoms_is_known_by_name(forest, rng, platform):
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     rays = [np.float32(x)[None] for x in (origin, direction)]
     kernels = RayKernels(platform, strict=True)
-    hits = jax.jit(lambda data, *rays: cast(sim.scene.visual_model, data, *rays, drones=False, kernels=kernels))(
+    hits = jax.jit(lambda data, *rays: cast_rays(sim.scene.visual_model, data, *rays, drones=False, kernels=kernels))(
         sim.data, *rays
     )
     sim.scene.sync_one(sim.data, 0)

@@ -17,7 +17,7 @@ def renderer(monkeypatch):
         monkeypatch.setattr(GL, "glGetString", lambda _: name)
         software.is_software.cache_clear()
 
-    monkeypatch.delenv(software.VARIABLE, raising=False)
+    monkeypatch.delenv(software.QUALITY_VARIABLE, raising=False)
     yield rename
     software.is_software.cache_clear()
 
@@ -40,15 +40,15 @@ def test_the_name_of_the_renderer_tells_a_cpu_from_a_gpu(opengl, renderer, name,
 
 def test_the_variable_decides_first(opengl, renderer, monkeypatch):
     renderer(b"llvmpipe")
-    monkeypatch.setenv(software.VARIABLE, "full")
+    monkeypatch.setenv(software.QUALITY_VARIABLE, "full")
     assert not software.is_fast()
     renderer(b"NVIDIA H200/PCIe/SSE2")
-    monkeypatch.setenv(software.VARIABLE, "fast")
+    monkeypatch.setenv(software.QUALITY_VARIABLE, "fast")
     assert software.is_fast()
 
 
 def test_a_wrong_variable_is_an_error(monkeypatch):
-    monkeypatch.setenv(software.VARIABLE, "quick")
+    monkeypatch.setenv(software.QUALITY_VARIABLE, "quick")
     with pytest.raises(ConfigError, match=r"expected full or fast in CRAZYSIM_RENDERING, got 'quick'"):
         Sim().render("rgb_array", width=32, height=24)
 
@@ -57,8 +57,8 @@ def test_the_settings_hold_while_a_context_is_made(monkeypatch):
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><visual><quality offsamples='8' shadowsize='512'/></visual></mujoco>"
     )
-    monkeypatch.setenv(software.VARIABLE, "fast")
-    with software.quality(model):
+    monkeypatch.setenv(software.QUALITY_VARIABLE, "fast")
+    with software.rendering_quality(model):
         assert (model.vis.quality.offsamples, model.vis.quality.numslices) == (0, 16)
     assert (model.vis.quality.offsamples, model.vis.quality.numslices) == (8, 28)
 
@@ -66,7 +66,7 @@ def test_the_settings_hold_while_a_context_is_made(monkeypatch):
 def test_a_fast_image_shows_the_same_scene_with_jagged_edges(opengl, monkeypatch):
     images = {}
     for chosen in ("full", "fast"):
-        monkeypatch.setenv(software.VARIABLE, chosen)
+        monkeypatch.setenv(software.QUALITY_VARIABLE, chosen)
         sim = Sim()
         sim.scene.add("pole", count=1, pos=[[0.0, 0.5, 0.0]], height=1.0, radius=0.05)
         config = {"lookat": [0, 0, 0.3], "distance": 1.5, "azimuth": 90, "elevation": -20}

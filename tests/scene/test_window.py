@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from crazysim.scene.window import Window
+from crazysim.scene.scene_window import SceneWindow
 
 BUTTONS = {"left": 0, "right": 1, "middle": 2}
 
@@ -14,7 +14,7 @@ BUTTONS = {"left": 0, "right": 1, "middle": 2}
 @pytest.fixture
 def window():
     """A window on a screen of 100 x 100 pixels that is none, with one button pressed at will."""
-    window = object.__new__(Window)
+    window = object.__new__(SceneWindow)
     window._model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     window._camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(window._model, window._camera)

@@ -103,8 +103,8 @@ def test_blocks_and_tables_do_not_change_the_result(table, seed, monkeypatch):
     rng = np.random.default_rng(seed)
     pieces = PieceTable.of([spline(np.arange(4.0), rng.normal(size=(4, 3))) for _ in range(4)])
     expected = closest_approaches(pieces)
-    monkeypatch.setattr(approaches, "TABLE", table)
-    monkeypatch.setattr(approaches, "BATCH", 7)
+    monkeypatch.setattr(approaches, "MAX_TABLE_CELLS", table)
+    monkeypatch.setattr(approaches, "CELLS_PER_BATCH", 7)
     found = closest_approaches(pieces)
     assert [x.drones for x in found] == [x.drones for x in expected]
     np.testing.assert_allclose([x.distance for x in found], [x.distance for x in expected], atol=TOLERANCE)

@@ -31,23 +31,23 @@ def test_each_basis_polynomial_has_one_derivative(order):
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_cost_is_the_integral_of_the_square(order):
     nodes, durations = problem(order, 3, 0)
-    filled = interpolation.fill(nodes, durations)
+    filled = interpolation.fill_derivatives(nodes, durations)
     total = 0.0
     for h, piece in zip(durations, interpolation.unit_coefficients(filled, durations), strict=True):
         for axis in piece:
             derivative = Polynomial(axis / h ** np.arange(2 * order)).deriv(order)
             total += (derivative**2).integ()(h)
-    np.testing.assert_allclose(interpolation.cost(filled, durations), total, rtol=1e-9)
+    np.testing.assert_allclose(interpolation.derivative_cost(filled, durations), total, rtol=1e-9)
 
 
 @pytest.mark.parametrize("order", ORDERS)
 @given(seed=st.integers(0, 1000))
 def test_other_derivatives_cost_more(order, seed):
     nodes, durations = problem(order, 5, seed)
-    filled = interpolation.fill(nodes, durations)
-    least = interpolation.cost(filled, durations)
+    filled = interpolation.fill_derivatives(nodes, durations)
+    least = interpolation.derivative_cost(filled, durations)
     change = np.where(np.isnan(nodes), np.random.default_rng(seed).normal(size=nodes.shape), 0.0)
-    steps = [interpolation.cost(filled + step * change, durations) - least for step in (-1e-3, 1e-3)]
+    steps = [interpolation.derivative_cost(filled + step * change, durations) - least for step in (-1e-3, 1e-3)]
     assert min(steps) > 0
     np.testing.assert_allclose(steps[0], steps[1], rtol=1e-4)  # a minimum has no slope
 
@@ -57,9 +57,9 @@ def test_the_gradient_with_respect_to_durations_is_that_of_differences(order):
     nodes, durations = problem(order, 4, 3, 0.5)
 
     def least(lengths):
-        return interpolation.cost(interpolation.fill(nodes, lengths), lengths)
+        return interpolation.derivative_cost(interpolation.fill_derivatives(nodes, lengths), lengths)
 
-    gradient = interpolation.cost_gradient(interpolation.fill(nodes, durations), durations)
+    gradient = interpolation.cost_gradient(interpolation.fill_derivatives(nodes, durations), durations)
     for k, step in enumerate(1e-6 * np.eye(4)):
         difference = (least(durations + step) - least(durations - step)) / 2e-6
         np.testing.assert_allclose(gradient[k], difference, rtol=1e-6, atol=1e-6 * np.abs(gradient).max())
@@ -69,7 +69,7 @@ def test_the_gradient_with_respect_to_durations_is_that_of_differences(order):
 def test_derivatives_are_continuous_over_many_uneven_pieces(order):
     """Derivative 2k - 2 is the highest continuous one; the durations of 60 pieces vary by a factor of 50."""
     nodes, durations = problem(order, 60, 4, 2.0)
-    c = interpolation.unit_coefficients(interpolation.fill(nodes, durations), durations)
+    c = interpolation.unit_coefficients(interpolation.fill_derivatives(nodes, durations), durations)
     for derivative in range(2 * order - 1):
         weights = np.array([np.prod(np.arange(k - derivative + 1, k + 1)) for k in range(2 * order)], float)
         weights[:derivative] = 0.0
@@ -83,7 +83,9 @@ def test_units_of_time_do_not_matter():
     nodes, durations = problem(4, 6, 5)
     scale = 1e3 ** np.arange(4)[:, None]
     np.testing.assert_allclose(
-        interpolation.fill(nodes * scale, durations / 1e3) / scale, interpolation.fill(nodes, durations), rtol=1e-9
+        interpolation.fill_derivatives(nodes * scale, durations / 1e3) / scale,
+        interpolation.fill_derivatives(nodes, durations),
+        rtol=1e-9,
     )
 
 
@@ -91,4 +93,4 @@ def test_too_little_that_is_fixed_is_an_error():
     nodes, durations = problem(4, 1, 6)
     nodes[:, 1:] = np.nan
     with pytest.raises(np.linalg.LinAlgError):
-        interpolation.fill(nodes, durations)
+        interpolation.fill_derivatives(nodes, durations)

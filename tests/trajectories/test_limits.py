@@ -110,7 +110,7 @@ def test_every_limit_can_be_exceeded():
     wild = [taylor([0, 0, 1, 0], [2, 2, 2, 2], [5, 5, -8, 1], [9, 9, 9, 1]), straight([0, 0, 1], [1, 0, 1], 1.0)]
     tight = Limits(0.1, 0.1, 0.1, 0.1, 0.1, 1.01, 0.99, 0.1, 0.1, 0.7, 0.5, floor=0.6)
     found = {violation.limit for violation in check(wild, tight).violations}
-    assert found == set(tight.given())
+    assert found == set(tight.as_dict())
     loose = Limits(*[1000.0] * 6, 1e-3, 1000.0, 1000.0, 1000.0, 1e-9)
     assert check([wild[0], wild[0].moved([9, 0, 0])], loose).ok
 

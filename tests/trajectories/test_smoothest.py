@@ -19,7 +19,9 @@ def test_it_is_that_of_the_host(order, x64):
     expected = METHODS[order](WAYPOINTS, DURATIONS)
     nodes = np.full((6, order, 3), np.nan)
     nodes[:, 0], nodes[[0, -1], 1:] = WAYPOINTS, 0.0
-    np.testing.assert_allclose(cost, interpolation.cost(interpolation.fill(nodes, DURATIONS), DURATIONS), rtol=1e-9)
+    np.testing.assert_allclose(
+        cost, interpolation.derivative_cost(interpolation.fill_derivatives(nodes, DURATIONS), DURATIONS), rtol=1e-9
+    )
     np.testing.assert_allclose(trajectory.ends, expected.ends)
     np.testing.assert_allclose(trajectory.coefficients, expected.coefficients, atol=1e-9)
 

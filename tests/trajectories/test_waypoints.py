@@ -116,7 +116,7 @@ def test_planned_flights_pass_the_waypoints_at_rest_within_tight_limits(method, 
     trajectory = method(waypoints, limits=limits, yaw=rng.uniform(-3, 3, n))
     report = check(trajectory, limits)
     assert report.ok, str(report)
-    use = [report.peaks[name].value[0] / limit for name, limit in limits.given().items()]
+    use = [report.peaks[name].value[0] / limit for name, limit in limits.as_dict().items()]
     assert max(use) > 0.999
     ends = np.concatenate([[0.0], trajectory.ends])
     table = PieceTable.of([trajectory])
@@ -325,5 +325,5 @@ def test_the_factor_of_the_error_is_the_remedy():
         minimum_snap(BENT, [0.5, 0.5], limits=LIMITS)
     factor = float(str(caught.value).split("durations by ")[1].split(",")[0])
     report = check(minimum_snap(BENT, [0.5 * factor, 0.5 * factor], limits=LIMITS), LIMITS)
-    assert max(report.peaks[name].value[0] / LIMITS.given()[name] for name in ("speed", "acceleration")) > 0.99
+    assert max(report.peaks[name].value[0] / LIMITS.as_dict()[name] for name in ("speed", "acceleration")) > 0.99
     assert "separation" not in QUANTITIES

@@ -11,18 +11,18 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim import rotation
 from crazysim.errors import ConfigError
 
-LEVEL = 0.1
+LEVEL_DURATION = 0.1
 """Duration at the start of a log over which its attitude is taken to be level, s."""
-OUTLIER = 0.3
-"""Distance from the median over ``NEAR`` beyond which a position is an outlier, m."""
-NEAR = 0.1
+OUTLIER_DISTANCE = 0.3
+"""Distance from the median over ``MEDIAN_DURATION`` beyond which a position is an outlier, m."""
+MEDIAN_DURATION = 0.1
 """Duration of that median, s: over longer ones fast turns look like outliers."""
 CUTOFFS = {"translation": 6.0, "rotation": 8.0}
 """Cutoffs of the filters of Crazyflow's identification, Hz."""
 
 
 def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
-    """Return a log with time from zero, outliers interpolated, and attitudes relative to that of the first 0.1 s.
+    """Return a log with time from zero, outliers interpolated, and attitudes relative to the mean of the first 0.1 s.
 
     Args:
         data: ``time``, s, (n,); ``pos``, m, (n, 3); ``quat``, body to world, xyzw, (n, 4); ``cmd_rpy``, rad, (n, 3);
@@ -42,15 +42,15 @@ def preprocessing(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     if not np.all(np.diff(time) > 0):
         raise ConfigError("expected a time that increases, got repeated or earlier samples. Drop them first.")
     dt = np.diff(time)
-    half = max(1, round(NEAR / 2 / float(np.mean(dt))))
+    half = max(1, round(MEDIAN_DURATION / 2 / float(np.mean(dt))))
     middle = np.stack([np.median(pos[max(0, k - half) : k + half + 1], axis=0) for k in range(len(time))])
-    good = ~np.any(np.abs(pos - middle) > OUTLIER, axis=-1)
+    good = ~np.any(np.abs(pos - middle) > OUTLIER_DISTANCE, axis=-1)
     if np.sum(good) < 2:
         raise ConfigError("expected positions along a path, got jumps at nearly every sample. Check their unit.")
     sign = np.cumprod(np.r_[1.0, np.where(np.sum(quat[1:] * quat[:-1], axis=-1) < 0, -1.0, 1.0)])
     quat = sign[:, None] * quat
     pos, quat = (np.stack([np.interp(time, time[good], c[good]) for c in x.T], axis=-1) for x in (pos, quat))
-    first = np.mean(quat[: max(1, round(LEVEL / float(np.mean(dt))))], axis=0)
+    first = np.mean(quat[: max(1, round(LEVEL_DURATION / float(np.mean(dt))))], axis=0)
     inverse = first / np.linalg.norm(first) * [-1, -1, -1, 1]
     quat = np.asarray(rotation.multiply(jnp.asarray(inverse), jnp.asarray(quat)), np.float64)
     quat /= np.linalg.norm(quat, axis=-1, keepdims=True)

@@ -18,13 +18,13 @@ from crazysim.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
-RATES = (0.5, 500.0)
+RATE_RANGE = (0.5, 500.0)
 """Range of the rate of the thrust's lag that is searched, 1/s."""
-BLOCK = 5.0
+BLOCK_DURATION = 5.0
 """Duration of the blocks whose scatter gives the standard deviations, s."""
-EDGE = 0.5
+EDGE_DURATION = 0.5
 """Duration at both ends of a log, s, that is left out: filters of 6 Hz start there, with a velocity that they lack."""
-FITTED = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
+FITTED_MODELS = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
 """Models that are fitted."""
 
 
@@ -109,8 +109,10 @@ def fit_translation(
     Raises:
         ConfigError: If the model is not a fitted one, or the mass is not positive.
     """
-    if dynamics not in list(FITTED):
-        raise ConfigError(f"expected dynamics as one of {', '.join(FITTED)}, got {dynamics!r}. Choose one of them.")
+    if dynamics not in list(FITTED_MODELS):
+        raise ConfigError(
+            f"expected dynamics as one of {', '.join(FITTED_MODELS)}, got {dynamics!r}. Choose one of them."
+        )
     if not 0 < mass < np.inf:
         raise ConfigError(f"expected mass to be positive and finite, in kg, got {mass}. Weigh the drone.")
     from scipy.optimize import minimize_scalar  # a fifth of a second to import
@@ -126,7 +128,7 @@ def fit_translation(
 
     rate = np.inf
     if kind != Dynamics.so_rpy:
-        grid = np.geomspace(*RATES, 31)
+        grid = np.geomspace(*RATE_RANGE, 31)
         k = int(np.argmin([solved(x)[0] for x in grid]))
         near = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
         found = minimize_scalar(lambda x: solved(np.exp(x))[0], bounds=near, method="bounded", options={"xatol": 1e-7})
@@ -178,22 +180,22 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
 def _terms(
     kind: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
 ) -> tuple[NDArray, NDArray]:
-    """Return the acceleration per coefficient, (n, 3, k), and that of all forces but gravity, (n, 3)."""
+    """Return the acceleration per coefficient, (n, 3, k), and by all forces but gravity, (n, 3)."""
     time, vel, acc, quat, cmd = (
         np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
     )
-    thrust = cmd if kind == Dynamics.so_rpy else lagged(cmd, float(time[-1] - time[0]) / (len(time) - 1), rate)
+    thrust = cmd if kind == Dynamics.so_rpy else lag_signal(cmd, float(time[-1] - time[0]) / (len(time) - 1), rate)
     matrix = np.asarray(rotation.matrix(jnp.asarray(quat)), np.float64)
     terms = [matrix[..., 2] * thrust[:, None]]
     if kind == Dynamics.so_rpy_rotor_drag:
         along = matrix[..., 2] * np.sum(matrix[..., 2] * vel, axis=-1, keepdims=True)
         terms += [vel - along, along]
-    inner = (time >= time[0] + EDGE) & (time <= time[-1] - EDGE)
+    inner = (time >= time[0] + EDGE_DURATION) & (time <= time[-1] - EDGE_DURATION)
     inner = inner if np.any(inner) else np.ones(len(time), bool)
     return (np.stack(terms, axis=-1) / mass)[inner], (acc - np.asarray(gravity, np.float64))[inner]
 
 
-def lagged(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
+def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
     """Return a signal, linear between samples, behind a lag of first order that starts at rest.
 
     Args:
@@ -221,7 +223,7 @@ def _angles(log: Mapping[str, ArrayLike], axes: Sequence[int]) -> tuple[float, A
     return float(time[-1] - time[0]) / (len(time) - 1), cmd, rpy, jnp.stack([rpy[0], rates[0]])
 
 
-def _simulated(x: Array, dt: float, cmd: Array, start: Array) -> Array:
+def _simulate(x: Array, dt: float, cmd: Array, start: Array) -> Array:
     """Return the angles of damped springs, exact for commands that are linear between samples. (n, k)"""
     stiffness, damping, gain = x
     zero = jnp.zeros_like(gain)
@@ -243,20 +245,20 @@ def _simulated(x: Array, dt: float, cmd: Array, start: Array) -> Array:
 
 
 @jax.jit
-def _rest(x: Array, dt: float, cmd: Array, rpy: Array, start: Array) -> Array:
-    return rpy - _simulated(x, dt, cmd, start)
+def _residual(x: Array, dt: float, cmd: Array, rpy: Array, start: Array) -> Array:
+    return rpy - _simulate(x, dt, cmd, start)
 
 
-_rotation_slope = jax.jit(lambda x, *log: -jax.jacfwd(_rest)(x, *log))
+_rotation_slope = jax.jit(lambda x, *log: -jax.jacfwd(_residual)(x, *log))
 
 
 def _rotation_error(x: NDArray, *log: Array | float) -> NDArray:
-    return np.asarray(_rest(jnp.asarray(x), *log), np.float64)
+    return np.asarray(_residual(jnp.asarray(x), *log), np.float64)
 
 
 def _blocks(logs: Sequence[Mapping[str, ArrayLike]]) -> NDArray:
     """Return the number of the block of each sample of all logs. (n,)"""
-    parts = [1000 * k + np.asarray(log["time"], np.float64) // BLOCK for k, log in enumerate(logs)]
+    parts = [1000 * k + np.asarray(log["time"], np.float64) // BLOCK_DURATION for k, log in enumerate(logs)]
     return np.concatenate(parts)
 
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
-from crazysim.core.plugin import Placement
+from crazysim.core.plugin import StagePlacement
 from crazysim.core.settings import setting
 from crazysim.envs.random import draw, scale_symmetric, scale_to
 from crazysim.envs.spawn import flying
@@ -60,7 +60,7 @@ class Chase(TouchDown):
         cars = Cars(sim.n_drones, vehicle=VEHICLE, pos=SPACING * grid_2d(sim.n_drones), level="speed", name=CARS)
         sim.add(cars)
         contacts = sim.scene.contact_fn([f"{CARS}:{k}" for k in range(sim.n_drones)], drones=False)
-        touch = Placement(self.touch(contacts, RADIUS, "world"), before="increment_steps")
+        touch = StagePlacement(self.touch(contacts, RADIUS, "world"), before="increment_steps")
         self.add_record(sim, Landing(**initial_outcome(sim.data)), [touch])
 
     def spawn(self, data: SimData, key: Array) -> SimData:

@@ -23,8 +23,8 @@ from crazysim.envs.tasks.goals import install_rules, pick, state_of, with_record
 from crazysim.plugins.payloads import Hook
 from crazysim.plugins.vehicles import Cars
 from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.car_state import to_world_frame
 from crazysim.plugins.vehicles.model import load_vehicle
-from crazysim.plugins.vehicles.state import to_world
 from crazysim.plugins.vehicles.trailer import trailer_axles, trailer_rates
 from crazysim.pytree import device_array, leaf
 from crazysim.sim.sim import Sim
@@ -184,7 +184,7 @@ def rings_of(car: CarData) -> Array:
     centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
     front, _ = trailer_axles(car.state, car.params)
     back = jnp.concatenate([car.yaw * 0 + centre[0], car.yaw * 0], axis=-1)
-    at = front + to_world(car.joints[..., 1:], back)  # type: ignore[index]
+    at = front + to_world_frame(car.joints[..., 1:], back)  # type: ignore[index]
     height = vehicle.number("trailer.wheel_radius") + centre[2] + thickness / 2 + SIZE[2] / 2 + RING
     return jnp.concatenate([at, jnp.full_like(car.yaw, height)], axis=-1)
 

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import FunctionPlugin, Placement
+from crazysim.core.plugin import FunctionPlugin, StagePlacement
 from crazysim.core.stage import Stage, stage
 from crazysim.envs.task import NAME, Task
 from crazysim.pytree import PyTree, device_array, leaf
@@ -156,9 +156,9 @@ def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = Fal
         rules: The stage.
         collisions: True to disable drones that touch each other, before the stage.
     """
-    placements = [Placement(rules, before="increment_steps")]
+    placements = [StagePlacement(rules, before="increment_steps")]
     if collisions and sim.n_drones > 1:
-        placements.insert(0, Placement(collision_stage(sim), before="increment_steps", name=f"{NAME}_collisions"))
+        placements.insert(0, StagePlacement(collision_stage(sim), before="increment_steps", name=f"{NAME}_collisions"))
     sim.add(FunctionPlugin(NAME, record, placements))
 
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, grid_2d
-from crazysim.core.plugin import Placement
+from crazysim.core.plugin import StagePlacement
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs.random import draw
@@ -79,9 +79,9 @@ class Land(TouchDown):
 
         zero = device_array(np.zeros((sim.n_worlds, sim.n_drones, 1)), sim.data.states.pos.dtype)
         record = PadLanding(circle=zero, rate=zero, phase=zero, pads=pads, **initial_outcome(sim.data))
-        placements = [Placement(self.touch(contacts, self.radius), before="increment_steps")]
+        placements = [StagePlacement(self.touch(contacts, self.radius), before="increment_steps")]
         if self.speed > 0:
-            placements.insert(0, Placement(move, before="increment_steps", name=f"{NAME}_pads"))
+            placements.insert(0, StagePlacement(move, before="increment_steps", name=f"{NAME}_pads"))
         self.add_record(sim, record, placements)
 
     def spawn(self, data: SimData, key: Array) -> SimData:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from crazysim.drones import Airframe, load_airframe
 from crazysim.dynamics import first_principles
-from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.checks import check_turning
 from crazysim.lab.identify.logs import Log
@@ -214,7 +214,7 @@ def _forces(logs: Sequence[Log], params: first_principles.Params) -> tuple[NDArr
     mass, gravity = float(params.mass[0]), np.asarray(params.gravity_vec, np.float64)
 
     def terms(log: Log) -> tuple[NDArray, NDArray]:
-        thrust = np.asarray(curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64)
+        thrust = np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64)
         vel, speed = _body(log, log.vel), np.linalg.norm(log.vel, axis=-1, keepdims=True)
         axes = np.eye(3)
         body = [thrust.sum(-1, keepdims=True) * axes[2]]
@@ -236,8 +236,8 @@ def _torques(
 
     def terms(log: Log) -> tuple[NDArray, NDArray]:
         speed = jnp.asarray(log.rotor_vel)
-        thrust = thrust_factor * np.asarray(curve(speed, params.rpm2thrust), np.float64)
-        drag = fast[3] * np.asarray(curve(speed, params.rpm2torque), np.float64)
+        thrust = thrust_factor * np.asarray(quadratic_curve(speed, params.rpm2thrust), np.float64)
+        drag = fast[3] * np.asarray(quadratic_curve(speed, params.rpm2torque), np.float64)
         spin = np.zeros_like(log.ang_vel)
         spin[:, 2] = -(rotor_inertia * log.rotor_vel) @ mixing[2]
         momentum = log.ang_vel @ inertia + spin
@@ -320,7 +320,7 @@ def _regressors(log: Log, params: first_principles.Params) -> tuple[NDArray, NDA
     acc = np.gradient(_smooth(log.vel), log.t, axis=0) - np.asarray(params.gravity_vec)
     ang_acc = np.gradient(_smooth(log.ang_vel), log.t, axis=0)
     body = np.asarray(rotate_inverse(jnp.asarray(log.quat), jnp.asarray(np.stack([acc, _smooth(log.vel)]))))
-    thrust = _smooth(np.asarray(curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
+    thrust = _smooth(np.asarray(quadratic_curve(jnp.asarray(log.rotor_vel), params.rpm2thrust), np.float64))
     return body[0][sl], ang_acc[sl], body[1][sl], thrust[sl]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from crazysim.drones import Airframe
 from crazysim.dynamics.rotor import rotor_acceleration
-from crazysim.dynamics.utils.identification import lagged
+from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import ConfigError
 from crazysim.lab.identify.logs import Log
 from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
@@ -121,7 +121,7 @@ def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
     index, inner = np.arange(len(speed), dtype=float), slice(round(0.5 / dt), None)
     rate = delay = 0.0
     for _ in range(5):
-        responses = lagged(terms[:, None], dt, rates[:, None])
+        responses = lag_signal(terms[:, None], dt, rates[:, None])
         best = np.inf
         for d in delays:
             for k, r in enumerate(rates):

@@ -116,7 +116,7 @@ class Browser(Viewer[Live]):
             log.warning("listening at %s:%d: every machine of that network that has the address with its token can "
                         "watch and command the simulation", access.host, access.port)  # fmt: skip
         sim.scene.compile_if_edited()
-        sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), int(worlds[0]))
+        sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), int(worlds[0]))
         shapes = visual_geoms(sim.mj_model, sim.mj_data)
         bodies = SceneBodies(sim, shapes)
         self._source = PictureSource(sim, bodies, worlds.tolist(), self._contacts, self._wind)

@@ -56,7 +56,7 @@ class SceneBodies:
             shapes: Visible geoms, for the sizes of the bodies.
         """
         names = _mocap_names(sim)
-        parts = {part: base for plugin in sim.plugins.values() for part, base in _parts(plugin.placed_kinds or ())}
+        parts = {part: base for plugin in sim.plugins.values() for part, base in _parts(plugin.moved_kinds or ())}
         counts = Counter(kind for kind, _ in names)
         members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
         items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_drones(sim))]

@@ -27,8 +27,8 @@ from crazysim.lab.live.scene_bodies import SceneBodies
 from crazysim.lab.live.viewer import Viewer
 from crazysim.media.worlds import world_indices
 from crazysim.scene.render import camera_id, require_size
+from crazysim.scene.scene_window import require_screen
 from crazysim.scene.visual_geoms import visual_geoms
-from crazysim.scene.window import require_screen
 
 START = 60.0
 """Longest time until the window must be open, s."""
@@ -102,7 +102,7 @@ class Window(Viewer[Live]):
         if self.plot and self.plot not in (known := [*live.quantities, *quantities(sim)]):
             raise ConfigError(f"expected a quantity to plot, one of {', '.join(known)}, got {self.plot!r}")
         sim.scene.compile_if_edited()
-        sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), worlds[0])
+        sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
         bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
         self._source = PictureSource(sim, bodies, worlds, self.contacts, self.wind)
         path = os.pathsep.join([str(Path(crazysim.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])

@@ -22,7 +22,7 @@ from crazysim.lab.live.window import LENGTH
 from crazysim.media.trail import Trail, colors_of
 from crazysim.scene.overlays import Overlays
 from crazysim.scene.render import camera_id
-from crazysim.scene.window import Window
+from crazysim.scene.scene_window import SceneWindow
 
 IDLE_TIME = 0.005
 """Time between two looks for a new picture, s."""
@@ -112,7 +112,7 @@ class Program:
             mujoco.mjv_defaultFreeCamera(model, self._camera)
             for key, value in (settings["cam_config"] or {}).items():
                 setattr(self._camera, key, value if np.ndim(value) == 0 else np.asarray(value, float))
-        self.window = Window(model, 100_000 + model.ngeom, settings["width"], settings["height"])
+        self.window = SceneWindow(model, 100_000 + model.ngeom, settings["width"], settings["height"])
         self.window.on_key = lambda key, down: self._say("press" if down else "release", key)
         self._chart = Chart(settings["plot"])
         self.window.on_drawn = self._chart.draw

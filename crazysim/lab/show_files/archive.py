@@ -71,7 +71,7 @@ class Archive:
         for _ in range(MAX_CHAIN):
             if not isinstance(value, dict) or "$ref" not in value:
                 return value, place
-            reference = checks.text(value["$ref"], f"{place}, $ref", 1000)
+            reference = checks.require_text(value["$ref"], f"{place}, $ref", 1000)
             name, _, fragment = reference.partition("#")
             if fragment.strip("/"):
                 checks.refuse("a reference to a whole file, such as ./cues.json#", short_repr(reference), place)

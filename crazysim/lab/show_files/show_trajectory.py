@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, short_repr
-from crazysim.trajectories.bezier import control_points, power_of, significant_degree
+from crazysim.trajectories.bezier import control_points, power_coefficients, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split
-from crazysim.trajectories.splines import of_unit_pieces
+from crazysim.trajectories.files.pieces import require_no_jumps, split_pieces, trajectory_pieces
+from crazysim.trajectories.splines import trajectory_of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 ENCODINGS = ("COMPRESSED", "POLY4D")
@@ -36,17 +36,17 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
     Raises:
         ConfigError: If it is invalid, with the place.
     """
-    value = checks.record(value, place)
-    checks.version_one(value, place)
+    value = checks.require_object(value, place)
+    checks.require_version_one(value, place)
     encoding = value.get("type", ENCODINGS[0])
     if encoding not in ENCODINGS:
         checks.refuse(f"type {' or '.join(ENCODINGS)}", short_repr(encoding), place)
-    points = checks.sequence(value.get("points"), checks.MAX_POINTS, f"{place}, points")
+    points = checks.require_array(value.get("points"), checks.MAX_POINTS, f"{place}, points")
     if not points:
         checks.refuse("at least one point", "none", place)
     for key in ("takeoffTime", "landingTime"):
         if value.get(key) is not None:
-            checks.number(value[key], f"{place}, {key}", 0.0, checks.MAX_TIME)
+            checks.require_number(value[key], f"{place}, {key}", 0.0, checks.MAX_TIME)
     takeoff = float(value.get("takeoffTime") or 0.0)
 
     times, curves, last = [], [], None
@@ -55,16 +55,16 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
         at = f"{place}, point {i}"
         if not _is_point(point):
             checks.refuse("[time, [x, y, z], [control points]]", short_repr(point), at)
-        times.append(checks.number(point[0], at, 0.0, checks.MAX_TIME))
-        end = checks.numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, at)
-        inner = checks.sequence(point[2], MAX_DEGREE - 1, f"{at}, control points") if len(point) > 2 else []
+        times.append(checks.require_number(point[0], at, 0.0, checks.MAX_TIME))
+        end = checks.require_numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, at)
+        inner = checks.require_array(point[2], MAX_DEGREE - 1, f"{at}, control points") if len(point) > 2 else []
         if last is None and inner:
             checks.refuse("no control points of the first point", f"{len(inner)}", at)
         if last is not None:
-            via = [checks.numbers(x, [n_axes], checks.MAX_COORDINATE, at) for x in inner]
+            via = [checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, at) for x in inner]
             curves.append(np.stack([last, *via, end]))
         last = end
-    checks.ascending(np.array(times), checks.MIN_LENGTH, place)
+    checks.require_ascending(np.array(times), checks.MIN_LENGTH, place)
     start = takeoff + times[0]
     if times[-1] + takeoff > checks.MAX_TIME:
         checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1] + takeoff:g} s", place)
@@ -84,26 +84,26 @@ def _of_curves(ends: NDArray, curves: list, yaw_control: object, place: str) -> 
     degree = max(len(curve) for curve in curves) - 1
     c = np.zeros((len(curves), 4, max(degree, 1) + 1))
     for k, curve in enumerate(curves):
-        c[k, : curve.shape[1], : len(curve)] = power_of(curve)
+        c[k, : curve.shape[1], : len(curve)] = power_coefficients(curve)
     c[:, 3] = np.deg2rad(c[:, 3])
     if yaw_control is not None:
         ends, c = _with_yaw(ends, c, yaw_control, f"{place}, yawControl")
-    return of_unit_pieces(np.diff(ends, prepend=0.0), c)
+    return trajectory_of_unit_pieces(np.diff(ends, prepend=0.0), c)
 
 
 def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, place: str) -> tuple[NDArray, NDArray]:
     """Return the pieces with the yaw of setpoints that are connected linearly, in the time of the show."""
-    value = checks.record(yaw_control, place)
-    checks.version_one(value, place)
-    setpoints = checks.sequence(value.get("setpoints"), checks.MAX_POINTS, place)
+    value = checks.require_object(yaw_control, place)
+    checks.require_version_one(value, place)
+    setpoints = checks.require_array(value.get("setpoints"), checks.MAX_POINTS, place)
     if not setpoints:
         return ends, c
     pairs = np.array(
-        [checks.numbers(x, [2], checks.MAX_COORDINATE, f"{place}, entry {i}") for i, x in enumerate(setpoints)]
+        [checks.require_numbers(x, [2], checks.MAX_COORDINATE, f"{place}, entry {i}") for i, x in enumerate(setpoints)]
     )
     times, yaw = pairs[:, 0], np.deg2rad(pairs[:, 1])
-    checks.ascending(times, checks.MIN_LENGTH, place)
-    ends, c = split(ends, c, times)
+    checks.require_ascending(times, checks.MIN_LENGTH, place)
+    ends, c = split_pieces(ends, c, times)
     starts = np.concatenate([[0.0], ends[:-1]])
     c[:, 3] = 0.0
     c[:, 3, 0] = np.interp(starts, times, yaw)
@@ -127,7 +127,7 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
     """
     if encoding not in ENCODINGS:
         raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
-    ends, c = pieces_of(trajectory)
+    ends, c = trajectory_pieces(trajectory)
     degrees = (1, 3, 7) if encoding == "COMPRESSED" else range(1, MAX_DEGREE + 1)
     c = c if yaw else c[:, :3]
     require_no_jumps(ends, c)

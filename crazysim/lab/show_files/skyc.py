@@ -44,7 +44,7 @@ def load_show(path: str | Path) -> Show:
     Raises:
         ConfigError: If the file is no valid show, with the place of the error.
     """
-    return parse_show(read_bytes(path, checks.MAX_FILE), str(path))
+    return parse_show(read_bytes(path, checks.MAX_FILE_BYTES), str(path))
 
 
 def parse_show(content: bytes, place: str = "a show") -> Show:
@@ -59,12 +59,14 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
     """
     archive = Archive(content, place)
     at = f"{place}: show.json"
-    show = checks.record(archive.json("show.json"), at)
-    checks.version_one(show, at)
+    show = checks.require_object(archive.json("show.json"), at)
+    checks.require_version_one(show, at)
     settings, _ = archive.resolve(show.get("settings", {}), at)
-    settings = checks.record(settings, f"{at}, settings")
+    settings = checks.require_object(settings, f"{at}, settings")
     swarm, swarm_at = archive.resolve(show.get("swarm"), f"{at}, swarm")
-    drones = checks.sequence(checks.record(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones")
+    drones = checks.require_array(
+        checks.require_object(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones"
+    )
     if not drones:
         checks.refuse("at least one drone", "none", swarm_at)
     found = []
@@ -81,7 +83,7 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
     if len(set(names)) < len(names):
         checks.refuse("different names of the drones", f"{short_repr(sorted(names))}", swarm_at)
     environment = show.get("environment") or {}
-    kind = checks.record(environment, f"{at}, environment").get("type", "outdoor")
+    kind = checks.require_object(environment, f"{at}, environment").get("type", "outdoor")
     if kind not in ("indoor", "outdoor"):
         checks.refuse("environment indoor or outdoor", short_repr(kind), at)
     return Show(
@@ -95,7 +97,7 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
         parameters=tuple(drone["parameters"] for drone in found),
         encodings=tuple(drone["encoding"] for drone in found),
         environment=kind,
-        meta=checks.record(show.get("meta") or {}, f"{at}, meta"),
+        meta=checks.require_object(show.get("meta") or {}, f"{at}, meta"),
     )
 
 
@@ -107,8 +109,8 @@ def _bound(n_pieces: int, place: str) -> None:
 def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str, Any]:
     """Return what the show says about one drone; its lights are not yet decoded."""
     value, place = archive.resolve(value, place)
-    settings, place = archive.resolve(checks.record(value, place).get("settings"), f"{place}, settings")
-    settings = checks.record(settings, place)
+    settings, place = archive.resolve(checks.require_object(value, place).get("settings"), f"{place}, settings")
+    settings = checks.require_object(settings, place)
     data, at = archive.resolve(settings.get("trajectory"), f"{place}, trajectory")
     yaw_control, _ = archive.resolve(settings.get("yawControl"), f"{place}, yawControl")
     if isinstance(yaw_control, dict) and yaw_control.get("autoYaw"):
@@ -117,11 +119,11 @@ def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str,
     c = np.asarray(trajectory.coefficients, float)
     start, end = c[0, :, 0], c[-1].sum(-1)
     if settings.get("startYaw") is not None:
-        checks.number(settings["startYaw"], f"{place}, startYaw", -checks.MAX_COORDINATE, checks.MAX_COORDINATE)
+        checks.require_number(settings["startYaw"], f"{place}, startYaw", -checks.MAX_COORDINATE, checks.MAX_COORDINATE)
     name = settings.get("name")
     return {
         "at": place,
-        "name": f"drone_{index}" if name is None else checks.text(name, f"{place}, name"),
+        "name": f"drone_{index}" if name is None else checks.require_text(name, f"{place}, name"),
         "trajectory": trajectory,
         "encoding": encoding,
         "home": _position(settings.get("home"), start[:3], f"{place}, home"),
@@ -132,17 +134,17 @@ def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str,
 
 
 def _position(value: object, default: NDArray, place: str) -> NDArray:
-    return default if value is None else checks.numbers(value, [3], checks.MAX_COORDINATE, place)
+    return default if value is None else checks.require_numbers(value, [3], checks.MAX_COORDINATE, place)
 
 
 def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
     changes = []
-    for i, entry in enumerate(checks.sequence(value, checks.MAX_POINTS, place) if value is not None else []):
+    for i, entry in enumerate(checks.require_array(value, checks.MAX_POINTS, place) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
             checks.refuse("[time, name, value]", short_repr(entry), f"{place}, entry {i}")
         at = f"{place}, entry {i}"
-        time = checks.number(entry[0], at, 0.0, checks.MAX_TIME)
-        changes.append(ParameterChange(time, checks.text(entry[1], at), checks.number(entry[2], at)))
+        time = checks.require_number(entry[0], at, 0.0, checks.MAX_TIME)
+        changes.append(ParameterChange(time, checks.require_text(entry[1], at), checks.require_number(entry[2], at)))
     return tuple(changes)
 
 
@@ -150,14 +152,14 @@ def _cues(archive: Archive, value: object, place: str) -> tuple[Cue, ...]:
     if value is None:
         return ()
     value, place = archive.resolve(value, place)
-    value = checks.record(value, place)
-    checks.version_one(value, place)
+    value = checks.require_object(value, place)
+    checks.require_version_one(value, place)
     cues = []
-    for i, item in enumerate(checks.sequence(value.get("items", []), checks.MAX_POINTS, place)):
+    for i, item in enumerate(checks.require_array(value.get("items", []), checks.MAX_POINTS, place)):
         at = f"{place}, item {i}"
-        item = checks.record(item, at)
-        time = checks.number(item.get("time"), at, 0.0, checks.MAX_TIME)
-        cues.append(Cue(time, checks.text(item.get("name", ""), at)))
+        item = checks.require_object(item, at)
+        time = checks.require_number(item.get("time"), at, 0.0, checks.MAX_TIME)
+        cues.append(Cue(time, checks.require_text(item.get("name", ""), at)))
     return tuple(sorted(cues, key=lambda cue: cue.time))
 
 
@@ -168,10 +170,10 @@ def _lights(
     if drone["lights"] is None:
         return Lights.constant()
     value, place = archive.resolve(drone["lights"], f"{drone['at']}, lights")
-    value = checks.record(value, place)
-    checks.version_one(value, place)
+    value = checks.require_object(value, place)
+    checks.require_version_one(value, place)
     if value.get("data") is not None:
-        data = checks.text(value["data"], f"{place}, data", 2**22)
+        data = checks.require_text(value["data"], f"{place}, data", 2**22)
         if data not in decoded:
             decoded[data] = decode_lights(data, until, place, min(max_looped, MAX_REPEATED))
         return decoded[data]
@@ -193,7 +195,7 @@ def parse_colors(value: object, place: str) -> Lights:
     Raises:
         ConfigError: If an entry is invalid.
     """
-    entries = checks.sequence(value, MAX_REPEATED, place)
+    entries = checks.require_array(value, MAX_REPEATED, place)
     times, colors, now = [], [], 0.0
     for i, entry in enumerate(entries):
         at = f"{place}, entry {i}"
@@ -203,16 +205,16 @@ def parse_colors(value: object, place: str) -> Lights:
         if isinstance(first, str):
             channels: Any = [_integer(x, at) for x in first.split(",")[:4]]
             times.append(now)
-            now += checks.number(second, at, 0.0, checks.MAX_TIME)
+            now += checks.require_number(second, at, 0.0, checks.MAX_TIME)
         else:
             channels = second
-            times.append(checks.number(first, at, 0.0, checks.MAX_TIME))
-        colors.append(checks.numbers(channels, [3], 255.0, at) / 255)
+            times.append(checks.require_number(first, at, 0.0, checks.MAX_TIME))
+        colors.append(checks.require_numbers(channels, [3], 255.0, at) / 255)
         if colors[-1].min() < 0:
             checks.refuse("colours from 0 to 255", short_repr(channels), at)
     if not entries:
         return Lights.constant((0.0, 0.0, 0.0))
-    checks.ascending(np.array(times), 0.0, place)
+    checks.require_ascending(np.array(times), 0.0, place)
     if times[0] > 0:
         times, colors = [0.0, *times], [np.zeros(3), *colors]
     return Lights.of_pieces(times, colors)

@@ -21,7 +21,7 @@ from crazysim.control.mellinger import Mellinger
 from crazysim.control.pid import PID
 from crazysim.core.airframes import AirframeSource
 from crazysim.drones import load_airframe
-from crazysim.dynamics.rotor import curve
+from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.lab.validate.rows import Row
 
 RATE, POSITION_PERIOD = 500, 5
@@ -165,7 +165,7 @@ def _flight_pwm(controller: Any, mode: str, numbers: tuple, states: Any, command
             after = controller.outer(data, command, memory, params)
             memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_PERIOD == 0, new, old), after, memory)
         rotor_vel, memory = controller.update(data, command, memory, params)
-        thrust = jnp.where(rotor_vel > 0, curve(rotor_vel, thrust_curve), 0.0)
+        thrust = jnp.where(rotor_vel > 0, quadratic_curve(rotor_vel, thrust_curve), 0.0)
         return memory, 4 * thrust / newton
 
     def fly(states: Array, commands: Array) -> Array:

@@ -31,28 +31,28 @@ PROCESS_VARIANCE = np.square(np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4,
 def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: Any, rot: Array, stations: Any) -> Any:
     """Return the estimate after the measurements of a loop, as tests/plugins/estimators/record_filter.py takes them."""
     if kind in ("position", "ground"):
-        return error_state.select(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
+        return error_state.select_estimate(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
     if kind == "pose":
         after = updates.update_quat(updates.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
-        return error_state.select(k % 10 == 0, after, estimate)
+        return error_state.select_estimate(k % 10 == 0, after, estimate)
     if kind in ("flow", "range"):
         after = updates.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
-        estimate = error_state.select(k % 10 == 0, after, estimate)
+        estimate = error_state.select_estimate(k % 10 == 0, after, estimate)
         sees = (k % 25 == 10) & (kind == "range")
-        return error_state.select(sees, updates.update_range(estimate, rot, m[2], 0.02), estimate)
+        return error_state.select_estimate(sees, updates.update_range(estimate, rot, m[2], 0.02), estimate)
     if kind == "sweep":
-        estimate = error_state.select(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
+        estimate = error_state.select_estimate(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
         station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
         for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
             after = updates.update_sweep(estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, m[0], 0.001)
-            estimate = error_state.select(k % 8 == first, after, estimate)
+            estimate = error_state.select_estimate(k % 8 == first, after, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
     if kind == "distance":
         after = updates.update_distance(estimate, anchors[a], m[0], 0.25)
     else:
         after = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
-    return error_state.select(k % 5 == 0, after, estimate)
+    return error_state.select_estimate(k % 5 == 0, after, estimate)
 
 
 def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
@@ -75,13 +75,15 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
         accel, gyro = inert[:3], inert[3:]
         predicted = error_state.predict(estimate, accel, gyro, 0.01, level if kind == "ground" else None)
         estimate = error_state.add_noise(
-            error_state.select(k % 10 == 0, predicted, estimate), jnp.asarray(PROCESS_VARIANCE)
+            error_state.select_estimate(k % 10 == 0, predicted, estimate), jnp.asarray(PROCESS_VARIANCE)
         )
         estimate = error_state.finalize(update_with_measurements(kind, k, m, gyro, estimate, rot, stations))
         state = estimate.pos, estimate.vel, estimate.att_error, jnp.roll(estimate.quat, 1), estimate.cov
         return (estimate, rotation.matrix(estimate.quat)), jnp.concatenate(state)
 
-    start = error_state.start(jnp.array([0.05, -0.05, 1.25]), jnp.zeros(3), level, (100, 100, 1, *[0.01] * 6))
+    start = error_state.initial_estimate(
+        jnp.array([0.05, -0.05, 1.25]), jnp.zeros(3), level, (100, 100, 1, *[0.01] * 6)
+    )
     loops = jnp.arange(1, len(inputs) + 1), inertial, inputs
     run = jax.jit(lambda start, x: jax.lax.scan(loop, (start, jnp.eye(3)), x)[1])
     return np.asarray(run(start, loops))[99::100], recorded
@@ -102,12 +104,12 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
     def tick(carry: Any, x: Any) -> tuple[Any, Array]:
         (quat, integral, climb, height, rate, over), (k, row) = carry, x
         gyro, accel = jnp.radians(row[:3]), GRAVITY_MAGNITUDE * row[3:6]
-        turned = law.mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
+        turned = law.update_mahony(quat, integral, gyro, accel, 0.004, 0.4, 0.001)
         turned = *turned, law.inertial_climb(climb, turned[0], accel, 0.004)
         quat, integral, climb = (jnp.where(k % 4 == 0, *pair) for pair in zip(turned, carry[:3], strict=True))
         shift = 0.01 * climb
         by_pressure = law.filtered_height(height, row[6:7], shift)
-        useful = row[8:] <= 1000 * law.OLDEST
+        useful = row[8:] <= 1000 * law.MAX_RANGE_AGE
         risen, above = law.height_over_surface(height, by_pressure, row[7:8], useful, over, shift)
         rises = k % 10 == 0
         rate, over = jnp.where(rises, (risen - height) / 0.01, rate), jnp.where(rises, above, over)

@@ -19,7 +19,7 @@ from crazysim.lab.validate.closed_loop import MAX_DISTANCE, columns_of, commande
 from crazysim.lab.validate.flights import find_logs
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.estimators import error_state, updates
-from crazysim.plugins.estimators.kalman import DEVIATIONS
+from crazysim.plugins.estimators.kalman import MEASUREMENT_STD
 
 PERIOD, LOOPS = 0.01, 10
 """Time between samples of a log, s, and the firmware's loops in it, each of which adds process noise."""
@@ -88,11 +88,11 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
     def tick(estimate: error_state.Estimate, x: Any) -> tuple[Any, Any]:
         force, rate, where, attitude = x
         estimate = error_state.add_noise(error_state.predict(estimate, force, rate, PERIOD), noise)
-        estimate = updates.update_pos(estimate, where, DEVIATIONS["pos"])
-        estimate = error_state.finalize(updates.update_quat(estimate, attitude, DEVIATIONS["quat"]))
+        estimate = updates.update_pos(estimate, where, MEASUREMENT_STD["pos"])
+        estimate = error_state.finalize(updates.update_quat(estimate, attitude, MEASUREMENT_STD["quat"]))
         return estimate, (estimate.pos, estimate.quat)
 
-    start = error_state.start(pos[0], jnp.zeros(3), quat[0], (100, 100, 1, *[0.01] * 6))
+    start = error_state.initial_estimate(pos[0], jnp.zeros(3), quat[0], (100, 100, 1, *[0.01] * 6))
     return jax.lax.scan(tick, start, (accel, gyro, pos, quat))[1]
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
 from crazysim.core.integration import Integrator, limit_ang_vel
-from crazysim.core.plugin import Placement, Simulation, parameter
+from crazysim.core.plugin import Simulation, StagePlacement, parameter
 from crazysim.core.population import Population, Rates
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, as_rgba, check_softness, color, setting
 from crazysim.core.stage import Stage
@@ -21,20 +21,20 @@ from crazysim.dynamics.models import GRAVITY
 from crazysim.dynamics.rigid_body import free_rotation
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape
-from crazysim.plugins.contacts.rigid_bodies import Touching, require_few_contacts
+from crazysim.plugins.contacts.rigid_bodies import BodyContacts, require_few_contacts
 from crazysim.plugins.effects.ground import TerrainData
-from crazysim.plugins.payloads.body import shape_of
+from crazysim.plugins.payloads.colliders import load_shape
 from crazysim.pytree import Members, host_array, leaf
 from crazysim.scene.contact_report import ObjectSelection
 from crazysim.tables import MASS
 
 MAX_BODIES = 1000
 """Most bodies in a world."""
-GAP = 0.5
+START_SPACING = 0.5
 """Distance of neighbours that start in a row, m."""
 
 
-SURFACE = ("mass", "friction", "restitution")
+SURFACE_SETTINGS = ("mass", "friction", "restitution")
 """Settings with a number for each body."""
 
 
@@ -121,7 +121,7 @@ class FreeBodies(Population):
         listed = isinstance(size, list) or np.ndim(size) == 2
         if listed and len(size) != n:
             raise ConfigError(f"expected one size for all {n} bodies or a list of {n}, got a list of {len(size)}")
-        return tuple(shape_of(tuple(s) if np.ndim(s) else s) for s in (size if listed else [size] * n))
+        return tuple(load_shape(tuple(s) if np.ndim(s) else s) for s in (size if listed else [size] * n))
 
     @property
     def pushes_drones(self) -> bool:
@@ -129,12 +129,10 @@ class FreeBodies(Population):
         return self.drones
 
     @property
-    def placed_kinds(self) -> tuple[str, ...]:
-        """Name of the bodies in the scene."""
+    def moved_kinds(self) -> tuple[str, ...]:
         return (self.name,)
 
     def record(self, sim: Simulation) -> FreeBodiesData:
-        """Return the bodies where they start, and put them into the scene."""
         shapes = self.shapes
         others = [p.name for p in sim.scene.plugins() if isinstance(p, FreeBodies) and p.name != self.name]
         if others:
@@ -143,14 +141,14 @@ class FreeBodies(Population):
                 f"FreeBodies(n, size=[...]) with a size for each body."
             )
         check_softness(sim.data.core.freq, self.softness)
-        pos = row(shapes) if self.pos is None else self.pos
-        numbers = {name: np.asarray(getattr(self, name), np.float64)[..., None] for name in SURFACE}
+        pos = row_positions(shapes) if self.pos is None else self.pos
+        numbers = {name: np.asarray(getattr(self, name), np.float64)[..., None] for name in SURFACE_SETTINGS}
         quat = np.asarray(self.quat, np.float64)
         if quat.shape[-1:] != (4,) or not np.all(np.linalg.norm(quat, axis=-1) > 0):
             raise ConfigError(f"expected quat as quaternions xyzw, not zero, got {self.quat!r}")
         self.check(sim)
         terrains = [name for name, x in sim.data.plugins.items() if isinstance(x, TerrainData)]
-        n_contacts = require_few_contacts(Touching(sim, self).n_contacts(terrains), f"{len(shapes)} bodies")
+        n_contacts = require_few_contacts(BodyContacts(sim, self).n_contacts(terrains), f"{len(shapes)} bodies")
         zero = np.zeros(3)
         record = self.create(
             sim,
@@ -170,15 +168,13 @@ class FreeBodies(Population):
         self._add_to_scene(sim, shapes)
         return record.replace(inertia=record.mass * np.stack([inertia_per_mass(shape) for shape in shapes]))
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages of the integration and of the contacts."""
-        touching = Touching(sim, self)
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        touching = BodyContacts(sim, self)
         name, why = f"{self.name}_contacts", "it solves the contacts of all worlds at once"
         contact = Stage(lambda data: touching.respond(data), "batch", name=name, why=why)
-        return [*super().stages(sim), Placement(contact, before="increment_steps", name=name)]
+        return [*super().stages(sim), StagePlacement(contact, before="increment_steps", name=name)]
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        """Return the rates of one body under gravity and the external wrench (Newton and Euler)."""
         body = self.read(data)
         torque = rotation.rotate_inverse(body.quat, body.torque)
         spin = body.inertia * body.ang_vel
@@ -190,7 +186,7 @@ class FreeBodies(Population):
         }
 
     def scheme(self, integrator: Integrator) -> Callable[..., FreeBodiesData]:
-        """Return the scheme of the simulation; with those of Euler bodies turn by ``free_rotation``."""
+        """Return the scheme of the simulation, in which bodies turn by ``free_rotation`` if it is an Euler scheme."""
         scheme = super().scheme(integrator)
 
         def moved(body: FreeBodiesData, rates: Rates, dt: float) -> FreeBodiesData:
@@ -206,11 +202,10 @@ class FreeBodies(Population):
         return moved
 
     def finish(self, record: FreeBodiesData) -> FreeBodiesData:
-        """Return the record of one body with its quaternion at unit length."""
         identity = jnp.asarray([0.0, 0.0, 0.0, 1.0], record.quat.dtype)
         return record.replace(quat=rotation.safe_normalize(record.quat, identity))
 
-    def place(self, data: SimData) -> Objects:
+    def move_objects(self, data: SimData) -> Objects:
         """Return the scene's objects with the bodies at their poses; of one world."""
         record = self.read(data)
         return data.objects.with_poses({self.name: (record.pos, record.quat)})  # type: ignore[union-attr]
@@ -219,13 +214,13 @@ class FreeBodies(Population):
         """Add the bodies to the scene, if they are not there yet."""
         rgba = (0.25, 0.5, 0.75, 1.0) if self.rgba is None else self.rgba
         colors = np.broadcast_to(as_rgba(rgba, len(shapes)), (len(shapes), 4))
-        geoms = [bodies_geom(shape, rgba) for shape, rgba in zip(shapes, colors, strict=True)]
+        geoms = [body_geom_xml(shape, rgba) for shape, rgba in zip(shapes, colors, strict=True)]
         sim.scene.add_once(geoms, self.name, len(shapes))
 
 
-def row(shapes: Sequence[Shape]) -> np.ndarray:
+def row_positions(shapes: Sequence[Shape]) -> np.ndarray:
     """Return positions in a row along x from 1 m on, on the floor, m. (n, 3)"""
-    return np.array([[1.0 + GAP * k, 0.0, shape.size[-1]] for k, shape in enumerate(shapes)])
+    return np.array([[1.0 + START_SPACING * k, 0.0, shape.size[-1]] for k, shape in enumerate(shapes)])
 
 
 def inertia_per_mass(shape: Shape) -> np.ndarray:
@@ -236,7 +231,7 @@ def inertia_per_mass(shape: Shape) -> np.ndarray:
     return np.array([y + z, z + x, x + y]) / 3
 
 
-def bodies_geom(shape: Shape, rgba: Iterable[float]) -> str:
+def body_geom_xml(shape: Shape, rgba: Iterable[float]) -> str:
     """Return MJCF of the geom of a body, which drones touch."""
     size, color = (" ".join(f"{float(x):.9g}" for x in values) for values in (shape.size, rgba))
     geom = f'<geom type="{shape.kind}" size="{size}" contype="0" conaffinity="2" rgba="{color}"/>'

@@ -9,12 +9,12 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.stage import Stage, StageScope
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf, static
-from crazysim.scene.contact_report import ContactReport, ObjectSelection, choose
-from crazysim.scene.placement import placed_by
+from crazysim.scene.contact_report import ContactReport, ObjectSelection, select_bodies
+from crazysim.scene.object_poses import moving_plugins
 
 
 class ContactLogData(PyTree):
@@ -27,7 +27,7 @@ class ContactLogData(PyTree):
     drones: Array = leaf("drone", 0)
     """True where it has touched another drone. (n_worlds, n_drones)"""
     first: Array = leaf("drone", 0)
-    """Step at the end of which it first touched anything; -1 before. (n_worlds, n_drones)"""
+    """Step in which it first touched anything; -1 before. (n_worlds, n_drones)"""
     object_names: tuple[str, ...] = static()
     """Names of the objects' bodies."""
 
@@ -52,7 +52,6 @@ class ContactLog(Plugin):
     name: str = "contacts"
 
     def record(self, sim: Simulation) -> ContactLogData:
-        """Return an empty log."""
         names = self._names(sim)
         if not (names or self.floor or self.drones):
             raise ConfigError("expected something to check for contacts, got nothing. Use floor, drones or objects.")
@@ -65,32 +64,32 @@ class ContactLog(Plugin):
             object_names=names,
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return a stage of one drone, and one of one world for loads and other objects that plugins place.
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        """Return a stage of one drone, and one of one world for loads and other objects that plugins move.
 
         Two, because a stage of one world computes everything for all its drones.
         """
         names, found = self._names(sim), []
-        placed = placed_by(sim.scene.plugins(), names)
-        others = [name for name in names if name not in placed]
+        moved = moving_plugins(sim.scene.plugins(), names)
+        others = [name for name in names if name not in moved]
         if others or self.floor or self.drones:
             alone = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
-            found.append(Placement(alone, before="increment_steps"))
-        if placed:
-            together = self._stage(sim.scene.contact_fn(list(placed), floor=False, drones=False), "world")
-            found.append(Placement(together, before="increment_steps", name=f"{self.name}_of_placed"))
+            found.append(StagePlacement(alone, before="increment_steps"))
+        if moved:
+            together = self._stage(sim.scene.contact_fn(list(moved), floor=False, drones=False), "world")
+            found.append(StagePlacement(together, before="increment_steps", name=f"{self.name}_of_moved"))
         return found
 
     def _names(self, sim: Simulation) -> tuple[str, ...]:
-        return tuple(body.name for body in choose(sim.scene.collision_model, self.objects))
+        return tuple(body.name for body in select_bodies(sim.scene.collision_model, self.objects))
 
     def _stage(self, contacts: Callable[[SimData], ContactReport], scope: StageScope) -> Stage:
         def check(data: SimData) -> SimData:
             log, report = self.read(data), contacts(data)
             new = log.replace(
-                floor=_or(log.floor, report.floor),
+                floor=_logical_or(log.floor, report.floor),
                 objects=_with_objects(log, report),
-                drones=_or(log.drones, report.drones),
+                drones=_logical_or(log.drones, report.drones),
                 first=jnp.where((log.first < 0) & report.any, data.core.steps + 1, log.first),
             )
             return self.write(data, new)
@@ -99,12 +98,12 @@ class ContactLog(Plugin):
 
 
 def _with_objects(log: ContactLogData, report: ContactReport) -> Array:
-    """Return the log's objects with those of a report, which may be some of them. (..., n_objects)"""
+    """Return the log's objects, updated by a report of all or some of them. (..., n_objects)"""
     if report.objects is None or report.object_names == log.object_names:
-        return _or(log.objects, report.objects)
+        return _logical_or(log.objects, report.objects)
     columns = np.array([log.object_names.index(name) for name in report.object_names])
     return log.objects | jnp.zeros_like(log.objects).at[..., columns].set(report.objects)
 
 
-def _or(before: Array, now: Array | None) -> Array:
+def _logical_or(before: Array, now: Array | None) -> Array:
     return before if now is None else before | now

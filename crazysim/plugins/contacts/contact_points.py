@@ -1,4 +1,4 @@
-"""Contact points: the places of a drone's collision box that touch floor and objects, or may touch them next.
+"""Contact points: the points of a drone's collision box that touch floor and objects, or may touch them next.
 
 They are the corners of the box, and the points of its upper and lower plate that are nearest to each object.
 """
@@ -22,13 +22,13 @@ from crazysim.core.population import populations
 from crazysim.geometry import Shape, distance, point_distance
 from crazysim.geometry.heightfield import field_gap
 from crazysim.plugins.effects.ground import TerrainData
-from crazysim.plugins.payloads.body import LoadBody
+from crazysim.plugins.payloads.colliders import LoadBody
 from crazysim.scene.collision import CollisionGeom
-from crazysim.scene.contact_report import ObjectSelection, choose
+from crazysim.scene.contact_report import ObjectSelection, select_bodies
 
-FLAT = ("plane", "box", "cylinder")
+FLAT_KINDS = ("plane", "box", "cylinder")
 """Kinds with faces, on which a drone stands by its corners."""
-THIN = 0.05
+PLATE_SHARE = 0.05
 """Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
 
 
@@ -54,10 +54,10 @@ class Surface(NamedTuple):
     """Name of the carrier's population; None for the static scene and objects."""
 
 
-def carriers_of(sim: Simulation, objects: ObjectSelection, without: Collection[str] = ()) -> list[Carrier]:
+def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection[str] = ()) -> list[Carrier]:
     """Return the static scene, and chosen objects and members of populations that turn.
 
-    Objects that other plugins place, such as loads, are left out.
+    Objects that other plugins move, such as loads, are left out.
 
     Args:
         sim: Simulation.
@@ -66,28 +66,28 @@ def carriers_of(sim: Simulation, objects: ObjectSelection, without: Collection[s
     """
     model = sim.scene.collision_model
     found = [Carrier(None, None, tuple(model.floor))] if model.floor else []
-    placed = {kind for plugin in sim.scene.plugins() for kind in plugin.placed_kinds or ()}
+    moved_kinds = {kind for plugin in sim.scene.plugins() for kind in plugin.moved_kinds or ()}
     members = populations(sim.data)
-    for body in choose(model, objects):
+    for body in select_bodies(model, objects):
         kind, _, number = body.name.rpartition(":")
         if kind in without:
             continue
         if kind in members and hasattr(members[kind], "ang_vel"):
             found.append(Carrier(kind, int(number), body.geoms))
-        elif kind not in placed:
+        elif kind not in moved_kinds:
             found.append(Carrier(None, body.row, body.geoms))
     return found
 
 
-def surfaces_of(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
-    """Return the surfaces that drones and loads touch, without those of bodies that push drones themselves.
+def find_surfaces(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
+    """Return the surfaces that drones and loads touch, without bodies that push drones themselves.
 
     Args:
         sim: Simulation.
         objects: Handles, or names of objects; None for all.
     """
     pushing = [plugin.name for plugin in sim.scene.plugins() if getattr(plugin, "pushes_drones", False)]
-    carriers = carriers_of(sim, objects, pushing)
+    carriers = find_carriers(sim, objects, pushing)
     return [Surface(geom, x.row, x.population) for x in carriers for geom in x.geoms]
 
 
@@ -121,25 +121,25 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     pos, quat = data.states.pos, data.states.quat
     dtype = pos.dtype
     corners = jnp.asarray(box[:3] + box[3:] * np.array(list(product((-1, 1), repeat=3))), dtype)
-    plate = Shape("box", (*box[3:5].tolist(), THIN * box[5]))
-    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - THIN) * box[5]]), dtype) for side in (-1, 1)]
+    plate = Shape("box", (*box[3:5].tolist(), PLATE_SHARE * box[5]))
+    middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_SHARE) * box[5]]), dtype) for side in (-1, 1)]
     turn = quat[..., None, :]
     in_world = pos[..., None, :] + rotation.rotate(turn, corners)
     found = []
     for surface in surfaces:
         geom = surface.geom
-        into, back, vel = _frame(data, surface)
+        into, back, vel = _geom_frame(data, surface)
         still = jnp.zeros_like(in_world) if vel is None else rotation.rotate_inverse(turn, vel(in_world))
         if geom.shape.kind == "hfield":
-            gap, normal = _above(data, geom, in_world, into, back)
+            gap, normal = _height_above_field(data, geom, in_world, into, back)
             normal = rotation.rotate_inverse(turn, normal)
             found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
-        if geom.shape.kind in FLAT:
+        if geom.shape.kind in FLAT_KINDS:
             gap, pull = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), into(in_world, True))
             normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
             found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
         if geom.shape.kind not in ("plane", "hfield"):
-            found += [_nearest(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
+            found += [_nearest_plate_point(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
     joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
     return ContactPoints(*joined)
 
@@ -158,10 +158,10 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     gaps, normals, vels = [], [], []
     for surface in surfaces:
         geom = surface.geom
-        into, back, vel = _frame(data, surface)
+        into, back, vel = _geom_frame(data, surface)
         if geom.shape.kind == "hfield":
-            gap, normal = _above(data, geom, pos, into, back)
-            gap = gap - _reach(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
+            gap, normal = _height_above_field(data, geom, pos, into, back)
+            gap = gap - _extent_along(shape, jnp.stack([rotation.dot(axis, normal)[..., 0] for axis in axes], axis=-1))
         else:
             rot = jnp.stack([into(axis, False) for axis in axes], axis=-1)
             gap, pull = jax.vjp(lambda x, s=geom.shape, f=into, r=rot: distance(shape, s, f(x, True), r), pos)
@@ -174,7 +174,9 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
     )
 
 
-def _above(data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable) -> tuple[Array, Array]:
+def _height_above_field(
+    data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable
+) -> tuple[Array, Array]:
     """Return the distance of points to the plane below them of a height field, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
     if isinstance(terrain, TerrainData):
@@ -183,14 +185,14 @@ def _above(data: SimData, geom: CollisionGeom, points: Array, into: Callable, ba
     return gap, back(normal)
 
 
-def _reach(shape: Shape, direction: Array) -> Array:
+def _extent_along(shape: Shape, direction: Array) -> Array:
     """Return the distance of the outermost point of a ball or box along a direction in its frame, m. (...)"""
     if shape.kind == "sphere":
         return jnp.full(direction.shape[:-1], shape.size[0], direction.dtype)
     return jnp.sum(jnp.abs(direction) * jnp.asarray(shape.size, direction.dtype), axis=-1)
 
 
-def _nearest(
+def _nearest_plate_point(
     data: SimData, geom: CollisionGeom, into: Callable, shape: Shape, middle: Array, vel: Array
 ) -> ContactPoints:
     """Return the point of a plate that is nearest to a geom.
@@ -231,7 +233,7 @@ def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> 
     return gap, pull_back(jnp.ones_like(gap))
 
 
-def _frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
+def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
     """Return functions that take points and directions into a geom's frame, and directions back, and its velocity.
 
     The last one takes points in the world frame; it is None for a fixed surface.

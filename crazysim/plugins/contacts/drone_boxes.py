@@ -13,11 +13,11 @@ from jax import Array
 from crazysim.core.plugin import Simulation
 from crazysim.scene.collision import DroneGeoms
 
-Boxes = Sequence[tuple[DroneGeoms, np.ndarray]]
+DroneBoxes = Sequence[tuple[DroneGeoms, np.ndarray]]
 """Drones of each airframe, with centre and half extents of their collision box, body frame, m. (6,)"""
 
 
-def boxes_of(sim: Simulation) -> Boxes:
+def collision_boxes(sim: Simulation) -> DroneBoxes:
     """Return the collision boxes of a simulation's drones."""
     kinds = [DroneGeoms((), drones) for drones in sim.scene.kinds]
     firsts = [0 if kind.drones is None else kind.drones[0] for kind in kinds]
@@ -25,7 +25,7 @@ def boxes_of(sim: Simulation) -> Boxes:
     return list(zip(kinds, boxes, strict=True))
 
 
-def of_kind(found: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
+def select_airframe(found: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
     """Return for each drone the result for its airframe.
 
     Args:
@@ -34,7 +34,7 @@ def of_kind(found: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
     """
     (_, result), *others = found
     for kind, other in others:
-        present: Any = kind.present(drone_id)
+        present: Any = kind.drone_mask(drone_id)
         mask = present[..., None] if present.ndim else present
         result = jax.tree.map(lambda x, y, mask=mask: x if y is x else jnp.where(mask, y, x), result, other)
     return result

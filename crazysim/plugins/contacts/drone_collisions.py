@@ -11,18 +11,18 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage, vmap_worlds
 from crazysim.errors import ConfigError
-from crazysim.geometry.manifold import N_OF_BOXES
-from crazysim.plugins.contacts.pairs import Solids, between, joined
+from crazysim.geometry.manifold import N_BOX_POINTS
+from crazysim.plugins.contacts.pairs import Solids, contacts_between, join_contacts
 from crazysim.plugins.contacts.rigid_bodies import (
-    boxes_of_drones,
+    drone_box_extents,
     drones_as_bodies,
     drones_as_boxes,
-    moved,
     require_few_contacts,
+    states_after_contact,
 )
 from crazysim.plugins.contacts.solver import Impulses, solve_contacts
 from crazysim.pytree import PyTree, device_array, leaf
@@ -61,12 +61,11 @@ class DroneCollisions(Plugin):
     name: str = "drone_collisions"
 
     def record(self, sim: Simulation) -> DroneCollisionsData:
-        """Return the parameters, and no impulse."""
         n = sim.n_drones
         if n < 2:
             raise ConfigError(f"expected at least two drones, which can collide, got {n}. Use Sim(n_drones=...).")
         check_softness(sim.data.core.freq, self.softness)
-        n_contacts = require_few_contacts(N_OF_BOXES * n * (n - 1) // 2, f"{n} drones")
+        n_contacts = require_few_contacts(N_BOX_POINTS * n * (n - 1) // 2, f"{n} drones")
         return DroneCollisionsData(
             friction=device_array([self.friction]),
             restitution=device_array([self.restitution]),
@@ -75,9 +74,8 @@ class DroneCollisions(Plugin):
             drag=device_array(np.zeros((sim.n_worlds, 1, n_contacts, 3))),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage of the collisions."""
-        boxes, n = boxes_of_drones(sim), sim.n_drones
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        boxes, n = drone_box_extents(sim), sim.n_drones
         pairs = np.array(list(combinations(range(n), 2)))
 
         def of_world(data: SimData) -> SimData:
@@ -85,12 +83,12 @@ class DroneCollisions(Plugin):
             pos, rot = drones_as_boxes(data, boxes)
             solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
             each = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
-            contacts = joined(between(solids, pairs), *each)
+            contacts = join_contacts(contacts_between(solids, pairs), *each)
             before, dt = Impulses(record.press, record.drag), 1 / data.core.freq
             solved = solve_contacts(drones_as_bodies(data), contacts, before, dt, self.softness, self.iterations)
             changes: Any = {"impulse": solved.impulse, "press": solved.at.press, "drag": solved.at.drag}
-            states = moved(data.states, solved, slice(n))
+            states = states_after_contact(data.states, solved, slice(n))
             return self.write(data.replace(states=states), record.replace(**changes))
 
         solve = Stage(vmap_worlds(of_world), "batch", why="it solves the contacts of all worlds at once")
-        return [Placement(solve, before="increment_steps")]
+        return [StagePlacement(solve, before="increment_steps")]

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.geometry.linear import solve
+from crazysim.geometry.small_matrices import solve_symmetric
 from crazysim.plugins.contacts.contact_points import ContactPoints
 
 BOUNCE_SPEED = 0.1
 """Approach speed below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
-STIFFNESS = 300.0
+PENALTY_STIFFNESS = 300.0
 """Penalty on the speed into a surface, in masses: costs a third of a percent of a bounce, solvable in float32."""
-STICKING = 1e-4
+STICKING_SPEED = 1e-4
 """Slip speed treated as zero, m/s."""
-FASTEST_PUSH = 0.25
+MAX_PUSH_SPEED = 0.25
 """Largest speed at which an overlap is pushed out, m/s."""
 
 
@@ -33,7 +33,7 @@ class Material(NamedTuple):
     """Time constant with which an overlap is pushed out, s. (1,)"""
 
 
-def after_contact(
+def velocity_after_contact(
     points: ContactPoints, before: Array, mass: Array, inertia: Array, material: Material, iterations: int
 ) -> Array:
     """Return the velocity of a body after the impulses of the surfaces that it touches. (..., 6) or (..., 3)
@@ -54,7 +54,7 @@ def after_contact(
     """
     n, p, s = points.normal, points.point, points.vel
     active = points.gap < 0
-    stiff = STIFFNESS * mass
+    stiff = PENALTY_STIFFNESS * mass
     row = _with_torque(n, p)
     along = jnp.sum(n * s, axis=-1)
 
@@ -66,7 +66,7 @@ def after_contact(
         return out, rotation.safe_norm(vel - out[..., None] * n)[..., 0]
 
     fast = active & (-slip(before)[0] > BOUNCE_SPEED)
-    wanted = jnp.where(fast, 0.0, jnp.minimum(-points.gap / material.softness, FASTEST_PUSH))
+    wanted = jnp.where(fast, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
 
     def turn(k: Array, u: Array) -> Array:
         out, aside = slip(u)
@@ -74,23 +74,25 @@ def after_contact(
         push = jnp.where(pressed, stiff * (wanted - out), 0.0)
         w_n = jnp.where(pressed, stiff, 0.0)
         # The first push stops the whole fall at every point: the friction force is known from the second on.
-        w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, material.friction * push / (aside + STICKING)))
+        w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, material.friction * push / (aside + STICKING_SPEED)))
         rest = w_n - w_t
         steep = jnp.sum(rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
-        matrix = inertia + _tangential(w_t, p, n.dtype) + steep
+        matrix = inertia + _weighted_inertia(w_t, p, n.dtype) + steep
         held = w_t[..., None] * _with_torque(s, p)
         driven = (rest * along + w_n * wanted)[..., None] * row
-        return solve(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
+        return solve_symmetric(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
 
     after = jax.lax.fori_loop(0, iterations, turn, before)
     push = jnp.where(active, stiff * jnp.maximum(wanted - slip(after)[0], 0.0), 0.0)
-    after = after + material.restitution * solve(inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2))
+    after = after + material.restitution * solve_symmetric(
+        inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2)
+    )
     # Energy is measured relative to the surfaces that push.
     total = jnp.sum(push, axis=-1, keepdims=True)
     seen = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
     seen = seen if p is None else jnp.concatenate([seen, jnp.zeros_like(seen)], axis=-1)
     had, has = (rotation.dot(u - seen, rotation.matvec(inertia, u - seen)) for u in (before, after))
-    most = had + mass * FASTEST_PUSH**2
+    most = had + mass * MAX_PUSH_SPEED**2
     after = jnp.where(
         has > most, seen + (after - seen) * rotation.safe_sqrt(most / jnp.where(has > 0, has, 1.0)), after
     )
@@ -112,8 +114,8 @@ def _with_torque(force: Array, p: Array | None) -> Array:
     return force if p is None else jnp.concatenate([force, rotation.cross(p, force)], axis=-1)
 
 
-def _tangential(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array:
-    """Return the sum of ``weight * B^T B``; ``B`` maps a body's velocity to that of its point ``p``. (..., k, k)"""
+def _weighted_inertia(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array:
+    """Return the sum of ``weight * B^T B``; ``B`` maps velocities of the body to its point ``p``. (..., k, k)"""
     total = jnp.sum(weight, axis=-1)[..., None, None] * jnp.eye(3, dtype=dtype)
     if p is None:
         return total

@@ -16,28 +16,28 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.geometry import Shape, distance
 from crazysim.plugins.contacts.contact_points import Surface, load_points
-from crazysim.plugins.contacts.drone_boxes import Boxes, of_kind
+from crazysim.plugins.contacts.drone_boxes import DroneBoxes, select_airframe
 from crazysim.plugins.contacts.impulse import (
     BOUNCE_SPEED,
-    FASTEST_PUSH,
-    STICKING,
+    MAX_PUSH_SPEED,
+    STICKING_SPEED,
     Material,
-    after_contact,
     inertia_matrix,
+    velocity_after_contact,
 )
-from crazysim.plugins.payloads.body import Collider, Colliding
+from crazysim.plugins.payloads.colliders import Collider, CollidingPlugin
 
-OWN_GAP = 1e3
-"""Distance that stands for that of a body to itself, m."""
+SELF_GAP = 1e3
+"""Distance of a body to itself, m: large, so that it never touches itself."""
 
 
-def loads_of(sim: Simulation) -> list[Colliding]:
+def load_plugins(sim: Simulation) -> list[CollidingPlugin]:
     """Return the plugins whose loads are objects of the scene, and collide."""
     names = () if sim.data.objects is None else sim.data.objects.names
-    return [p for p in sim.scene.plugins() if isinstance(p, Colliding) and f"{p.name}:0" in names]
+    return [p for p in sim.scene.plugins() if isinstance(p, CollidingPlugin) and f"{p.name}:0" in names]
 
 
-def names_of(sim: Simulation, plugins: Sequence[Colliding]) -> set[str]:
+def load_names(sim: Simulation, plugins: Sequence[CollidingPlugin]) -> set[str]:
     """Return the names of the loads and hooks of some plugins in the scene."""
     kinds = {kind for p in plugins for kind in p.solid_kinds}
     return {name for name in (sim.data.objects.names if plugins else ()) if name.rpartition(":")[0] in kinds}
@@ -55,12 +55,12 @@ def stop_loads(
     # A load of a whole world takes the material of its first drone.
     material = Material(*(x[:1] if x.ndim > 1 else x for x in material))
     points, one = load_points(data, body, collider.shape, surfaces), jnp.ones_like(body.mass)
-    vel = after_contact(points, body.vel, one, inertia_matrix(one), material, iterations)
+    vel = velocity_after_contact(points, body.vel, one, inertia_matrix(one), material, iterations)
     vel = vel if body.exists is None else jnp.where(body.exists[..., None], vel, body.vel)
     return collider.with_vel(data, vel)
 
 
-def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Boxes) -> tuple[SimData, Array]:
+def hit_drones(data: SimData, collider: Collider, material: Material, boxes: DroneBoxes) -> tuple[SimData, Array]:
     """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
 
     The impulse acts at the load's centre, on both: momentum and angular momentum are kept. First the normal impulse,
@@ -87,9 +87,9 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Box
         gap, pull = jax.vjp(lambda x: distance(shape, target, x - jnp.asarray(box[:3], x.dtype), rot), lever)
         return gap[..., None], pull(jnp.ones_like(gap))[0]
 
-    gap, normal = of_kind([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
+    gap, normal = select_airframe([(kind, to_box(box)) for kind, box in boxes], data.core.drone_id)
     gap = gap[..., 0]
-    touches = (gap < 0) & ~collider.joined(data)
+    touches = (gap < 0) & ~collider.joined_mask(data)
     touches = touches if body.exists is None else touches & body.exists[:, None]
 
     def response(change: Array) -> Array:
@@ -124,7 +124,7 @@ def velocity_change(
         response: Returns the change of the relative velocity for a change of the body's velocity, both m/s.
     """
     out = rotation.dot(vel, normal)
-    pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, FASTEST_PUSH)
+    pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)
     wanted = jnp.where(out < -BOUNCE_SPEED, -material.restitution * out, pushed_out)
     moved = response(normal)
     # At least one, except where the normal is zero: between balls with one centre.
@@ -132,12 +132,12 @@ def velocity_change(
     vel = vel + speed * moved
     slip = vel - rotation.dot(vel, normal) * normal
     fast = rotation.safe_norm(slip)
-    along = slip / (fast + STICKING)
+    along = slip / (fast + STICKING_SPEED)
     brake = jnp.minimum(material.friction * speed, fast / jnp.maximum(rotation.dot(along, response(along)), 1.0))
     return speed * normal - brake * along
 
 
-class _Pairs(NamedTuple):
+class _PairContacts(NamedTuple):
     """Changes of velocity by the contacts of two groups of bodies with each other."""
 
     touches: Array
@@ -163,7 +163,7 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     """
     groups = list(combinations_with_replacement(range(len(colliders)), 2))
     material = Material(*(x.reshape(-1)[:1] for x in material))
-    found = {(a, b): _pairs(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
+    found = {(a, b): _pair_contacts(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
     n_touches: list[Any] = [
         sum(pairs.touches.sum(axis=1) for (a, _), pairs in found.items() if a == k)
         + sum(pairs.touches.sum(axis=0) for (_, b), pairs in found.items() if b == k)
@@ -181,13 +181,13 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     return data
 
 
-def _pairs(data: SimData, first: Collider, second: Collider, material: Material, same: bool) -> _Pairs:
-    """Return the contacts of two groups of bodies, or of one group, each pair of which counts once."""
+def _pair_contacts(data: SimData, first: Collider, second: Collider, material: Material, same: bool) -> _PairContacts:
+    """Return the contacts of two groups of bodies, or of one group, in which each pair counts once."""
     a, b = first.body(data), second.body(data)
     turn = b.quat[None]
     offset = rotation.rotate_inverse(turn, a.pos[:, None] - b.pos[None])
     if same:
-        offset = offset + OWN_GAP * np.eye(len(offset), dtype=offset.dtype)[..., None]
+        offset = offset + SELF_GAP * np.eye(len(offset), dtype=offset.dtype)[..., None]
     eye = jnp.eye(3, dtype=offset.dtype)
     axes = [rotation.rotate_inverse(turn, rotation.rotate(a.quat[:, None], eye[k])) for k in range(3)]
     rot = jnp.stack(axes, axis=-1)
@@ -203,4 +203,4 @@ def _pairs(data: SimData, first: Collider, second: Collider, material: Material,
     change = velocity_change(gap, normal, vel, material, lambda change: change)
     total = a.mass[:, None] + b.mass[None]
     weight = 1 / jnp.where(total > 0, total, 1.0)
-    return _Pairs(touches, b.mass[None] * weight * change, -a.mass[:, None] * weight * change)
+    return _PairContacts(touches, b.mass[None] * weight * change, -a.mass[:, None] * weight * change)

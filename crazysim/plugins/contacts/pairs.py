@@ -12,8 +12,8 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.geometry import Shape, distance, point_distance
-from crazysim.geometry.linear import apply
-from crazysim.geometry.manifold import Manifold, ball_on_box, balls, boxes
+from crazysim.geometry.manifold import Manifold, ball_box_contacts, ball_contacts, box_contacts
+from crazysim.geometry.small_matrices import matvec
 from crazysim.plugins.contacts.solver import Contacts
 from crazysim.scene.collision import CollisionGeom
 
@@ -38,7 +38,7 @@ class Solids(NamedTuple):
     """Rotation matrices to the world frame. (n, 3, 3)"""
 
 
-class Found(NamedTuple):
+class PairContacts(NamedTuple):
     """Contact points of some pairs, of each the same number."""
 
     first: np.ndarray
@@ -46,10 +46,10 @@ class Found(NamedTuple):
     second: np.ndarray
     """Numbers of the second bodies. (n_pairs,)"""
     points: Manifold
-    """Gaps (k,), normals (k, 3) and points (k, 3), those of a pair as neighbours."""
+    """Gaps (k,), normals (k, 3) and points (k, 3), sorted by pair."""
 
 
-def between(solids: Solids, pairs: np.ndarray) -> list[Found]:
+def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
     """Return the contact points of pairs of solids. (n_pairs, 2)"""
     found = []
     kinds = solids.is_ball[pairs]
@@ -62,16 +62,20 @@ def between(solids: Solids, pairs: np.ndarray) -> list[Found]:
         a, b = of_kind.T
         size = jnp.asarray(solids.size, solids.pos.dtype)
         if first and second:
-            points = jax.vmap(balls)(size[a, 0], solids.pos[a], size[b, 0], solids.pos[b])
+            points = jax.vmap(ball_contacts)(size[a, 0], solids.pos[a], size[b, 0], solids.pos[b])
         elif first or second:
-            points = jax.vmap(ball_on_box)(size[a, 0], solids.pos[a], size[b], solids.pos[b], solids.rot[b])
+            points = jax.vmap(ball_box_contacts)(size[a, 0], solids.pos[a], size[b], solids.pos[b], solids.rot[b])
         else:
-            points = jax.vmap(boxes)(size[a], solids.pos[a], solids.rot[a], size[b], solids.pos[b], solids.rot[b])
-        found.append(Found(solids.body[a], solids.body[b], _flat(points)))
+            points = jax.vmap(box_contacts)(
+                size[a], solids.pos[a], solids.rot[a], size[b], solids.pos[b], solids.rot[b]
+            )
+        found.append(PairContacts(solids.body[a], solids.body[b], _flatten_manifolds(points)))
     return found
 
 
-def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, pose: tuple[Array, Array]) -> Found:
+def contacts_on_surface(
+    solids: Solids, number: int, geom: CollisionGeom, carrier: int, pose: tuple[Array, Array]
+) -> PairContacts:
     """Return the contact points of a solid with a geom of any kind: corners and the nearest point.
 
     Args:
@@ -84,19 +88,19 @@ def on_surface(solids: Solids, number: int, geom: CollisionGeom, carrier: int, p
     (at, turn), shape = pose, geom.shape
 
     def gap_at(points: Array) -> tuple[Array, Array]:
-        gap, normal = _height(shape, apply(turn.T, points - at))
-        return gap, apply(turn, normal)
+        gap, normal = _distance_and_normal(shape, matvec(turn.T, points - at))
+        return gap, matvec(turn, normal)
 
-    found = on_ground(solids, number, carrier, gap_at)
+    found = contacts_on_ground(solids, number, carrier, gap_at)
     if solids.is_ball[number] or shape.kind == "plane":
         return found
     box = Shape("box", tuple(map(float, solids.size[number])))
-    nearest = _nearest(box, solids.pos[number], solids.rot[number], shape, at, turn)
+    nearest = _nearest_point(box, solids.pos[number], solids.rot[number], shape, at, turn)
     return found._replace(points=Manifold(*(jnp.concatenate(x) for x in zip(found.points, nearest, strict=True))))
 
 
-def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found:
-    """Return the contact points of a solid with terrain, of which ``gap_at(points)`` gives gaps and normals."""
+def contacts_on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> PairContacts:
+    """Return the contact points of a solid with terrain; ``gap_at(points)`` returns its gaps and normals."""
     pos, rot = solids.pos[number], solids.rot[number]
     if solids.is_ball[number]:
         radius = float(solids.size[number, 0])
@@ -104,12 +108,12 @@ def on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> Found
         gap = gap - radius
         found = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
     else:
-        corners = pos + apply(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
+        corners = pos + matvec(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
         found = Manifold(*gap_at(corners), corners)
-    return Found(solids.body[number : number + 1], np.array([carrier]), found)
+    return PairContacts(solids.body[number : number + 1], np.array([carrier]), found)
 
 
-def joined(found: list[Found], friction: Array, restitution: Array) -> Contacts:
+def join_contacts(found: list[PairContacts], friction: Array, restitution: Array) -> Contacts:
     """Return all contact points, each with the larger friction and restitution of its two bodies, as MuJoCo combines.
 
     Args:
@@ -127,33 +131,33 @@ def joined(found: list[Found], friction: Array, restitution: Array) -> Contacts:
     return Contacts(first, second, n_points, gap, normal, point, *mixed)
 
 
-def _n_points(found: Found) -> int:
+def _n_points(found: PairContacts) -> int:
     """Return the number of points of each pair."""
     return found.points.gap.shape[0] // len(found.first)
 
 
-def _height(shape: Shape, point: Array) -> tuple[Array, Array]:
+def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
     """Return the distance of points to a shape, and its normal there, in the shape's frame."""
     gap, pull = jax.vjp(lambda p: point_distance(shape, p), point)
     return gap, pull(jnp.ones_like(gap))[0]
 
 
-def _nearest(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: Array) -> Manifold:
+def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: Array) -> Manifold:
     """Return the nearest point of a box and a shape; the gradient of the gap is the normal, and the lever times it."""
 
     def gap_at(move: Array, turned: Array) -> Array:
         spun = rot + jnp.stack([rotation.cross(turned, rot[:, k]) for k in range(3)], axis=-1)
-        columns = [apply(turn.T, spun[:, k]) for k in range(3)]
-        return distance(box, shape, apply(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
+        columns = [matvec(turn.T, spun[:, k]) for k in range(3)]
+        return distance(box, shape, matvec(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
 
     gap, pull = jax.vjp(gap_at, jnp.zeros_like(pos), jnp.zeros_like(pos))
     normal, torque = pull(jnp.ones_like(gap))
     half = jnp.asarray(box.size, pos.dtype)
-    reach = jnp.sum(jnp.abs(apply(rot.T, normal)) * half)
+    reach = jnp.sum(jnp.abs(matvec(rot.T, normal)) * half)
     point = pos + rotation.cross(normal, torque) - reach * normal
     return Manifold(gap[None], normal[None], point[None])
 
 
-def _flat(points: Manifold) -> Manifold:
+def _flatten_manifolds(points: Manifold) -> Manifold:
     """Return manifolds of several pairs as one."""
     return Manifold(points.gap.reshape(-1), points.normal.reshape(-1, 3), points.point.reshape(-1, 3))

@@ -2,8 +2,8 @@
 
 Time stepping on velocities (Moreau 1988; the convex form of Todorov 2014): after a step, impulses at the contact points
 change the velocity into one that no longer approaches. An overlap is pushed out with a time constant, so that the
-ground is soft and no drone is thrown out of it. The points are those of ``contact_points``, and the
-impulses those of ``impulse``.
+ground is soft and no drone is thrown out of it. The points come from ``contact_points``, and the
+impulses from ``impulse``.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData, SimState
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
 from crazysim.core.settings import MAX_FRICTION, MAX_ITERATIONS, MAX_SOFTNESS, check_softness, setting
 from crazysim.core.stage import Stage
-from crazysim.plugins.contacts.contact_points import Surface, contact_points, is_ground, surfaces_of
-from crazysim.plugins.contacts.drone_boxes import Boxes, boxes_of, of_kind
-from crazysim.plugins.contacts.impulse import Material, after_contact, inertia_matrix
-from crazysim.plugins.contacts.load_contacts import hit_drones, hit_each_other, loads_of, names_of, stop_loads
-from crazysim.plugins.payloads.body import Colliding
+from crazysim.plugins.contacts.contact_points import Surface, contact_points, find_surfaces, is_ground
+from crazysim.plugins.contacts.drone_boxes import DroneBoxes, collision_boxes, select_airframe
+from crazysim.plugins.contacts.impulse import Material, inertia_matrix, velocity_after_contact
+from crazysim.plugins.contacts.load_contacts import hit_drones, hit_each_other, load_names, load_plugins, stop_loads
+from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.pytree import PyTree, device_array, leaf
-from crazysim.scene.contact_report import ObjectSelection, choose
+from crazysim.scene.contact_report import ObjectSelection, select_bodies
 
 
 class ContactResponseData(PyTree):
@@ -69,7 +69,6 @@ class ContactResponse(Plugin):
     name: str = "contact_response"
 
     def record(self, sim: Simulation) -> ContactResponseData:
-        """Return the parameters, and no impulse."""
         check_softness(sim.data.core.freq, self.softness)
         return ContactResponseData(
             friction=device_array([self.friction]),
@@ -78,26 +77,27 @@ class ContactResponse(Plugin):
             impulse=device_array(np.zeros((sim.n_worlds, sim.n_drones, 3))),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that applies the impulses."""
-        boxes = boxes_of(sim)
-        plugins = loads_of(sim)
-        names = names_of(sim, plugins)
-        surfaces = surfaces_of(sim, self.objects)
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        boxes = collision_boxes(sim)
+        plugins = load_plugins(sim)
+        names = load_names(sim, plugins)
+        surfaces = find_surfaces(sim, self.objects)
 
         def respond(data: SimData) -> SimData:
             found = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
-            states, record = of_kind(found, data.core.drone_id)
+            states, record = select_airframe(found, data.core.drone_id)
             return self.write(data.replace(states=states), record)
 
-        found = [Placement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
+        found = [StagePlacement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
-        hits = any(body.name in names for body in choose(sim.scene.collision_model, self.objects))
+        hits = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
         for plugin in plugins:
             found += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
         return found
 
-    def _load_stages(self, plugin: Colliding, obstacles: list[Surface], boxes: Boxes, n_drones: int) -> list[Placement]:
+    def _load_stages(
+        self, plugin: CollidingPlugin, obstacles: list[Surface], boxes: DroneBoxes, n_drones: int
+    ) -> list[StagePlacement]:
         """Return the stages of a plugin's loads: with obstacles, with drones and with each other.
 
         Args:
@@ -138,7 +138,7 @@ class ContactResponse(Plugin):
             found.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
             if meet:
                 found.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
-        return [Placement(stage, before="increment_steps", name=name) for stage, name in found]
+        return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in found]
 
 
 def _respond(
@@ -148,7 +148,7 @@ def _respond(
     states, params = data.states, data.params
     before = jnp.concatenate([rotation.rotate_inverse(states.quat, states.vel), states.ang_vel], axis=-1)
     points, inertia = contact_points(data, surfaces, box), inertia_matrix(params.mass, params.J)
-    after = after_contact(points, before, params.mass, inertia, record.material, iterations)
+    after = velocity_after_contact(points, before, params.mass, inertia, record.material, iterations)
     impulse = params.mass * rotation.rotate(states.quat, after[..., :3] - before[..., :3])
     states = states.replace(vel=rotation.rotate(states.quat, after[..., :3]), ang_vel=after[..., 3:])
     return states, record.replace(impulse=impulse)

@@ -15,86 +15,94 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation
 from crazysim.core.stage import vmap_worlds
 from crazysim.errors import ConfigError
-from crazysim.geometry.linear import apply, matmul
-from crazysim.geometry.manifold import N_OF_BOXES
-from crazysim.plugins.contacts.contact_points import Carrier, carriers_of
-from crazysim.plugins.contacts.pairs import CORNERS, Found, Solids, between, joined, on_ground, on_surface
-from crazysim.plugins.contacts.solver import Bodies, Impulses, Solved, solve_contacts
+from crazysim.geometry.manifold import N_BOX_POINTS
+from crazysim.geometry.small_matrices import matmul, matvec
+from crazysim.plugins.contacts.contact_points import Carrier, find_carriers
+from crazysim.plugins.contacts.pairs import (
+    CORNERS,
+    PairContacts,
+    Solids,
+    contacts_between,
+    contacts_on_ground,
+    contacts_on_surface,
+    join_contacts,
+)
+from crazysim.plugins.contacts.solver import Bodies, Impulses, SolvedBodies, solve_contacts
 from crazysim.plugins.effects.ground import TerrainData
 from crazysim.scene.collision import CollisionGeom
 
 MAX_CONTACTS = 250_000
-"""Most contact points in a world: those of 250 drones or boxes."""
-EXACT = ("sphere", "box")
-"""Kinds of geoms whose contact with balls and boxes is that of bodies; others touch corners and the nearest point."""
+"""Most contact points in a world, as many as 250 drones or boxes have."""
+EXACT_KINDS = ("sphere", "box")
+"""Kinds of geoms that touch balls and boxes as bodies do; others touch their corners and nearest point."""
 
 
-class Touching:
+class BodyContacts:
     """Contacts of the free bodies of a simulation."""
 
     def __init__(self, sim: Simulation, plugin: Any):
         """Collect the solids of the scene as they are now."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
-        self.boxes = boxes_of_drones(sim)
-        self.carriers = carriers_of(sim, plugin.objects, (plugin.name,))
+        self.boxes = drone_box_extents(sim)
+        self.carriers = find_carriers(sim, plugin.objects, (plugin.name,))
 
     def n_contacts(self, terrains: Collection[str]) -> int:
-        """Return the number of contact points, of which most are out of contact.
+        """Return the number of contact points; most of them are out of contact.
 
         Args:
             terrains: Names of the plugins whose height fields are terrain.
         """
         balls = [shape.kind == "sphere" for shape in self.shapes]
         geoms = [geom for carrier in self.carriers for geom in carrier.geoms]
-        others = [False] * self.n_drones + [g.shape.kind == "sphere" for g in geoms if g.shape.kind in EXACT]
+        others = [False] * self.n_drones + [g.shape.kind == "sphere" for g in geoms if g.shape.kind in EXACT_KINDS]
         pairs = [*combinations(balls, 2), *product(balls, others)]
-        n = sum(1 if any(pair) else N_OF_BOXES for pair in pairs)
+        n = sum(1 if any(pair) else N_BOX_POINTS for pair in pairs)
         for geom in geoms:
-            if geom.shape.kind not in EXACT:
+            if geom.shape.kind not in EXACT_KINDS:
                 only_corners = geom.shape.kind == "plane" or geom.name in terrains
                 n += sum(1 if ball else len(CORNERS) + (not only_corners) for ball in balls)
         return n
 
     def respond(self, data: SimData) -> SimData:
         """Return the data of all worlds with the velocities after contact."""
-        return vmap_worlds(self.of_world)(data)
+        return vmap_worlds(self.respond_in_world)(data)
 
-    def of_world(self, data: SimData) -> SimData:
+    def respond_in_world(self, data: SimData) -> SimData:
         """Return the data of one world with the velocities of bodies and drones after contact."""
         plugin, record, s = self.plugin, self.plugin.read(data), data.states
         n_free, n_drones = record.pos.shape[0], self.n_drones
         bodies, first_carrier = self._bodies(data, record), n_free + n_drones
         solids = self._solids(data, record)
         dynamic = [k for k, body in enumerate(solids.body) if body < n_free]
-        found = between(solids, self._pairs(solids, n_free))
+        found = contacts_between(solids, self._pairs(solids, n_free))
         for k, carrier in enumerate(self.carriers):
-            found += self._on(data, solids, dynamic, carrier, first_carrier + k)
+            found += self._contacts_on_carrier(data, solids, dynamic, carrier, first_carrier + k)
         if not found:
             return data
         size = bodies.pos.shape[0]
         friction, restitution = (
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
-        contacts = joined(found, friction, restitution)
+        contacts = join_contacts(found, friction, restitution)
         before = Impulses(record.press, record.drag)
         solved = solve_contacts(bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations)
-        record = moved(record, solved, slice(n_free))
+        record = states_after_contact(record, solved, slice(n_free))
         changes: Any = {"impulse": solved.impulse[:n_free], "press": solved.at.press, "drag": solved.at.drag}
         data = plugin.write(data, record.replace(**changes))
         if n_drones:
-            data = data.replace(states=moved(s, solved, slice(n_free, first_carrier)))
+            data = data.replace(states=states_after_contact(s, solved, slice(n_free, first_carrier)))
         return data
 
     def _bodies(self, data: SimData, record: Any) -> Bodies:
-        """Return the bodies: free ones, drones, then those that are not pushed."""
+        """Return the bodies: free bodies, drones, then bodies that are not pushed."""
         dtype = record.pos.dtype
         rows = [(record.pos, record.vel, rotation.rotate(record.quat, record.ang_vel), 1 / record.mass[:, 0],
-                 _turned(record.quat, 1 / record.inertia))]  # fmt: skip
+                 _rotate_diagonal(record.quat, 1 / record.inertia))]  # fmt: skip
         if self.n_drones:
             rows.append(drones_as_bodies(data))
         for carrier in self.carriers:
-            pos, quat, vel, ang_vel = _motion(data, carrier)
+            pos, quat, vel, ang_vel = _carrier_motion(data, carrier)
             spin = rotation.rotate(quat, ang_vel)
             rows.append((pos[None], vel[None], spin[None], jnp.zeros(1, dtype), jnp.zeros((1, 3, 3), dtype)))
         return Bodies(*(jnp.concatenate(column) for column in zip(*rows, strict=True)))
@@ -114,8 +122,8 @@ class Touching:
                 whole.append(part)
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
-                if geom.shape.kind in EXACT:
-                    at, turn = _pose(data, carrier, geom, dtype)
+                if geom.shape.kind in EXACT_KINDS:
+                    at, turn = _geom_pose(data, carrier, geom, dtype)
                     owners.append(n_free + self.n_drones + k)
                     balls.append(geom.shape.kind == "sphere")
                     sizes.append(np.resize(geom.shape.size, 3))
@@ -124,20 +132,24 @@ class Touching:
         return Solids(np.array(owners), np.array(balls), np.array(sizes), jnp.concatenate(pos), jnp.concatenate(rot))
 
     def _pairs(self, solids: Solids, n_free: int) -> np.ndarray:
-        """Return the pairs of solids of which at least one is a free body. (n_pairs, 2)"""
+        """Return the pairs of solids with at least one free body. (n_pairs, 2)"""
         pairs = [pair for pair in combinations(range(len(solids.body)), 2) if solids.body[pair[0]] < n_free]
         return np.array(pairs, np.int64).reshape(-1, 2)
 
-    def _on(self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, number: int) -> list[Found]:
+    def _contacts_on_carrier(
+        self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, number: int
+    ) -> list[PairContacts]:
         """Return the contacts of free bodies with the geoms of a carrier that are neither balls nor boxes."""
         found = []
         for geom in carrier.geoms:
             terrain = data.plugins.get(geom.name) if carrier.row is None else None
-            for k in dynamic if geom.shape.kind not in EXACT else ():
+            for k in dynamic if geom.shape.kind not in EXACT_KINDS else ():
                 if isinstance(terrain, TerrainData):
-                    found.append(on_ground(solids, k, number, terrain.gap_at))
+                    found.append(contacts_on_ground(solids, k, number, terrain.gap_at))
                 else:
-                    found.append(on_surface(solids, k, geom, number, _pose(data, carrier, geom, solids.pos.dtype)))
+                    found.append(
+                        contacts_on_surface(solids, k, geom, number, _geom_pose(data, carrier, geom, solids.pos.dtype))
+                    )
         return found
 
 
@@ -154,12 +166,12 @@ def require_few_contacts(n_contacts: int, among: str) -> int:
     if n_contacts > MAX_CONTACTS:
         raise ConfigError(
             f"expected at most {MAX_CONTACTS} contact points in a world, got {n_contacts} of {among}. Use fewer bodies "
-            f"or fewer objects: every pair has up to {N_OF_BOXES}."
+            f"or fewer objects: every pair has up to {N_BOX_POINTS}."
         )
     return n_contacts
 
 
-def moved(states: Any, solved: Solved, rows: slice) -> Any:
+def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
     """Return states of bodies or drones after contact.
 
     Args:
@@ -181,7 +193,7 @@ def drones_as_bodies(data: SimData) -> Bodies:
     return Bodies(s.pos, s.vel, rotation.rotate(s.quat, s.ang_vel), inv_mass, inverse)
 
 
-def boxes_of_drones(sim: Simulation) -> np.ndarray:
+def drone_box_extents(sim: Simulation) -> np.ndarray:
     """Return centre and half extents of each drone's collision box, body frame, m. (n_drones, 6)"""
     return np.array([airframe.value("shape.collision_box") for airframe in sim.airframes], np.float64)
 
@@ -197,7 +209,7 @@ def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
     return s.pos + rotation.rotate(s.quat, jnp.asarray(boxes[:, :3], s.pos.dtype)), rotation.matrix(s.quat)
 
 
-def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:
+def _carrier_motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:
     """Return position, attitude, velocity, world frame, and angular velocity, body frame, of a carrier."""
     dtype = data.states.pos.dtype
     zero = jnp.zeros(3, dtype)
@@ -210,15 +222,15 @@ def _motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array
     return objects.pos[carrier.row], objects.quat[carrier.row], objects.vel[carrier.row], zero
 
 
-def _pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.dtype) -> tuple[Array, Array]:
+def _geom_pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.dtype) -> tuple[Array, Array]:
     """Return position and rotation matrix of a geom, world frame."""
-    pos, quat, _, _ = _motion(data, carrier)
+    pos, quat, _, _ = _carrier_motion(data, carrier)
     rot = rotation.matrix(quat)
-    at = pos + apply(rot, jnp.asarray(geom.pos, dtype))
+    at = pos + matvec(rot, jnp.asarray(geom.pos, dtype))
     return at, rot if geom.rot is None else matmul(rot, jnp.asarray(geom.rot, dtype))
 
 
-def _turned(quat: Array, diagonal: Array) -> Array:
+def _rotate_diagonal(quat: Array, diagonal: Array) -> Array:
     """Return the matrices ``R diag(d) R^T``. (n, 3, 3)"""
     rot = rotation.matrix(quat)
     return matmul(rot * diagonal[:, None, :], jnp.swapaxes(rot, -1, -2))

@@ -15,15 +15,15 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.geometry.linear import apply, matmul
-from crazysim.plugins.contacts.impulse import BOUNCE_SPEED, FASTEST_PUSH
+from crazysim.geometry.small_matrices import matmul, matvec
+from crazysim.plugins.contacts.impulse import BOUNCE_SPEED, MAX_PUSH_SPEED
 
-ACTING_GAP = 1e-3
+MAX_ACTING_GAP = 1e-3
 """Gap up to which a contact may act in a step beyond the distance of approach, m."""
 
 
 class Bodies(NamedTuple):
-    """Bodies of a world, world frame; those that cannot be pushed have zero inverse mass and inertia."""
+    """Bodies of a world, world frame. Bodies that cannot be pushed have zero inverse mass and inertia."""
 
     pos: Array
     """Position of the centre of mass, m. (n, 3)"""
@@ -57,7 +57,7 @@ class Contacts(NamedTuple):
     restitution: Array
     """Ratio of the speeds after and before a bounce, 1. (k,)"""
 
-    def of_pairs(self, values: Array) -> Array:
+    def sum_pairs(self, values: Array) -> Array:
         """Return the sums of values of the points over the points of every pair. (n_pairs, m)"""
         found, end = [], 0
         for n_points, n_pairs in zip(*np.unique(self.n_points, return_counts=True), strict=True):
@@ -75,7 +75,7 @@ class Impulses(NamedTuple):
     """Across them, world frame, N s. (k, 3)"""
 
 
-class Solved(NamedTuple):
+class SolvedBodies(NamedTuple):
     """Bodies after contact."""
 
     bodies: Bodies
@@ -90,7 +90,7 @@ class Solved(NamedTuple):
 
 def solve_contacts(
     bodies: Bodies, contacts: Contacts, before: Impulses, dt: float, softness: float, iterations: int
-) -> Solved:
+) -> SolvedBodies:
     """Return the bodies after contact.
 
     At every contact the speed of separation becomes at least the one that closes a gap within the step, and
@@ -104,7 +104,7 @@ def solve_contacts(
     Args:
         bodies: The bodies.
         contacts: The contacts, each with at least one body that can be pushed.
-        before: Impulses to begin with: those of the last step bring bodies at rest to rest at once.
+        before: Initial impulses. The impulses of the last step bring bodies at rest to rest at once.
         dt: Step, s.
         softness: Time constant with which an overlap is pushed out, s.
         iterations: Iterations of the solver.
@@ -125,14 +125,17 @@ def solve_contacts(
 
     def change(impulse: Array) -> tuple[Array, Array]:
         """Return the changes of the velocities by impulses on the first bodies, and against the second."""
-        force, torque = contacts.of_pairs(impulse), contacts.of_pairs(rotation.cross(arm, impulse))
+        force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         against = torque + rotation.cross(offset, force)
-        force, torque = _gather(sums[0] - sums[1], force), _gather(sums[0], torque) - _gather(sums[1], against)
-        return bodies.inv_mass[:, None] * force, apply(bodies.inv_inertia, torque)
+        force, torque = (
+            _sum_for_bodies(sums[0] - sums[1], force),
+            _sum_for_bodies(sums[0], torque) - _sum_for_bodies(sums[1], against),
+        )
+        return bodies.inv_mass[:, None] * force, matvec(bodies.inv_inertia, torque)
 
     start = slip(bodies.vel, bodies.ang_vel)
     out = rotation.dot(start, normal)[:, 0]
-    near = contacts.gap < ACTING_GAP + dt * jnp.abs(out)
+    near = contacts.gap < MAX_ACTING_GAP + dt * jnp.abs(out)
     closes = jnp.minimum(-contacts.gap / dt, 0.0)
     bounces = (out < -BOUNCE_SPEED) & (contacts.gap + dt * out < 0)
     wanted = jnp.where(bounces, -contacts.restitution * out, closes)
@@ -142,11 +145,11 @@ def solve_contacts(
         turn = rotation.cross_matrix(lever)
         inverse, inv_mass = bodies.inv_inertia[numbers][pair], bodies.inv_mass[numbers][pair]
         spun = matmul(inverse, turn)
-        of_normal = inv_mass + rotation.dot(rotation.cross(lever, normal), apply(spun, normal))[:, 0]
+        of_normal = inv_mass + rotation.dot(rotation.cross(lever, normal), matvec(spun, normal))[:, 0]
         of_slip = 0.5 * (3 * inv_mass + jnp.sum(turn * spun, axis=(-2, -1)) - of_normal)
         acts = near & (of_normal > 0)
         n_weight, s_weight = (jnp.where(acts, 1 / jnp.where(acts, x, 1.0), 0.0) for x in (of_normal, of_slip))
-        together = _together(bodies, sum_of, contacts, normal, turn, n_weight, s_weight)[numbers][pair]
+        together = _shared_response(bodies, sum_of, contacts, normal, turn, n_weight, s_weight)[numbers][pair]
         along, across = along + together * of_normal, across + together * of_slip
     along, across = (jnp.where(x > 0, x, 1.0) for x in (along, across))
 
@@ -170,22 +173,22 @@ def solve_contacts(
     at, *_ = jax.lax.fori_loop(0, iterations, turn_once, (first, first, jnp.zeros((), dtype)))
     total = at.press[:, None] * normal + at.drag
     vel, ang_vel = change(total)
-    share = _share_that_keeps_energy(total, start, slip(vel, ang_vel))
+    share = _energy_share(total, start, slip(vel, ang_vel))
     at, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (at, total, vel, ang_vel))
 
     # One step down the gradient, as far as the overlaps shrink; the next time step continues.
     leaves = out + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
-    push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, FASTEST_PUSH) - jnp.maximum(leaves, 0.0)
+    push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(leaves, 0.0)
     push = jnp.maximum(push, 0.0)
     moved, turned = change((push / along)[:, None] * normal)
     apart = jnp.sum(push / along * rotation.dot(slip(moved, turned), normal)[:, 0])
     size = dt * jnp.sum(push / along * push) / jnp.where(apart > 0, apart, 1.0)
     after = bodies._replace(pos=bodies.pos + size * moved, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel)
-    impulse = _gather(sums[0] - sums[1], contacts.of_pairs(total))
-    return Solved(after, size * turned, at, impulse)
+    impulse = _sum_for_bodies(sums[0] - sums[1], contacts.sum_pairs(total))
+    return SolvedBodies(after, size * turned, at, impulse)
 
 
-def _together(
+def _shared_response(
     bodies: Bodies, sum_of: Array, contacts: Contacts, normal: Array, turn: Array, along: Array, across: Array
 ) -> Array:
     """Return for each body how many times more its contacts respond to all their impulses than each to its own. (n,)
@@ -208,7 +211,7 @@ def _together(
     upper = jnp.concatenate([weight, jnp.swapaxes(turned, -1, -2)], axis=-1)
     lower = jnp.concatenate([turned, matmul(turned, jnp.swapaxes(turn, -1, -2))], axis=-1)
     both = jnp.concatenate([upper, lower], axis=-2).reshape(-1, 36)
-    total = _gather(sum_of, contacts.of_pairs(both)).reshape(-1, 6, 6)
+    total = _sum_for_bodies(sum_of, contacts.sum_pairs(both)).reshape(-1, 6, 6)
     response = jnp.concatenate(
         [bodies.inv_mass[:, None, None] * total[:, :3], matmul(bodies.inv_inertia, total[:, 3:])], axis=-2
     )
@@ -217,7 +220,7 @@ def _together(
     return jnp.where(trace > 0, jnp.where(trace > 0, trace, 1.0) ** 0.125, 1.0)
 
 
-def _share_that_keeps_energy(impulse: Array, before: Array, change: Array) -> Array:
+def _energy_share(impulse: Array, before: Array, change: Array) -> Array:
     """Return the share of impulses, at most one, with which they add no kinetic energy. ()
 
     The energy that they add, in the frame of what cannot be pushed, is the sum of their products with the means of the
@@ -233,6 +236,6 @@ def _share_that_keeps_energy(impulse: Array, before: Array, change: Array) -> Ar
     return jnp.where(gains, jnp.maximum(-2 * first, 0.0) / jnp.where(gains, second, 1.0), 1.0)
 
 
-def _gather(sums: Array, values: Array) -> Array:
+def _sum_for_bodies(sums: Array, values: Array) -> Array:
     """Return the sums of the pairs' values for every body; by components, as a GPU may round products. (n, m)"""
     return jnp.sum(sums[:, :, None] * values[None], axis=1)

@@ -12,26 +12,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.settings import as_rgba, color, setting
 from crazysim.core.stage import Stage
 from crazysim.core.stages import FLOOR_HEIGHT, stop_below
 from crazysim.errors import ConfigError
 from crazysim.plugins.contacts.response import ContactResponse
-from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE
+from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, WHY_UNFUSED
 from crazysim.plugins.effects.ground import TerrainData, ground_height
 from crazysim.pytree import device_array
 from crazysim.storage import read_bytes
 
-PNG = b"\x89PNG\r\n\x1a\n"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG image; its width and height are bytes 16 to 24."""
-MAX_FILE = 256 * 2**20
+MAX_FILE_BYTES = 256 * 2**20
 """Largest file of an image, bytes."""
 MAX_PIXELS = 2**24
 """Most pixels of an image: 4096 x 4096. It takes 0.5 GB."""
-DEPTH = 1.0
+BASE_THICKNESS = 1.0
 """Thickness of the ground below the lowest height, m."""
-FLATTEST = 1e-3
+MIN_HEIGHT_RANGE = 1e-3
 """Least range of heights of a height field of MuJoCo, m: a flat terrain is given one."""
 
 
@@ -53,12 +53,11 @@ class Terrain(Plugin):
     """True to keep the flat floor around it; False to remove it, which depressions below z = 0 need. The heights of the
     border then extend outwards without end."""
     rgba: ArrayLike | None = color()
-    """Colour; None for that of the floor. (4,)"""
+    """Colour; None for the colour of the floor. (4,)"""
     name: str = "terrain"
 
     def record(self, sim: Simulation) -> TerrainData:
-        """Return the heights, and put the height field into the scene."""
-        heights, size, pos = self._checked(sim)
+        heights, size, pos = self._check_heights(sim)
         dtype = sim.data.states.pos.dtype
         record = TerrainData(
             heights=device_array(heights, dtype),
@@ -67,14 +66,13 @@ class Terrain(Plugin):
             below=drone_array(sim, 0.0, 1),
             floor=self.floor,
         )
-        _put(sim.scene, self, heights, size, pos)
+        _set_height_field(sim.scene, self, heights, size, pos)
         return record.replace(below=record.surface_at(sim.data.states.pos)[0])
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that stops drones at the ground."""
-        scope = "drone" if self._checked(sim)[0].size <= LARGEST_FUSED else "batch"
-        stop = Stage(self.stop, scope, batched=True, why=TOO_LARGE)
-        return [Placement(stop, before="increment_steps", replaces="clip_floor_pos")]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
+        stop = Stage(self.stop, scope, batched=True, why=WHY_UNFUSED)
+        return [StagePlacement(stop, before="increment_steps", replaces="clip_floor_pos")]
 
     def stop(self, data: SimData) -> SimData:
         """Stop drones at the ground: one that is below it, or on it and not rising, is set on it, at rest."""
@@ -82,7 +80,7 @@ class Terrain(Plugin):
         states = stop_below(data.states, ground + FLOOR_HEIGHT)
         return self.write(data.replace(states=states), self.read(data).replace(below=ground))
 
-    def _checked(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights, full lengths along x and y, and the middle, m."""
         given = self.heights
         is_image = isinstance(given, (str, Path))
@@ -119,8 +117,8 @@ def read_image(path: str | Path) -> np.ndarray:
     Raises:
         ConfigError: If it is no image that MuJoCo can read.
     """
-    content = read_bytes(path, MAX_FILE)
-    size = struct.unpack(">II", content[16:24]) if content[:8] == PNG and len(content) >= 24 else (0, 0)
+    content = read_bytes(path, MAX_FILE_BYTES)
+    size = struct.unpack(">II", content[16:24]) if content[:8] == PNG_SIGNATURE and len(content) >= 24 else (0, 0)
     if not 0 < size[0] * size[1] <= MAX_PIXELS:
         raise ConfigError(
             f"expected a PNG image of heights of at most {MAX_PIXELS} pixels, got {str(path)!r} of "
@@ -136,10 +134,10 @@ def read_image(path: str | Path) -> np.ndarray:
     return np.asarray(model.hfield_data, np.float64).reshape(int(model.hfield_nrow[0]), int(model.hfield_ncol[0]))
 
 
-def _put(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos: np.ndarray) -> None:
+def _set_height_field(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos: np.ndarray) -> None:
     """Put the height field into the scene, or change it where it is there already."""
     spec, lowest = scene.spec, float(heights.min())
-    rise = max(float(np.ptp(heights)), FLATTEST)
+    rise = max(float(np.ptp(heights)), MIN_HEIGHT_RANGE)
     shares = ((heights - lowest) / rise).astype(np.float32)
     field, geom = spec.hfield(plugin.name), spec.geom(plugin.name)
     if (field is None) != (geom is None):
@@ -147,7 +145,7 @@ def _put(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos
     if field is None:
         field = spec.add_hfield(name=plugin.name)
         geom = spec.worldbody.add_geom(name=plugin.name, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=plugin.name)
-    field.size = [*(size / 2), rise, DEPTH]
+    field.size = [*(size / 2), rise, BASE_THICKNESS]
     field.nrow, field.ncol = heights.shape
     field.userdata = shares.ravel()
     geom.pos = [pos[0], pos[1], pos[2] + lowest]

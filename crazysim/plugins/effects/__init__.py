@@ -6,7 +6,7 @@ from crazysim.plugins.effects.grid import Grid, load_wind_grid
 from crazysim.plugins.effects.ground import ground_at, ground_height
 from crazysim.plugins.effects.ground_effect import GroundEffect
 from crazysim.plugins.effects.latency import Latency
-from crazysim.plugins.effects.motors import MotorFailure
+from crazysim.plugins.effects.motor_failure import MotorFailure
 from crazysim.plugins.effects.randomize import Randomize
 from crazysim.plugins.effects.residual import Residual
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamics

@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.plugin import (
-    Placement,
     Plugin,
     Simulation,
+    StagePlacement,
     airframe_numbers,
     check_parameter,
     drone_array,
     parameter,
 )
 from crazysim.core.stage import stage
-from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.eager import jit_unless_traced
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, leaf
@@ -70,11 +70,11 @@ class Battery(Plugin):
     """
 
     capacity: ArrayLike | None = parameter(default=None, positive=True)
-    """Charge of the full battery, A h; None for that of the airframe's table ``[battery]``."""
+    """Charge of the full battery, A h; None for the value in the airframe's table ``[battery]``."""
     resistance: ArrayLike | None = parameter(default=None, positive=True)
-    """Internal resistance of the whole battery, ohm; None for that of the airframe's table ``[battery]``."""
+    """Internal resistance of the whole battery, ohm; None for the value in the airframe's table ``[battery]``."""
     n_cells: ArrayLike | None = parameter(default=None, low=1, high=MAX_CELLS, dtype=np.int32)
-    """Number of lithium-polymer cells in series; None for that of the airframe's table ``[battery]``, or else 1."""
+    """Number of lithium-polymer cells in series; None for the value in the airframe's table ``[battery]``, or 1."""
     efficiency: ArrayLike = parameter(default=1.0, high=1.0, positive=True)
     """Mechanical power of the propellers per electric power of the motors, above 0, up to 1."""
     base_power: ArrayLike = parameter(default=0.0, low=0.0)
@@ -91,11 +91,9 @@ class Battery(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The voltage of the motors, which the model takes to be constant."""
         return ("battery voltage",)
 
     def record(self, sim: Simulation) -> BatteryData:
-        """Return batteries with the initial charge and no load."""
         require_rotors(sim, "battery sag")
         n_cells = self.n_cells
         if n_cells is None:
@@ -112,23 +110,23 @@ class Battery(Plugin):
             BatteryData,
             charge=charge,
             voltage=open_circuit_voltage(charge, cells),
-            capacity=check_parameter(sim, "capacity", self._own(sim, "capacity"), positive=True),
-            resistance=check_parameter(sim, "resistance", self._own(sim, "resistance"), positive=True),
+            capacity=check_parameter(sim, "capacity", self._own_or_airframe_value(sim, "capacity"), positive=True),
+            resistance=check_parameter(
+                sim, "resistance", self._own_or_airframe_value(sim, "resistance"), positive=True
+            ),
             full_speed_voltage=check_parameter(sim, "full_speed_voltage", full_speed_voltage, positive=True),
             n_cells=cells,
         )
 
-    def _own(self, sim: Simulation, key: str) -> ArrayLike:
+    def _own_or_airframe_value(self, sim: Simulation, key: str) -> ArrayLike:
         """Return a setting, or else the airframes' number."""
         given = getattr(self, key)
         return airframe_numbers(sim, lambda a: a.value(f"battery.{key}", ())) if given is None else given
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that discharges the batteries."""
-        return [Placement(stage("drone")(self.discharge))]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        return [StagePlacement(stage("drone")(self.discharge))]
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with rotor commands that follow the voltage, or are limited by it."""
         battery, controls = self.read(data), controls_of(data)
         share = battery.voltage / battery.full_speed_voltage
         share = jnp.where(battery.charge > 0, jnp.where(share < 1, share, 1.0), 0.0)
@@ -151,10 +149,14 @@ class Battery(Plugin):
         empty battery supplies nothing.
         """
         battery, p, rotor_vel = self.read(data), data.params, data.states.rotor_vel
-        mechanical = jnp.sum(curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True)
+        mechanical = jnp.sum(
+            quadratic_curve(rotor_vel, p.rpm2torque) * rotor_vel * RPM_TO_RAD_S, axis=-1, keepdims=True
+        )
         power = jnp.where(mechanical > 0, mechanical, 0.0) / battery.efficiency + battery.base_power
         power = jnp.where(battery.charge > 0, power, 0.0)
-        voltage, current = under_load(power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance)
+        voltage, current = voltage_under_load(
+            power, open_circuit_voltage(battery.charge, battery.n_cells), battery.resistance
+        )
 
         # Compensated summation (Kahan 1965): a step draws some millionths of the charge, mostly lost in float32.
         drawn = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
@@ -185,7 +187,7 @@ def open_circuit_voltage(charge: Array, n_cells: Array) -> Array:
     return n_cells * (polynomial - 1.031 * jnp.exp(-35.0 * charge))
 
 
-def under_load(power: Array, open_circuit: Array, resistance: Array) -> tuple[Array, Array]:
+def voltage_under_load(power: Array, open_circuit: Array, resistance: Array) -> tuple[Array, Array]:
     """Return the voltage, V, and current, A, of a source with internal resistance that supplies a power.
 
     The upper root of ``V = V_0 - R P / V``. The source supplies ``V_0^2 / (4 R)`` at most, at half the open-circuit

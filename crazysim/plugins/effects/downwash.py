@@ -14,12 +14,18 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.others import reduce_over_others
-from crazysim.core.plugin import Placement, Plugin, Simulation, airframe_numbers, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, airframe_numbers, parameter
 from crazysim.core.stage import stage
-from crazysim.drones.estimate import AIR_DENSITY
+from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics import first_principles
-from crazysim.dynamics.rotor import curve
-from crazysim.plugins.effects.moving_air import Air, Exposed, checked_propeller_radius, require_drag, with_moving_air
+from crazysim.dynamics.rotor import quadratic_curve
+from crazysim.plugins.effects.moving_air import (
+    BodiesInAir,
+    MovingAir,
+    checked_propeller_radius,
+    require_drag,
+    with_moving_air,
+)
 from crazysim.pytree import device_array, leaf
 
 DECAY, SPREAD = 5.8, 0.094
@@ -27,7 +33,7 @@ DECAY, SPREAD = 5.8, 0.094
 Turbulent Flows, 2000, table 5.1)."""
 
 
-class DownwashData(Air):
+class DownwashData(MovingAir):
     """Velocity of the air from the other drones of its world at every drone."""
 
     diameter: Array = leaf("parameter", 1, (1,))
@@ -37,8 +43,7 @@ class DownwashData(Air):
     air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air from other drones, world frame, m/s. (n_worlds, n_drones, 3)"""
 
-    def at_drone(self, data: SimData) -> Array:
-        """Return the velocity of the air from other drones."""
+    def velocity_at_drone(self, data: SimData) -> Array:
         return self.air_vel
 
 
@@ -53,23 +58,19 @@ class Downwash(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The downwash, which the model lacks."""
         return ("downwash",)
 
     def record(self, sim: Simulation) -> DownwashData:
-        """Return still air."""
         require_drag(sim, "downwash")
         radius = checked_propeller_radius(sim, self.propeller_radius)
         # Far below a rotor the cross-section of its stream is half the rotor's disc (momentum theory).
         return self.filled(sim, DownwashData, diameter=stream_diameter(sim, radius))
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that computes the air velocity."""
-        return [Placement(stage("drone")(self.sum_jets))]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        return [StagePlacement(stage("drone")(self.sum_jets))]
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the force that the air from other drones adds to the drag."""
-        return with_moving_air(data, self.read(data).at_drone(data))
+        return with_moving_air(data, self.read(data).velocity_at_drone(data))
 
     def sum_jets(self, data: SimData) -> SimData:
         """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.
@@ -77,14 +78,14 @@ class Downwash(Plugin):
         They are added up at its load too, where the jet of the drone above counts.
         """
         record, s = self.read(data), data.states
-        bodies = {name: x for name, x in data.plugins.items() if isinstance(x, Exposed) and x.air_vel is not None}
-        places = {self.name: s.pos} | {name: x.pos for name, x in bodies.items()}
+        bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
+        positions = {self.name: s.pos} | {name: x.pos for name, x in bodies.items()}
         axis = rotation.z_axis(s.quat)
         own = jet_source(collective_thrust(data), record.diameter, record.air_density)
 
         def at_places(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
-            return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in places.items()}
+            return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in positions.items()}
 
         against = reduce_over_others(at_places, (s.pos, axis, own))
         moved = {name: x.replace(air_vel=-against[name]) for name, x in bodies.items()}
@@ -99,7 +100,7 @@ def stream_diameter(sim: Simulation, radius: Array) -> Array:
     return device_array(factor * np.asarray(radius), radius.dtype)
 
 
-def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
+def hover_jet_speed(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
     """Return the speed of the air in the jet of a hovering drone, m/s.
 
     From 2.5 drone diameters downwards the mean flow below a quadrotor is that of one round turbulent jet (Bauersfeld
@@ -127,7 +128,7 @@ def jet(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density:
 
 
 class JetSource(NamedTuple):
-    """The part of a jet's speed that does not depend on the place."""
+    """The part of a jet's speed that does not depend on the position."""
 
     strength: Array
     """``u_0 B d``, m^2/s; zero without thrust. (..., 1)"""
@@ -138,7 +139,7 @@ class JetSource(NamedTuple):
 
 
 def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
-    """Return the source of a drone's jet; the arguments are those of ``jet``."""
+    """Return the source of a drone's jet; for the arguments see ``hover_jet_speed``."""
     pushes = thrust > 0
     impulse = jnp.where(pushes, jnp.sqrt(jnp.where(pushes, thrust, 1.0) * 4 / (math.pi * air_density)), 0.0)
     return JetSource(DECAY * impulse, DECAY * diameter, 1 / diameter)
@@ -147,8 +148,8 @@ def jet_source(thrust: Array, diameter: Array, air_density: Array) -> JetSource:
 def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     """Return the speed of the air in a jet, m/s. (..., 1)
 
-    The formula of ``jet`` with one division: for ``q = s + B d`` and ``w = q / (q^2 + (sqrt(2) - 1) (r / S)^2)`` the
-    speed is ``u_0 B d q w^2``.
+    The formula of ``hover_jet_speed`` with one division: for ``q = s + B d`` and
+    ``w = q / (q^2 + (sqrt(2) - 1) (r / S)^2)`` the speed is ``u_0 B d q w^2``.
     """
     below = -rotation.dot(offset, axis)
     off_axis = offset + below * axis
@@ -175,6 +176,6 @@ def collective_thrust(data: SimData) -> Array:
     p: Any = data.params
     rotor_vel = data.states.rotor_vel
     if isinstance(p, first_principles.Params):
-        return jnp.sum(curve(rotor_vel, p.rpm2thrust), axis=-1, keepdims=True)
+        return jnp.sum(quadratic_curve(rotor_vel, p.rpm2thrust), axis=-1, keepdims=True)
     thrust = data.controls.attitude.cmd[..., 3:] if p.thrust_dyn_coef is None else rotor_vel[..., :1]
     return p.acc_coef + p.cmd_f_coef * thrust

@@ -1,4 +1,4 @@
-"""Values at the nodes of regular grids, and their interpolation at any place."""
+"""Values at the nodes of regular grids, and their interpolation at any position."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from crazysim.rotation import safe_clip
 from crazysim.storage import read_text
 from crazysim.tables import ANY_NUMBER, MAX_NUMBER, POSITIVE, read_numbers
 
-LARGEST_FUSED = 400_000
+MAX_FUSED_VALUES = 400_000
 """Most numbers of a table that a fused kernel reads; compiling the step takes 8 µs for each."""
-TOO_LARGE = f"its table has more than {LARGEST_FUSED:,} numbers"
+WHY_UNFUSED = f"its table has more than {MAX_FUSED_VALUES:,} numbers"
 """Reason why a stage that reads a table is not fused."""
-MAX_FILE = 2**30
+MAX_FILE_BYTES = 2**30
 """Largest file of a grid, bytes."""
-UNEVEN = 1e-3
+MAX_SPACING_ERROR = 1e-3
 """Largest relative difference between the distances of nodes along an axis of a regular grid."""
 
 
@@ -69,12 +69,12 @@ class Grid(NamedTuple):
 def interpolate(values: Array, position: Array) -> Array:
     """Return values between the nodes of a grid, linear along each axis (trilinear along three).
 
-    A place outside takes the value of the nearest place inside. The gradient with respect to the position is that
+    A position outside takes the value of the nearest position inside. The gradient with respect to the position is that
     within the cell, and zero outside.
 
     Args:
         values: Values at the nodes. (n_1, ..., n_d, *core)
-        position: Place in units of cells, 0 to n - 1 along each axis. (..., d)
+        position: Position in units of cells, 0 to n - 1 along each axis. (..., d)
 
     Returns:
         (..., *core)
@@ -83,9 +83,9 @@ def interpolate(values: Array, position: Array) -> Array:
     shares, nodes = [], []
     for k in range(n_axes):
         last = values.shape[k] - 1
-        place = safe_clip(position[..., k], 0.0, float(last))
-        low = jnp.clip(jnp.floor(place), 0, max(last - 1, 0))
-        share, low = place - low, low.astype(jnp.int32)
+        cells = safe_clip(position[..., k], 0.0, float(last))
+        low = jnp.clip(jnp.floor(cells), 0, max(last - 1, 0))
+        share, low = cells - low, low.astype(jnp.int32)
         nodes.append((low, jnp.minimum(low + 1, last)))
         shares.append((1 - share, share))
     core = (1,) * (values.ndim - n_axes)
@@ -101,11 +101,11 @@ def interpolate(values: Array, position: Array) -> Array:
 
 
 def is_inside(shape: tuple[int, ...], position: Array) -> Array:
-    """Return True for places within a grid.
+    """Return True for positions within a grid.
 
     Args:
         shape: Numbers of nodes along the axes. (d,)
-        position: Place in units of cells. (..., d)
+        position: Position in units of cells. (..., d)
 
     Returns:
         (...)
@@ -126,7 +126,7 @@ def load_wind_grid(path: str | Path) -> Grid:
     Raises:
         ConfigError: If the file cannot be read, a column is missing, or the points are not the nodes of a regular grid.
     """
-    header, *rows = read_text(path, MAX_FILE).splitlines() or [""]
+    header, *rows = read_text(path, MAX_FILE_BYTES).splitlines() or [""]
     names = [name.strip().strip('"') for name in header.split(",")]
     columns = [f"{kind}:{k}" for kind in ("Points", "U") for k in range(3)]
     missing = [name for name in columns if name not in names]
@@ -147,12 +147,12 @@ def load_wind_grid(path: str | Path) -> Grid:
         raise ConfigError(
             f"expected finite numbers in {str(path)!r}, got NaN, infinity or a larger one. Fill the gaps."
         )
-    axes, places = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
+    axes, indices = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
     shape = tuple(map(len, axes))
     is_full = len(table) == math.prod(shape)  # before anything of that size is allocated
     values = np.full((*shape, 3), np.nan) if is_full else np.array(np.nan)
     if is_full:
-        values[places] = table[:, 3:]
+        values[indices] = table[:, 3:]
     if np.isnan(values).any():
         raise ConfigError(
             f"expected one row for each of the {' x '.join(map(str, shape))} nodes of a regular grid in {str(path)!r}, "
@@ -161,7 +161,7 @@ def load_wind_grid(path: str | Path) -> Grid:
     spacing = []
     for axis in axes:
         steps = np.diff(axis) if len(axis) > 1 else np.ones(1)
-        if np.ptp(steps) > UNEVEN * steps.mean():
+        if np.ptp(steps) > MAX_SPACING_ERROR * steps.mean():
             raise ConfigError(
                 f"expected nodes at equal distances in {str(path)!r}, got {steps.min()} to {steps.max()} m. Resample "
                 f"the flow to an image in ParaView before the export."

@@ -1,4 +1,4 @@
-"""The ground of a world: the flat floor, or terrain, with height and normal at any place as pure functions."""
+"""The ground of a world: the flat floor, or terrain, with height and normal at any position as pure functions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jax import Array
 
 from crazysim.core.data import SimData
 from crazysim.eager import jit_unless_traced
-from crazysim.geometry.heightfield import FAR, surface
+from crazysim.geometry.heightfield import OUTSIDE_DISTANCE, surface_at
 from crazysim.pytree import PyTree, leaf, static
 
 
@@ -27,7 +27,7 @@ class TerrainData(PyTree):
 
     @jit_unless_traced()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
-        """Return height and normal of the ground at a place, whose z does not count.
+        """Return height and normal of the ground at a position; its z does not count.
 
         The surface is linear on the two triangles of each cell, as MuJoCo draws and collides it: contacts, rays and
         images have the same ground.
@@ -38,7 +38,7 @@ class TerrainData(PyTree):
         Returns:
             Height, world frame, m (..., 1), and unit normal, upwards (..., 3).
         """
-        height, normal, inside = surface(self.heights, self.half, pos - self.middle)
+        height, normal, inside = surface_at(self.heights, self.half, pos - self.middle)
         if self.floor:
             normal = jnp.where(inside[..., None], normal, jnp.asarray([0.0, 0.0, 1.0], normal.dtype))
             return jnp.where(inside, height + self.middle[2], 0.0)[..., None], normal
@@ -51,17 +51,17 @@ class TerrainData(PyTree):
             point: Position, world frame, m. (..., 3)
 
         Returns:
-            Distance, m, ``FAR`` beyond the border of a terrain that a flat floor surrounds (...), and unit normal
-            (..., 3).
+            Distance, m, ``OUTSIDE_DISTANCE`` beyond the border of a terrain that a flat floor surrounds (...), and unit
+            normal (..., 3).
         """
-        height, normal, inside = surface(self.heights, self.half, point - self.middle)
+        height, normal, inside = surface_at(self.heights, self.half, point - self.middle)
         gap = (point[..., 2] - self.middle[2] - height) * normal[..., 2]
-        return jnp.where(inside, gap, FAR) if self.floor else gap, normal
+        return jnp.where(inside, gap, OUTSIDE_DISTANCE) if self.floor else gap, normal
 
 
 @jit_unless_traced()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return height and normal of the ground at a place, whose z does not count; flat and zero without terrain.
+    """Return height and normal of the ground at a position; its z does not count; flat and zero without terrain.
 
     Where terrains overlap, the highest counts.
 
@@ -82,7 +82,7 @@ def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
 
 
 def ground_height(data: SimData, pos: Array) -> Array:
-    """Return the height of the ground at a place, m, as ``ground_at`` does. (..., 1)"""
+    """Return the height of the ground at a position, m, as ``ground_at`` does. (..., 1)"""
     return ground_at(data, pos)[0]
 
 

@@ -34,17 +34,14 @@ class GroundEffect(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The ground effect, which the model lacks."""
         return ("ground effect",)
 
     def record(self, sim: Simulation) -> GroundEffectData:
-        """Return the parameters."""
         require_rotors(sim, "ground effect")
         radius = checked_propeller_radius(sim, self.propeller_radius)
         return GroundEffectData(radius, rotor_positions(sim))
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the thrust curves at the height of each rotor."""
         record, s, p = self.read(data), data.states, data.params
         height = s.pos[..., 2:] - ground_below(data) + rotation.rotate(s.quat[..., None, :], record.rotor_pos)[..., 2]
         upright = rotation.z_axis(s.quat)[..., 2:]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim.control import Control
 from crazysim.core.data import SimData
 from crazysim.core.functional import stage_command, staged_leaves
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage, as_stages, stage
 from crazysim.errors import ConfigError
@@ -29,7 +29,7 @@ class LatencyData(PyTree):
     delay: Array = leaf("parameter", 1, (1,))
     """Steps from sending a command to its arrival. (1,)"""
     queue: Array = leaf("drone", 2)
-    """Commands of the last steps, that of step i in row i modulo n_rows. (n_worlds, n_drones, n_rows, k)"""
+    """Commands of the last steps; step i is in row i modulo n_rows. (n_worlds, n_drones, n_rows, k)"""
     arrived: Array = leaf("drone", 1)
     """Latest command that has arrived. (n_worlds, n_drones, k)"""
 
@@ -50,52 +50,51 @@ class Latency(Plugin):
     order: ClassVar[int] = -1  # a late command is limited as any other
 
     def record(self, sim: Simulation) -> LatencyData:
-        """Return a queue filled with the command that is staged now."""
-        return self._filled(sim, sim.data)
+        return self._filled_queue(sim, sim.data)
 
     def default_record(self, sim: Simulation) -> LatencyData:
-        """Return a queue filled with the command that is staged in the default data."""
-        return self._filled(sim, sim.default_data)
+        return self._filled_queue(sim, sim.default_data)
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that moves the queue, and the controller that gets the commands which have arrived."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         queue = stage("drone")(self.move_queue)
         if sim.data.controls.mode == Control.rotor_vel:
-            return [Placement(queue)]
-        name = _controller(sim)
+            return [StagePlacement(queue)]
+        name = _controller_stage(sim)
         (controller,) = as_stages({name: sim.step_pipeline[name]})
-        return [Placement(queue, before=name), Placement(self._late(controller), replaces=name, name=name)]
+        return [
+            StagePlacement(queue, before=name),
+            StagePlacement(self._delayed_controller(controller), replaces=name, name=name),
+        ]
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the rotor commands that have arrived."""
-        return _send(data, self.read(data).arrived) if data.controls.mode == Control.rotor_vel else data
+        return _with_command(data, self.read(data).arrived) if data.controls.mode == Control.rotor_vel else data
 
     def move_queue(self, data: SimData) -> SimData:
         """Put the command of one drone into its queue, and take out the one that arrives."""
         latency, step = self.read(data), data.core.steps
         length = latency.queue.shape[0]
-        queue = latency.queue.at[step % length].set(_sent(data))
+        queue = latency.queue.at[step % length].set(_staged_command(data))
         arrived = queue[(step - latency.delay[0]) % length]
         return self.write(data, latency.replace(queue=queue, arrived=arrived))
 
-    def _late(self, controller: Stage) -> Stage:
+    def _delayed_controller(self, controller: Stage) -> Stage:
         """Return a controller that gets the command that has arrived, and leaves the one that was sent staged."""
         scope: Any = controller.scope
 
         def late(data: SimData) -> SimData:
-            return _send(controller.fn(_send(data, self.read(data).arrived)), _sent(data))
+            return _with_command(controller.fn(_with_command(data, self.read(data).arrived)), _staged_command(data))
 
         return Stage(late, scope, controller.when, controller.batched, controller.__name__)
 
-    def _filled(self, sim: Simulation, data: SimData) -> LatencyData:
+    def _filled_queue(self, sim: Simulation, data: SimData) -> LatencyData:
         delay, longest = np.asarray(self.delay), self.max_delay
         longest = int(np.max(delay)) if longest is None else longest
-        steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _sent(data)
+        steps, command = check_parameter(sim, "delay", delay, (1,), 0, longest, jnp.int32), _staged_command(data)
         queue = np.repeat(np.asarray(command)[..., None, :], int(longest) + 1, axis=-2)
         return LatencyData(steps, device_array(queue, command.dtype), command)
 
 
-def _controller(sim: Simulation) -> str:
+def _controller_stage(sim: Simulation) -> str:
     """Return the name of the stage that takes over commands of the simulation's own level."""
     mode = sim.data.controls.mode.value
     for name in (f"{mode}_controller", f"commit_{mode}"):
@@ -106,12 +105,12 @@ def _controller(sim: Simulation) -> str:
     )
 
 
-def _sent(data: SimData) -> Array:
+def _staged_command(data: SimData) -> Array:
     """Return the staged command of the simulation's own level, with the feedforward of a setpoint. (..., k)"""
     return jnp.concatenate(staged_leaves(data), axis=-1)
 
 
-def _send(data: SimData, command: Array) -> SimData:
+def _with_command(data: SimData, command: Array) -> SimData:
     """Return the data with another command of the simulation's own level."""
     n = staged_leaves(data)[0].shape[-1]
     return stage_command(data, command[..., :n], command[..., n:])

@@ -17,7 +17,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
 
 
-class Exposed(PyTree):
+class BodiesInAir(PyTree):
     """Record of bodies that wind and downwash act on: one for each drone, such as its load."""
 
     pos: Array = leaf("drone", 1, (3,))
@@ -30,10 +30,10 @@ class Exposed(PyTree):
     (n_worlds, n_drones, 3)"""
 
 
-class Air(PyTree):
+class MovingAir(PyTree):
     """Record of an effect that moves the air at the drones."""
 
-    def at_drone(self, data: SimData) -> Array:
+    def velocity_at_drone(self, data: SimData) -> Array:
         """Return the velocity of the air at one drone, world frame, m/s. (3,)"""
         raise NotImplementedError
 
@@ -45,13 +45,13 @@ class Air(PyTree):
 
 def air_velocity(data: SimData) -> Array:
     """Return the velocity of the air at one drone, the sum of all effects that move it, world frame, m/s. (3,)"""
-    moved = [record.at_drone(data) for record in data.plugins.values() if isinstance(record, Air)]
+    moved = [record.velocity_at_drone(data) for record in data.plugins.values() if isinstance(record, MovingAir)]
     return sum(moved, jnp.zeros_like(data.states.vel))
 
 
 def drag_factor(data: SimData) -> Array | float:
-    """Return the factor of the drag of one drone, the product of those of all effects, 1. (1,)"""
-    return math.prod([record.drag_factor for record in data.plugins.values() if isinstance(record, Air)])
+    """Return the factor of the drag of one drone, the product over all effects, 1. (1,)"""
+    return math.prod([record.drag_factor for record in data.plugins.values() if isinstance(record, MovingAir)])
 
 
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:
@@ -99,7 +99,7 @@ def require_rotors(sim: Simulation, effect: str) -> None:
 
 
 def checked_propeller_radius(sim: Simulation, radius: ArrayLike | None) -> Array:
-    """Return the radius of propellers as ``check_parameter`` does, m; of None that of the airframes."""
+    """Return the checked radius of propellers, m; None stands for the radius of the airframes."""
     if radius is None:
         radius = airframe_numbers(sim, lambda airframe: airframe.value("shape.propeller_radius", ()))
     return check_parameter(sim, "propeller_radius", radius, positive=True)

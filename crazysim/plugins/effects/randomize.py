@@ -18,7 +18,7 @@ from crazysim.core.random import drone_key, uniform
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.effects.battery import BatteryData, open_circuit_voltage
 from crazysim.plugins.effects.latency import LatencyData
-from crazysim.plugins.effects.moving_air import Air, has_drag, require_drag, require_rotors, with_moving_air
+from crazysim.plugins.effects.moving_air import MovingAir, has_drag, require_drag, require_rotors, with_moving_air
 from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import leaf
 
@@ -28,7 +28,7 @@ RANGES = (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay")
 """Settings that are ranges of numbers."""
 
 
-class RandomizeData(Air):
+class RandomizeData(MovingAir):
     """Factors of the parameters of every drone, and the ranges that they are drawn from."""
 
     factors: Array = leaf("drone", 1)
@@ -54,12 +54,11 @@ class RandomizeData(Air):
     wind: Array | None = leaf("parameter", 1, (2,))
     """Least and largest speed of the mean wind, m/s; None without. (2,)"""
     charge: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest state of charge of a battery, 1; None for that of ``Battery``. (2,)"""
+    """Least and largest state of charge of a battery, 1; None for the setting of ``Battery``. (2,)"""
     delay: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest delay of commands, steps; None for that of ``Latency``. (2,)"""
+    """Least and largest delay of commands, steps; None for the setting of ``Latency``. (2,)"""
 
-    def at_drone(self, data: SimData) -> Array:
-        """Return the mean wind at the drone."""
+    def velocity_at_drone(self, data: SimData) -> Array:
         return jnp.zeros_like(data.states.vel) if self.air_vel is None else self.air_vel
 
     @property
@@ -155,7 +154,6 @@ class Randomize(Plugin):
         return cls(**(settings | ranges | changes))
 
     def record(self, sim: Simulation) -> RandomizeData:
-        """Return factors of one and no wind, until the first step of an episode."""
         require_rotors(sim, "randomisation of motors")
         blows = self.wind is not None
         if blows and "wind" in self.optional and not has_drag(sim):
@@ -203,24 +201,23 @@ class Randomize(Plugin):
                 )
         for name, latency in latencies.items() if self.delay is not None else ():
             batch = (sim.n_worlds, sim.n_drones)
-            if latency.delay.shape[:-1] != batch or latency.queue.shape[-2] <= self._longest:
+            if latency.delay.shape[:-1] != batch or latency.queue.shape[-2] <= self._max_delay:
                 raise ConfigError(
-                    f"expected plugin {name!r} with one delay per drone, of up to {self._longest} steps, got delay of "
-                    f"shape {latency.delay.shape} and queues of {latency.queue.shape[-2]} rows. Use "
+                    f"expected plugin {name!r} with one delay per drone, of up to {self._max_delay} steps, got delay "
+                    f"of shape {latency.delay.shape} and queues of {latency.queue.shape[-2]} rows. Use "
                     f"{self._latency(sim)}."
                 )
 
     @property
-    def _longest(self) -> int:
+    def _max_delay(self) -> int:
         """Longest delay, steps."""
         return 0 if self.delay is None else int(np.max(np.asarray(self.delay)))
 
     def _latency(self, sim: Simulation) -> str:
         """Return the expression of a ``Latency`` whose delays can be drawn."""
-        return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._longest})"
+        return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the parameters of the drone that was drawn."""
         record, p = self.read(data), data.params
         mass, inertia, torque, lag, drag = (record.factors[k : k + 1] for k in range(len(FACTORS)))
         changes = {}
@@ -240,13 +237,11 @@ class Randomize(Plugin):
         return data if record.air_vel is None else with_moving_air(data, record.air_vel)
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the factors, for critics and policies that are to be given what is drawn."""
         record = self.read(data)
         found = {"factors": record.factors, "thrust_factors": record.thrust_factors}
         return found if record.air_vel is None else found | {"air_vel": record.air_vel}
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Draw the factors of one drone for an episode."""
+    def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
         n_rotors, dtype = record.thrust_factors.shape[-1], record.factors.dtype
         u = uniform(drone_key(data, self.name), (len(FACTORS) + 5 + n_rotors,), dtype)

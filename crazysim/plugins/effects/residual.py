@@ -14,7 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter, parameter
 from crazysim.drones import Airframe
 from crazysim.dynamics import first_principles
-from crazysim.dynamics.rotor import curve, rotor_torque
+from crazysim.dynamics.rotor import quadratic_curve, rotor_torque
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, device_array, leaf
@@ -24,7 +24,7 @@ N_INPUTS = 14
 
 
 class ResidualData(PyTree):
-    """Coefficients of the force and torque, which are those of the airframe's table ``[residual]``."""
+    """Coefficients of the force and torque, as in the airframe's table ``[residual]``."""
 
     linear: Array = leaf("parameter", 2, (6, N_INPUTS))
     """Force, N, and torque, N m, in the body frame, per input. (6, 14)"""
@@ -71,7 +71,6 @@ class Residual(Plugin):
         return ("drag",) if self.linear is None else ()
 
     def record(self, sim: Simulation) -> ResidualData:
-        """Return the coefficients."""
         require_rotors(sim, "a residual")
         given = {key: getattr(self, key) for key in ("linear", "hidden", "output")}
         if (self.hidden is None) != (self.output is None) or (self.linear is None and self.hidden is not None):
@@ -81,7 +80,7 @@ class Residual(Plugin):
                 f"linear terms."
             )
         if self.linear is None:
-            given = _of_airframes(sim)
+            given = _airframe_coefficients(sim)
         n_hidden = 0 if given["hidden"] is None else np.atleast_2d(given["hidden"]).shape[-2]
 
         def checked(key: str, shape: tuple[int, int]) -> Array | None:
@@ -92,7 +91,6 @@ class Residual(Plugin):
         return ResidualData(linear, checked("hidden", (n_hidden, N_INPUTS)), checked("output", (6, n_hidden)))
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the force and torque added."""
         s = data.states
         inputs = residual_inputs(s.quat, s.vel, s.ang_vel, s.rotor_vel, data.params)
         force, torque = residual_wrench(inputs, self.read(data))
@@ -121,9 +119,9 @@ def residual_inputs(
     """
     p = params
     body_vel = rotation.rotate_inverse(quat, vel)
-    thrust = curve(rotor_vel, p.rpm2thrust)
+    thrust = quadratic_curve(rotor_vel, p.rpm2thrust)
     weight = p.mass * rotation.safe_norm(p.gravity_vec)
-    torque = rotor_torque(thrust, curve(rotor_vel, p.rpm2torque), p.L, p.mixing_matrix)
+    torque = rotor_torque(thrust, quadratic_curve(rotor_vel, p.rpm2torque), p.L, p.mixing_matrix)
     collective = jnp.sum(thrust, axis=-1, keepdims=True) / weight
     return jnp.concatenate(
         [
@@ -154,8 +152,8 @@ def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array
     return wrench[..., :3], wrench[..., 3:]
 
 
-def _of_airframes(sim: Simulation) -> dict[str, Any]:
-    """Return the coefficients of the airframes, of which all or none have a network of one size."""
+def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
+    """Return the coefficients of the airframes. Either all or none have a network, of one size."""
     lacking = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
     if lacking is not None:
         raise ConfigError(

@@ -14,10 +14,10 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin, Simulation, airframe_numbers, check_parameter, parameter
 from crazysim.drones import Airframe
-from crazysim.drones.estimate import AIR_DENSITY
+from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.inflow import blade_coefficient, ceiling_factor, disc_factor, thrust_in_flight
 from crazysim.dynamics.models import GRAVITY
-from crazysim.dynamics.rotor import RPM_TO_RAD_S, curve
+from crazysim.dynamics.rotor import RPM_TO_RAD_S, quadratic_curve
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground_effect import rotor_positions
 from crazysim.plugins.effects.moving_air import air_velocity, checked_propeller_radius, drag_factor, require_rotors
@@ -57,7 +57,7 @@ class RotorAerodynamics(Plugin):
     that of the airframe's linear drag in hover, the mean of x and y; zero for none. () or (n_worlds, n_drones)"""
     inflow: ArrayLike | None = parameter(default=None, low=0.0)
     """Loss of thrust of a hovering rotor per axial velocity and rotor speed (k_z of RotorPy), N s^2/(m rad) = kg/rad;
-    None for that of the airframe's linear drag along z in hover; zero for the thrust of still air.
+    None for the airframe's linear drag along z in hover; zero for the thrust of still air.
     () or (n_worlds, n_drones)"""
     flapping: ArrayLike = parameter(default=0.0, low=0.0)
     """Moment of flapping blades at a hub per velocity across its axis and rotor speed, which tips the drone back,
@@ -78,15 +78,13 @@ class RotorAerodynamics(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The linear drag."""
         return ("drag",)
 
     def record(self, sim: Simulation) -> RotorAerodynamicsData:
-        """Return the parameters."""
         require_rotors(sim, "rotor aerodynamics")
         radius = checked_propeller_radius(sim, self.propeller_radius)
         density = check_parameter(sim, "air_density", self.air_density, positive=True)
-        inflow = np.asarray(self._own(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
+        inflow = np.asarray(self._own_or_drag_value(sim, "inflow", lambda drag: -drag[2, 2]), np.float64)
         thrust, speed = airframe_numbers(sim, hover_thrust)[..., None], airframe_numbers(sim, hover_speed)[..., None]
         disc = np.asarray(disc_factor(radius, density), np.float64)
         blade = blade_coefficient(inflow * speed, thrust, speed, disc)
@@ -105,13 +103,13 @@ class RotorAerodynamics(Plugin):
         return self.filled(
             sim,
             RotorAerodynamicsData,
-            drag=self._own(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),
+            drag=self._own_or_drag_value(sim, "drag", lambda drag: -0.5 * (drag[0, 0] + drag[1, 1])),
             blade=check_parameter(sim, "blade", blade),
             propeller_radius=radius,
             hub_pos=self._hub_positions(sim),
         )
 
-    def _own(self, sim: Simulation, name: str, of_drag: Callable[[np.ndarray], float]) -> Array:
+    def _own_or_drag_value(self, sim: Simulation, name: str, of_drag: Callable[[np.ndarray], float]) -> Array:
         """Return a coefficient as it is set, or else from the airframes' linear drag in hover."""
         given = getattr(self, name)
         if given is None:
@@ -137,13 +135,12 @@ class RotorAerodynamics(Plugin):
         return device_array(pos + up * np.array([0.0, 0.0, 1.0]), sim.data.states.pos.dtype)
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the forces and torques of the rotors in place of the linear drag."""
         record, s, p = self.read(data), data.states, data.params
         vel = rotation.rotate_inverse(s.quat, s.vel - air_velocity(data))
         hub_vel = vel + rotation.cross(s.ang_vel, record.hub_pos)
         u, v, axial = hub_vel[..., 0], hub_vel[..., 1], hub_vel[..., 2]
         speed = RPM_TO_RAD_S * s.rotor_vel
-        static = curve(s.rotor_vel, p.rpm2thrust)
+        static = quadratic_curve(s.rotor_vel, p.rpm2thrust)
         blade, drag = drag_factor(data) * record.blade, drag_factor(data) * record.drag
         factor: Array | float = 1.0
         if record.ceiling is not None:

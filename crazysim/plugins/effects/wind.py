@@ -10,12 +10,12 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
 from crazysim.core.random import drone_key, normal
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import ground_below
-from crazysim.plugins.effects.moving_air import Air, require_drag, with_moving_air
+from crazysim.plugins.effects.moving_air import MovingAir, require_drag, with_moving_air
 from crazysim.pytree import leaf
 from crazysim.rotation import dot, safe_clip, safe_normalize
 
@@ -23,14 +23,14 @@ FOOT = 0.3048
 """Metres per foot: the low-altitude model is stated in feet."""
 LOWEST, HIGHEST = 10.0, 1000.0
 """Range of heights in which the low-altitude model holds, ft; heights outside are clipped to it."""
-GROUND = 0.01
+MIN_PROFILE_HEIGHT = 0.01
 """Height below which the wind of a power law stays the same, m: its slope would be infinite at zero."""
 MIN_AIRSPEED = 1.0
 """Airspeed at which gusts pass a drone that drifts with the mean wind, m/s. An assumption: in the model's frozen field
 the gust at such a drone would never change."""
 
 
-class WindData(Air):
+class WindData(MovingAir):
     """Velocity of the air at every drone."""
 
     velocity: Array = leaf("parameter", 1, (3,))
@@ -48,12 +48,11 @@ class WindData(Air):
     gust: Array | None = leaf("drone", 1, (3,))
     """Gust, world frame, m/s; None without gusts. (n_worlds, n_drones, 3)"""
 
-    def at_drone(self, data: SimData) -> Array:
-        """Return the wind at the drone."""
+    def velocity_at_drone(self, data: SimData) -> Array:
         return self.velocity_at(data.states.pos, ground_below(data))
 
     def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
-        """Return the mean wind at a place, above ground of some height, m (..., 1), world frame, m/s. (..., 3)"""
+        """Return the mean wind at a position, above ground of some height, m (..., 1), world frame, m/s. (..., 3)"""
         if self.reference_height is None:
             return self.velocity
         height = pos[..., 2:] - ground
@@ -62,7 +61,7 @@ class WindData(Air):
         return power_profile(height, self.reference_height, self.exponent) * self.velocity  # type: ignore[arg-type]
 
     def velocity_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
-        """Return the velocity of the air at a place, with the drone's gust, world frame, m/s. (..., 3)"""
+        """Return the velocity of the air at a position, with the drone's gust, world frame, m/s. (..., 3)"""
         mean = self.mean_at(pos, ground)
         return mean if self.gust is None else mean + self.gust
 
@@ -92,7 +91,6 @@ class Wind(Plugin):
     name: str = "wind"
 
     def record(self, sim: Simulation) -> WindData:
-        """Return the wind, with filters at rest."""
         require_drag(sim, "wind")
         if self.roughness is not None and self.exponent is not None:
             raise ConfigError(
@@ -111,20 +109,18 @@ class Wind(Plugin):
             )
         return record
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that advances the gusts, if there are any."""
-        return [] if self.speed_20ft is None else [Placement(stage("drone")(self.advance_gust))]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        return [] if self.speed_20ft is None else [StagePlacement(stage("drone")(self.advance_gust))]
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the force that the wind adds to the drag."""
-        return with_moving_air(data, self.read(data).at_drone(data))
+        return with_moving_air(data, self.read(data).velocity_at_drone(data))
 
     def advance_gust(self, data: SimData) -> SimData:
         """Advance the gust at one drone by a step."""
         wind, s = self.read(data), data.states
         ground = ground_below(data)
         mean = wind.mean_at(s.pos, ground)
-        length, deviation = low_altitude(s.pos[..., 2:] - ground, wind.speed_20ft)
+        length, deviation = low_altitude_gusts(s.pos[..., 2:] - ground, wind.speed_20ft)
         relative = s.vel - mean
         airspeed = jnp.sqrt(dot(relative, relative) + MIN_AIRSPEED**2)
         step = airspeed / (data.core.freq * length)
@@ -137,12 +133,12 @@ class Wind(Plugin):
 
         first, second = filters[:3], filters[3:]
         across = (3**0.5 * first[1:] + (1 - 3**0.5) * second) / 2**0.5
-        gust = from_wind_axes(deviation * jnp.concatenate([first[:1], across]), mean)
+        gust = wind_axes_to_world(deviation * jnp.concatenate([first[:1], across]), mean)
         return self.write(data, wind.replace(filters=filters, gust=gust))
 
 
 def wind_at(data: SimData, pos: Array) -> Array:
-    """Return the velocity of the air at a place near a drone, the sum over all ``Wind``, world frame, m/s; of one
+    """Return the velocity of the air at a position near a drone, the sum over all ``Wind``, world frame, m/s; of one
     drone. (3,)
     """
     total = jnp.zeros_like(pos)
@@ -170,18 +166,18 @@ def log_profile(height: Array, reference_height: Array, roughness: Array) -> Arr
 def power_profile(height: Array, reference_height: Array, exponent: Array) -> Array:
     """Return the ratio of the mean wind at a height to that at the reference height.
 
-    ``(z / z_ref)^alpha``, as in the normal wind profile of IEC 61400-1; heights below ``GROUND`` count as that.
+    ``(z / z_ref)^alpha``, as in the normal wind profile of IEC 61400-1; with ``MIN_PROFILE_HEIGHT`` for lower heights.
 
     Args:
         height: Height above ground, m. (..., 1)
         reference_height: Height at which the ratio is one, m. (..., 1)
         exponent: Exponent, 1. (..., 1)
     """
-    height = jnp.where(height > GROUND, height, GROUND)
+    height = jnp.where(height > MIN_PROFILE_HEIGHT, height, MIN_PROFILE_HEIGHT)
     return jnp.exp(exponent * jnp.log(height / reference_height))
 
 
-def low_altitude(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
+def low_altitude_gusts(height: Array, speed_20ft: Array) -> tuple[Array, Array]:
     """Return the scale lengths and standard deviations of gusts near the ground.
 
     MIL-F-8785C, 3.7.3.4: with h in ft, ``L_w = h``, ``L_u = L_v = h / (0.177 + 0.000823 h)^1.2``,
@@ -223,7 +219,7 @@ def shape_noise(first: Array, second: Array, noise: Array, loss: Array) -> Array
     return jnp.concatenate([new, second - loss[..., 1:] * (second - mean)], axis=-1)
 
 
-def from_wind_axes(vector: Array, velocity: Array) -> Array:
+def wind_axes_to_world(vector: Array, velocity: Array) -> Array:
     """Transform a vector from wind axes (along the mean wind, to its left, up) to the world frame. (..., 3)
 
     The axes are level, as in MIL-F-8785C at low altitude; without mean wind they are the world's.

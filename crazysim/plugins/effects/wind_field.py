@@ -9,16 +9,16 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.random import uniform, world_key
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, Grid, interpolate
-from crazysim.plugins.effects.moving_air import Air, Exposed, require_drag, with_moving_air
+from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, WHY_UNFUSED, Grid, interpolate
+from crazysim.plugins.effects.moving_air import BodiesInAir, MovingAir, require_drag, with_moving_air
 from crazysim.pytree import device_array, leaf
 
 
-class WindFieldData(Air):
+class WindFieldData(MovingAir):
     """Velocities of the air on a grid, and at every drone."""
 
     field: Array = leaf("shared", 4)
@@ -39,12 +39,11 @@ class WindFieldData(Air):
     air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
 
-    def at_drone(self, data: SimData) -> Array:
-        """Return the velocity of the air that was looked up at the drone."""
+    def velocity_at_drone(self, data: SimData) -> Array:
         return self.air_vel
 
     def velocity_at(self, pos: Array) -> Array:
-        """Return the velocity of the air at a place, world frame, m/s. (..., 3)"""
+        """Return the velocity of the air at a position, world frame, m/s. (..., 3)"""
         moved = pos - self.origin - self.offset
         moved = moved if self.shift is None else moved - self.shift
         return self.scale * interpolate(self.field, moved / self.spacing)
@@ -69,7 +68,6 @@ class WindField(Plugin):
     name: str = "wind_field"
 
     def record(self, sim: Simulation) -> WindFieldData:
-        """Return the field, and still air at the drones until the first step."""
         require_drag(sim, "wind")
         if not isinstance(self.field, Grid):
             raise ConfigError(
@@ -87,22 +85,18 @@ class WindField(Plugin):
             shift=None if self.spread is None else drone_array(sim, 0.0, 3),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that looks up the air."""
-        is_small = np.size(self.field.values) <= LARGEST_FUSED
-        return [Placement(Stage(self.look_up, "drone" if is_small else "batch", batched=True, why=TOO_LARGE))]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        is_small = np.size(self.field.values) <= MAX_FUSED_VALUES
+        return [StagePlacement(Stage(self.look_up, "drone" if is_small else "batch", batched=True, why=WHY_UNFUSED))]
 
     @property
-    def begins_episodes(self) -> bool:
-        """True if a displacement of the grid is drawn."""
+    def resets_episode(self) -> bool:
         return self.spread is not None
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the force that the wind adds to the drag."""
-        return with_moving_air(data, self.read(data).at_drone(data))
+        return with_moving_air(data, self.read(data).velocity_at_drone(data))
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Draw the displacement of the grid for an episode; of one drone."""
+    def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
         drawn = 2 * uniform(world_key(data, self.name), (3,), record.shift.dtype) - 1
         return self.write(data, record.replace(shift=record.spread * drawn))
@@ -112,6 +106,6 @@ class WindField(Plugin):
         record = self.read(data)
         data = self.write(data, record.replace(air_vel=record.velocity_at(data.states.pos)))
         fields = [x for x in data.plugins.values() if isinstance(x, WindFieldData)]
-        loads = {name: x for name, x in data.plugins.items() if isinstance(x, Exposed) and x.wind_vel is not None}
+        loads = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.wind_vel is not None}
         moved = {name: x.replace(wind_vel=sum(f.velocity_at(x.pos) for f in fields)) for name, x in loads.items()}
         return data.replace(plugins=data.plugins | moved)

@@ -13,7 +13,7 @@ ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman, "eskf": ESKF, "compl
 
 
 def find_estimator(estimator: str | Estimator) -> Estimator:
-    """Return an estimator, or that of a name on its default sensors.
+    """Return an estimator; a name stands for the estimator on its default sensors.
 
     Raises:
         ConfigError: If there is none of that name.

@@ -29,9 +29,9 @@ HEIGHT_FREQ = 100
 """Updates of the height per second, Hz (estimator_complementary.c)."""
 KEEP_HEIGHT, KEEP_VELOCITY = 0.9, 0.995
 """Share of the height, and of the velocity, that an update keeps (position_estimator_altitude.c)."""
-DEADBAND = 0.04
+CLIMB_DEADBAND = 0.04
 """Vertical acceleration that counts as zero, in units of gravity (position_estimator_altitude.c)."""
-OLDEST = 0.05
+MAX_RANGE_AGE = 0.05
 """Greatest age of a distance to the ground that is used, s (position_estimator_altitude.c)."""
 
 
@@ -82,11 +82,9 @@ class Complementary(Estimator):
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
-        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
         return Barometer, TimeOfFlight
 
     def record(self, sim: Simulation) -> ComplementaryData:
-        """Return the filter before its first step."""
         self.check_sensors(sim)
         if not self.aids or len({type(sensor) for sensor in self.aids}) < len(self.aids):
             got = [type(sensor).__name__ for sensor in self.aids]
@@ -101,7 +99,6 @@ class Complementary(Estimator):
         return self.filled(sim, ComplementaryData, quat=drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4))
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        """Return the stages of the filter by name, in their order."""
         period = freq // dividing_rate("freq", self.freq, freq)
         height_period = freq // dividing_rate("rate of the height", HEIGHT_FREQ, freq)
 
@@ -109,7 +106,7 @@ class Complementary(Estimator):
             """Update the attitude and the inertial velocity of one drone."""
             record, dt = self.read(data), period / data.core.freq
             gyro, accel = self.inertial(data)
-            quat, integral = mahony(record.quat, record.integral, gyro, accel, dt, record.kp, record.ki)
+            quat, integral = update_mahony(record.quat, record.integral, gyro, accel, dt, record.kp, record.ki)
             climb = inertial_climb(record.inertial_climb, quat, accel, dt)
             return self.write(data, record.replace(quat=quat, integral=integral, inertial_climb=climb))
 
@@ -135,8 +132,7 @@ class Complementary(Estimator):
         pos, vel = (jnp.concatenate([zero, up], axis=-1) for up in (record.height, record.climb))
         return {"pos": pos, "vel": vel, "quat": rotation.safe_normalize(record.quat, s.quat)}
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Begin at the true attitude and height of one drone."""
+    def reset_episode(self, data: SimData) -> SimData:
         s, record = data.states, self.read(data)
         up = s.vel[2:]
         return self.write(data, record.replace(quat=s.quat, height=s.pos[2:], climb=up, inertial_climb=up))
@@ -151,7 +147,7 @@ class Complementary(Estimator):
         for sensor in self.aids:
             if isinstance(sensor, TimeOfFlight):
                 distance = sensor.latest(data)
-                useful = (sensor.age(data) <= OLDEST) & (distance < sensor.read(data).max_range)
+                useful = (sensor.age(data) <= MAX_RANGE_AGE) & (distance < sensor.read(data).max_range)
                 after, over_surface = height_over_surface(height, after, distance, useful, over_surface, shift)
         return after, over_surface
 
@@ -179,7 +175,7 @@ def height_over_surface(
     return jnp.where(useful, filtered_height(height, distance, shift), held), over_surface
 
 
-def mahony(
+def update_mahony(
     quat: Array, integral: Array, gyro: Array, accel: Array, dt: float, kp: Array | float, ki: Array | float
 ) -> tuple[Array, Array]:
     """Return attitude and integral after an interval (``sensfusion6UpdateQ``).
@@ -213,5 +209,5 @@ def inertial_climb(climb: Array, quat: Array, accel: Array, dt: float) -> Array:
         dt: Length of the interval, s.
     """
     acc = rotation.matrix(quat)[2:] @ accel / GRAVITY_MAGNITUDE - 1.0
-    beyond = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - DEADBAND, 0.0)
+    beyond = jnp.sign(acc) * jnp.maximum(jnp.abs(acc) - CLIMB_DEADBAND, 0.0)
     return KEEP_VELOCITY * (climb + GRAVITY_MAGNITUDE * dt * beyond)

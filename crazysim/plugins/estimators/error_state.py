@@ -28,7 +28,7 @@ from crazysim.pytree import PyTree, leaf
 POS, VEL, ATT, GYRO = (0, 1, 2), (3, 4, 5), (6, 7, 8), (12, 13, 14)
 """Rows of the errors of position, velocity, attitude and the bias of the gyroscope."""
 N, N_BIASED = 9, 15
-"""Number of error states without biases, and with those of accelerometer and gyroscope, in this order."""
+"""Number of error states without biases, and with the biases of accelerometer and gyroscope, in this order."""
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
 """Bounds of a covariance and a variance (kalman_core.c); with biases, whose variances are smaller, an assumption."""
 EPS = 1e-6
@@ -38,7 +38,7 @@ MAX_POS, MAX_VEL = 100.0, 10.0
 (kalman_supervisor.c)."""
 SMALL_ANGLE, LARGE_ANGLE = 1e-4, 10.0
 """Smallest attitude error that is moved into the attitude, and the largest, rad (kalman_core.c)."""
-REVERSION = 0.001
+REVERSION_SHARE = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
 
@@ -66,12 +66,12 @@ def covariance(upper: Array) -> Array:
     """Return the covariance, (..., n, n), from its upper triangle, row by row. (..., n (n + 1) / 2)"""
     n = _n_errors(upper)
     # Unsigned: to signed indices JAX 0.10 adds sizes of the precision in which it indexed first, float32 or float64.
-    place = np.zeros((n, n), np.uint32)
-    place[_upper(n)] = np.arange(upper.shape[-1])
-    return upper[..., np.maximum(place, place.T)]
+    index = np.zeros((n, n), np.uint32)
+    index[_upper_triangle(n)] = np.arange(upper.shape[-1])
+    return upper[..., np.maximum(index, index.T)]
 
 
-def start(
+def initial_estimate(
     pos: Array,
     vel: Array,
     quat: Array,
@@ -91,7 +91,7 @@ def start(
         gyro_bias: Bias of the gyroscope, body frame, rad/s; None to estimate none. (3,)
     """
     variance = jnp.stack([jnp.asarray(d, pos.dtype) ** 2 for d in deviations])
-    cov = jnp.diag(variance)[_upper(len(deviations))]
+    cov = jnp.diag(variance)[_upper_triangle(len(deviations))]
     return Estimate(pos, vel, quat, jnp.zeros_like(vel), cov, accel_bias, gyro_bias)
 
 
@@ -105,7 +105,7 @@ def predict(
         accel: Specific force, body frame, m/s^2. (3,)
         gyro: Angular velocity, body frame, rad/s. (3,)
         dt: Length of the interval, s.
-        resting: Attitude to which that of a drone on the ground is drawn, (4,); None in flight.
+        resting: Attitude towards which a drone on the ground is drawn, (4,); None in flight.
         all_axes: True to use the force along all axes in flight; False for that along the z axis of the body only, as
             the firmware does, because rotors can make no other.
     """
@@ -118,7 +118,7 @@ def predict(
     att_to_pos = -to_pos @ rotation.cross_matrix(vel)
     keep_vel = identity - rotation.cross_matrix(angle)
     att_to_vel = -dt * rotation.cross_matrix(gravity)
-    turn = _turn(0.5 * angle)
+    turn = _error_rotation(0.5 * angle)
     p = covariance(estimate.cov)
     pos_rows = p[:3] + to_pos @ p[3:6] + att_to_pos @ p[6:]
     vel_rows = keep_vel @ p[3:6] + att_to_vel @ p[6:]
@@ -131,12 +131,12 @@ def predict(
     shift = dt * vel + 0.5 * dt**2 * force
     pos = rotation.matvec(rot, shift, pos) - jnp.asarray([0.0, 0.0, 0.5 * GRAVITY_MAGNITUDE * dt**2], pos.dtype)
     new_vel = vel + dt * (force - rotation.cross(gyro, vel) - gravity)
-    upper = p[_upper(N)]
-    cov = jnp.where(_is_variance(N), upper, _at_most(upper))
-    return estimate.replace(pos=pos, vel=new_vel, quat=turned(quat, angle, resting), cov=cov)
+    upper = p[_upper_triangle(N)]
+    cov = jnp.where(_is_variance(N), upper, _limit_covariances(upper))
+    return estimate.replace(pos=pos, vel=new_vel, quat=turn_attitude(quat, angle, resting), cov=cov)
 
 
-def moved(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, gravity: Array) -> Estimate:
+def propagate(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, gravity: Array) -> Estimate:
     """Return the estimate with biases after an interval, or before one where it is negative, with its covariance as is.
 
     Args:
@@ -147,7 +147,7 @@ def moved(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, grav
         gravity: Acceleration of gravity, world frame, m/s^2. (3,)
     """
     angle = dt * (gyro - estimate.gyro_bias)  # type: ignore[operator]
-    middle, end = turned(estimate.quat, 0.5 * angle), turned(estimate.quat, angle)
+    middle, end = turn_attitude(estimate.quat, 0.5 * angle), turn_attitude(estimate.quat, angle)
     acc = rotation.matvec(rotation.matrix(middle), accel - estimate.accel_bias, gravity)  # type: ignore[operator]
     vel = rotation.rotate(estimate.quat, estimate.vel)
     pos = estimate.pos + dt * vel + 0.5 * dt**2 * acc
@@ -183,8 +183,8 @@ def predict_biased(
         accel_variance: Variances of the mean specific force, m^2/s^4. (3,)
         gyro_variance: Variances of the mean angular velocity, rad^2/s^2. (3,)
     """
-    vel, after = estimate.vel, moved(estimate, accel, gyro, dt, gravity)
-    middle = turned(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
+    vel, after = estimate.vel, propagate(estimate, accel, gyro, dt, gravity)
+    middle = turn_attitude(estimate.quat, 0.5 * dt * (gyro - estimate.gyro_bias))  # type: ignore[operator]
     rot, rot_middle, rot_end = (rotation.matrix(q) for q in (estimate.quat, middle, after.quat))
 
     turn, accel_to_vel = rot_end.T @ rot, -dt * (rot_end.T @ rot_middle)
@@ -204,14 +204,14 @@ def predict_biased(
     both = -dt * by_gyro
     p = p.at[3:6, 3:6].add(vel_noise).at[3:6, 6:9].add(both).at[6:9, 3:6].add(both.T)
     p = p.at[6:9, 6:9].add(dt**2 * jnp.diag(gyro_variance))
-    return after.replace(cov=bounded(p))
+    return after.replace(cov=bound_covariance(p))
 
 
 def add_noise(estimate: Estimate, variances: Array) -> Estimate:
-    """Return the estimate with process noise, given as variances that are added to those of the errors. (n,)"""
+    """Return the estimate with process noise, given as variances that are added to the errors' variances. (n,)"""
     n, cov = variances.shape[0], estimate.cov
     variance = _is_variance(n)
-    return estimate.replace(cov=cov.at[variance].set(_variances(cov[variance] + variances, n)))
+    return estimate.replace(cov=cov.at[variance].set(_limit_variances(cov[variance] + variances, n)))
 
 
 def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, deviation: Array | float) -> Estimate:
@@ -245,7 +245,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
         pos=estimate.pos + step[:3],
         vel=estimate.vel + step[3:6],
         att_error=estimate.att_error + step[6:9],
-        cov=bounded(p),
+        cov=bound_covariance(p),
         **biases,
     )
 
@@ -260,34 +260,34 @@ def finalize(estimate: Estimate, least: float = SMALL_ANGLE) -> Estimate:
     error, p = estimate.att_error, covariance(estimate.cov)
     size = jnp.abs(error)
     moves = jnp.any(size > least) & jnp.all(size < LARGE_ANGLE)
-    turn = _turn(0.5 * jnp.where(moves, error, 0.0))
+    turn = _error_rotation(0.5 * jnp.where(moves, error, 0.0))
     p = jnp.concatenate([p[:6], turn @ p[6:9], p[9:]])
     p = jnp.concatenate([p[:, :6], p[:, 6:9] @ turn.T, p[:, 9:]], axis=1)
-    quat = jnp.where(moves, turned(estimate.quat, error), estimate.quat)
-    return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=bounded(p))
+    quat = jnp.where(moves, turn_attitude(estimate.quat, error), estimate.quat)
+    return estimate.replace(quat=quat, att_error=jnp.zeros_like(error), cov=bound_covariance(p))
 
 
-def within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
+def is_within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: float = MAX_VEL) -> Array:
     """Return True where all coordinates, m, and velocities, m/s, are within bounds, by default the firmware's. ()"""
     return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 
-def select(which: Array, one: Estimate, other: Estimate) -> Estimate:
+def select_estimate(which: Array, one: Estimate, other: Estimate) -> Estimate:
     """Return one estimate where a flag is set, and the other elsewhere."""
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), one, other)
 
 
-def bounded(p: Array) -> Array:
+def bound_covariance(p: Array) -> Array:
     """Return the upper triangle of a covariance, bounded; NaN becomes the upper bound.
 
     The firmware takes the mean of both triangles, which differ by rounding; with one, the engine computes half of them.
     """
     n = p.shape[0]
-    upper = p[_upper(n)]
-    return jnp.where(_is_variance(n), _variances(upper, n), _at_most(upper))
+    upper = p[_upper_triangle(n)]
+    return jnp.where(_is_variance(n), _limit_variances(upper, n), _limit_covariances(upper))
 
 
-def turned(quat: Array, angle: Array, resting: Array | None = None) -> Array:
+def turn_attitude(quat: Array, angle: Array, resting: Array | None = None) -> Array:
     """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
 
     A part of an attitude at rest is mixed in where one is given.
@@ -297,23 +297,23 @@ def turned(quat: Array, angle: Array, resting: Array | None = None) -> Array:
     step = jnp.concatenate([jnp.sin(half) / size * angle, jnp.cos(half)])
     quat = rotation.multiply(quat, step)
     if resting is not None:
-        quat = (1 - REVERSION) * quat + REVERSION * resting
+        quat = (1 - REVERSION_SHARE) * quat + REVERSION_SHARE * resting
     return quat / (rotation.safe_norm(quat) + EPS)
 
 
-def _at_most(covariances: Array) -> Array:
+def _limit_covariances(covariances: Array) -> Array:
     """Return covariances within their upper bound, which NaN becomes."""
     return jnp.where(covariances <= MAX_COVARIANCE, covariances, MAX_COVARIANCE)
 
 
-def _variances(variances: Array, n: int) -> Array:
+def _limit_variances(variances: Array, n: int) -> Array:
     """Return variances within their bounds, of ``n`` errors; NaN becomes the upper bound."""
     return jnp.where(variances <= MAX_COVARIANCE, jnp.maximum(variances, MIN_VARIANCE[n]), MAX_COVARIANCE)
 
 
 def _is_variance(n: int) -> np.ndarray:
     """Return True for the variances of the upper triangle of a covariance of ``n`` errors. (n (n + 1) / 2)"""
-    return np.equal(*_upper(n))
+    return np.equal(*_upper_triangle(n))
 
 
 def _n_errors(upper: Array) -> int:
@@ -322,12 +322,12 @@ def _n_errors(upper: Array) -> int:
 
 
 @functools.cache
-def _upper(n: int) -> tuple[np.ndarray, ...]:
+def _upper_triangle(n: int) -> tuple[np.ndarray, ...]:
     """Return rows and columns of the upper triangle of a matrix (n, n), row by row."""
-    return tuple([places.astype(np.uint32) for places in np.triu_indices(n)])
+    return tuple([x.astype(np.uint32) for x in np.triu_indices(n)])
 
 
-def _turn(half: Array) -> Array:
+def _error_rotation(half: Array) -> Array:
     """Return the rotation of the error of an attitude that turns by twice ``half``, to second order. (3, 3)"""
     cross = rotation.cross_matrix(half)
     return jnp.eye(3, dtype=half.dtype) - cross + 0.5 * (cross @ cross)

@@ -28,9 +28,9 @@ R = TypeVar("R", bound=PyTree)
 class ErrorStateFilter(Estimator):
     """Base class of filters with error states.
 
-    A subclass also defines ``updated`` and ``restarted``. Its record has the fields ``estimate``, ``accel`` and
-    ``gyro``, sums of the inertial measurements since the last prediction, ``used`` and ``failures``, which
-    ``record_of`` describes.
+    A subclass also defines ``update_estimate`` and ``restarted_estimate``. Its record has the fields ``estimate``,
+    ``accel`` and ``gyro``, sums of the inertial measurements since the last prediction, ``used`` and ``failures``,
+    which ``initial_record`` describes.
     """
 
     _: dataclasses.KW_ONLY
@@ -42,15 +42,15 @@ class ErrorStateFilter(Estimator):
         """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
         return cls([IMU.crazyflie(), MotionCapture()])
 
-    def updated(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
+    def update_estimate(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor."""
         raise NotImplementedError
 
     def is_valid(self, estimate: Estimate) -> Array:
         """Return True where the estimate of one drone is within its bounds. ()"""
-        return error_state.within_bounds(estimate)
+        return error_state.is_within_bounds(estimate)
 
-    def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
+    def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:
         """Return the estimate with which the filter of one drone begins again, at rest.
 
         Args:
@@ -60,7 +60,7 @@ class ErrorStateFilter(Estimator):
         """
         raise NotImplementedError
 
-    def record_of(self, sim: Simulation, kind: type[R], estimate: Estimate, **given: Any) -> R:
+    def initial_record(self, sim: Simulation, kind: type[R], estimate: Estimate, **given: Any) -> R:
         """Return the record before the first step.
 
         No measurement was ``used``: the step in which the latest one was taken is -1 for each sensor. The filter has
@@ -77,20 +77,20 @@ class ErrorStateFilter(Estimator):
         failures = device_array(np.zeros((*shape, 1)), np.int32)
         return self.filled(sim, kind, estimate=estimate, used=used, failures=failures, **given)
 
-    def predictions(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
+    def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
         """Return the steps between predictions, for ``freq`` steps per second, Hz, and when one is due."""
         period = freq // dividing_rate("freq", self.freq, freq)
         return period, lambda data: (data.core.steps + 1) % period == 0
 
-    def fusions(self) -> list[tuple[str, Stage]]:
+    def fusion_stages(self) -> list[tuple[str, Stage]]:
         """Return the stages that use the measurements of the sensors, by their names."""
-        return [(s.name, Stage(self._fuse(k, s), "drone", self._is_new(k, s))) for k, s in enumerate(self.aids)]
+        return [(s.name, Stage(self._fusion_stage(k, s), "drone", self._is_new(k, s))) for k, s in enumerate(self.aids)]
 
-    def restart(self) -> Stage:
+    def restart_stage(self) -> Stage:
         """Return the stage with which the filter begins again where its estimate left its bounds."""
         return Stage(self._begin_again, "drone", lambda data: ~self.is_valid(self.read(data).estimate))
 
-    def sample(self, data: SimData) -> SimData:
+    def add_sample(self, data: SimData) -> SimData:
         """Add the latest inertial measurement of one drone to the sums."""
         record = self.read(data)
         gyro, accel = self.inertial(data)
@@ -99,17 +99,19 @@ class ErrorStateFilter(Estimator):
     def _is_new(self, k: int, sensor: Sensor) -> Callable[[SimData], Array]:
         return lambda data: sensor.read(data).samples.taken[0] != self.read(data).used[k]
 
-    def _fuse(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
+    def _fusion_stage(self, k: int, sensor: Sensor) -> Callable[[SimData], SimData]:
         def fuse(data: SimData) -> SimData:
             """Use a new measurement of one sensor."""
             record, taken = self.read(data), sensor.read(data).samples.taken
             used = record.used.at[k].set(taken[0])
-            return self.write(data, record.replace(estimate=self.updated(sensor, data, record), used=used))
+            return self.write(data, record.replace(estimate=self.update_estimate(sensor, data, record), used=used))
 
         return fuse
 
     def _begin_again(self, data: SimData) -> SimData:
-        """Begin again with one drone at the origin, level."""
+        """Restart the filter of one drone at the origin, level."""
         record = self.read(data)
         pos, quat = jnp.zeros_like(record.estimate.pos), jnp.zeros_like(record.estimate.quat).at[3].set(1.0)
-        return self.write(data, record.replace(estimate=self.restarted(data, pos, quat), failures=record.failures + 1))
+        return self.write(
+            data, record.replace(estimate=self.restarted_estimate(data, pos, quat), failures=record.failures + 1)
+        )

@@ -18,9 +18,9 @@ from crazysim.core.stage import Stage, tick
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
-from crazysim.plugins.estimators.inertial_path import Path
-from crazysim.plugins.estimators.kalman import UPDATES as FIRMWARE
-from crazysim.plugins.sensors.barometer import EXPONENT, LAPSE, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
+from crazysim.plugins.estimators.inertial_path import InertialPath
+from crazysim.plugins.estimators.kalman import UPDATE_FNS as FIRMWARE
+from crazysim.plugins.sensors.barometer import LAPSE, PRESSURE_EXPONENT, SEA_LEVEL_TEMPERATURE, Barometer, pressure_at
 from crazysim.plugins.sensors.beacons import UWB, Lighthouse
 from crazysim.plugins.sensors.flow_deck import OpticalFlow, TimeOfFlight, range_deviation
 from crazysim.plugins.sensors.gps import GPS
@@ -31,11 +31,11 @@ from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.plugins.sensors.triad import TriadData
 from crazysim.pytree import PyTree, leaf
 
-START = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
+INITIAL_STD = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad. Assumptions; the start is the truth."""
-RESTART = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
+RESTART_STD = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
 """The same where a filter that diverged begins again. Assumptions: 10 is the root of ``error_state.MAX_COVARIANCE``."""
-LEAST = 1e-3
+MIN_STD = 1e-3
 """Least standard deviation assumed for a measurement, in m, m/s, rad or pixels, and as a share of the field for a
 magnetometer; 100 times as much, 0.1 Pa, for pressures. An assumption for sensors without noise, and for float32."""
 
@@ -63,10 +63,11 @@ class ESKF(ErrorStateFilter):
     """Error-state Kalman filter: position, velocity, attitude and biases of the ``IMU``, for any airframe.
 
     The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
-    velocity in the body frame. Its noise is that of the records of its sensors, so it has no gains to tune: densities,
-    random walk and spread of the biases of the ``IMU``, and the noise of the others. Their errors that wander or are
-    constant are treated as white noise. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``, ``Magnetometer``,
-    ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, and assumes that they are at the centre of mass.
+    velocity in the body frame. It takes its noise from the records of its sensors, so it has no gains to tune:
+    densities, random walk and spread of the biases of the ``IMU``, and the noise of the others. Their errors that
+    wander or are constant are treated as white noise. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``,
+    ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, and assumes that they are at the
+    centre of mass.
     """
 
     _: dataclasses.KW_ONLY
@@ -74,38 +75,40 @@ class ESKF(ErrorStateFilter):
     """Coordinate beyond which the estimate has diverged, m."""
     max_vel: float = setting(default=100.0, positive=True)
     """Velocity along an axis beyond which the estimate has diverged, m/s."""
-    begins_before: ClassVar[str | None] = "integration"
-    """Name of the stage in front of which an episode begins: at the state before the first step."""
+    reset_before: ClassVar[str | None] = "integration"
+    """Name of the stage before which an episode is reset: at the state before the first step."""
     name: str = "eskf"
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
-        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
-        return tuple(UPDATES)
+        return tuple(UPDATE_FNS)
 
     def record(self, sim: Simulation) -> ESKFData:
-        """Return the filter before its first step."""
         self.check_sensors(sim)
         n = error_state.N_BIASED
         level, still = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4), drone_array(sim, 0.0, 3)
         cov = drone_array(sim, 0.0, n * (n + 1) // 2)
         rows = sum(_rows_in_transit(sensor, sim.data) for sensor in self.aids)
-        paths = drone_array(sim, inertial_path.START, rows, len(inertial_path.START)) if rows else None
-        return self.record_of(sim, ESKFData, Estimate(still, still, level, still, cov, still, still), paths=paths)
+        paths = (
+            drone_array(sim, inertial_path.EMPTY_PATH_ROW, rows, len(inertial_path.EMPTY_PATH_ROW)) if rows else None
+        )
+        return self.initial_record(sim, ESKFData, Estimate(still, still, level, still, cov, still, still), paths=paths)
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        """Return the stages of the filter by name, in their order."""
-        period, is_due = self.predictions(freq)
+        period, is_due = self.prediction_schedule(freq)
         return [
-            ("sample", Stage(self.sample, "drone")),
-            ("predict", Stage(self._predict(period), "drone", is_due)),
+            ("sample", Stage(self.add_sample, "drone")),
+            ("predict", Stage(self._prediction_stage(period), "drone", is_due)),
             *(
-                (f"{sensor.name}_path", Stage(self._begin_path(sensor, period), "drone", _takes(sensor)))
+                (
+                    f"{sensor.name}_path",
+                    Stage(self._path_start_stage(sensor, period), "drone", _sampling_predicate(sensor)),
+                )
                 for sensor in self.aids
                 if sensor.is_late
             ),
-            *self.fusions(),
-            ("", self.restart()),
+            *self.fusion_stages(),
+            ("", self.restart_stage()),
         ]
 
     def inertial(self, data: SimData) -> tuple[Array, Array]:
@@ -117,27 +120,29 @@ class ESKF(ErrorStateFilter):
         return gyro, accel + 0.5 / data.core.freq * rotation.cross(gyro, accel)
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated position, attitude, velocity and angular velocity of one drone."""
         estimate = self.read(data).estimate
         quat = rotation.safe_normalize(estimate.quat, data.states.quat)
         ang_vel = self.inertial(data)[0] - estimate.gyro_bias
         return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel), "ang_vel": ang_vel}
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Begin at the true state of one drone."""
+    def reset_episode(self, data: SimData) -> SimData:
         s = data.states
-        estimate = self._started(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)
+        estimate = self._initial_estimate(data, s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
         half = 0.5 * (s.ang_vel + estimate.gyro_bias)  # type: ignore[operator]
         return self.write(data, self.read(data).replace(estimate=estimate, gyro=half))
 
-    def _started(self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]) -> Estimate:
+    def _initial_estimate(
+        self, data: SimData, pos: Array, vel: Array, quat: Array, deviations: Sequence[float]
+    ) -> Estimate:
         """Return the estimate of one drone before any measurement, with the mean biases of its sensors."""
         imu = self.imu.read(data)
-        spreads = [x for triad in (imu.accel, imu.gyro) for x in _size(triad.spread[:3], triad.instability, least=0.0)]
+        spreads = [
+            x for triad in (imu.accel, imu.gyro) for x in _combined_std(triad.spread[:3], triad.instability, least=0.0)
+        ]
         means = [rotation.rotate(imu.quat, triad.mean[:3]) for triad in (imu.accel, imu.gyro)]
-        return error_state.start(pos, vel, quat, [*deviations, *spreads], *means)
+        return error_state.initial_estimate(pos, vel, quat, [*deviations, *spreads], *means)
 
-    def _predict(self, period: int) -> Callable[[SimData], SimData]:
+    def _prediction_stage(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone; angular velocities are integrated by the trapezoidal rule."""
             record, imu, dt = self.read(data), self.imu.read(data), period / data.core.freq
@@ -150,58 +155,56 @@ class ESKF(ErrorStateFilter):
             walks = [_bias_walk(triad, dt) for triad in (imu.accel, imu.gyro)]
             estimate = error_state.add_noise(estimate, jnp.concatenate([jnp.zeros(9, accel.dtype), *walks]))
             if record.paths is not None:
-                paths = [Path.unpacked(row, jnp.zeros_like(dt)).extended(accel, gyro, dt) for row in record.paths]
-                record = record.replace(paths=jnp.stack([path.packed() for path in paths]))
+                paths = [InertialPath.from_row(row, jnp.zeros_like(dt)).extend(accel, gyro, dt) for row in record.paths]
+                record = record.replace(paths=jnp.stack([path.to_row() for path in paths]))
             return self.write(data, record.replace(estimate=estimate, accel=jnp.zeros_like(accel), gyro=half))
 
         return predict
 
-    def _begin_path(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
+    def _path_start_stage(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
         def begin_path(data: SimData) -> SimData:
-            """Begin a path where one sensor takes a measurement: back to the last prediction, for now."""
+            """Start a path where one sensor measures: back to the last prediction, for now."""
             record, (gyro, accel) = self.read(data), self.inertial(data)
             since = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
-            start = jnp.asarray(inertial_path.START, gyro.dtype)
-            back = Path.unpacked(start, jnp.zeros_like(since)).extended(accel, gyro, since).reversed().packed()
-            first, last = self._rows(sensor, data)
+            start = jnp.asarray(inertial_path.EMPTY_PATH_ROW, gyro.dtype)
+            back = InertialPath.from_row(start, jnp.zeros_like(since)).extend(accel, gyro, since).reverse().to_row()
+            first, last = self._path_rows(sensor, data)
             paths = [record.paths[:first], back[None], record.paths[first : last - 1], record.paths[last:]]
             return self.write(data, record.replace(paths=jnp.concatenate(paths)))
 
         return begin_path
 
-    def _rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
+    def _path_rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
         """Return the first row of the paths of one sensor, and that after its last one."""
         counts = [_rows_in_transit(aid, data) for aid in self.aids]
         first = sum(counts[: self.aids.index(sensor)])
         return first, first + counts[self.aids.index(sensor)]
 
-    def updated(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
+    def update_estimate(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
         """Return the estimate of one drone after the latest measurement of a sensor, used where it was taken."""
         steps, taken, gravity = data.core.steps, sensor.read(data).samples.taken[0], data.params.gravity_vec
-        period, (gyro, accel) = self.predictions(data.core.freq)[0], self.inertial(data)
+        period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
         since = (taken - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq  # the last prediction
         if not sensor.is_late:
-            then = error_state.moved(record.estimate, accel, gyro, since, gravity)
-            then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
-            return error_state.moved(then, accel, gyro, -since, gravity)
-        interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._rows(sensor, data)
+            then = error_state.propagate(record.estimate, accel, gyro, since, gravity)
+            then = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, then))
+            return error_state.propagate(then, accel, gyro, -since, gravity)
+        interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
         row, number = paths[first], (steps - taken) // interval
         for k in range(first + 1, last):
             row = jnp.where(number == k - first, paths[k], row)
-        path, estimate = Path.unpacked(row, -since), record.estimate
-        back = path.without_biases(estimate).reversed()
-        then = inertial_path.carried(estimate, back, gravity)
-        then = _finalized(UPDATES[type(sensor)](sensor, self.imu, data, then))
-        return inertial_path.carried(then, path.without_biases(then), gravity)
+        path, estimate = InertialPath.from_row(row, -since), record.estimate
+        back = path.without_biases(estimate).reverse()
+        then = inertial_path.propagate_along(estimate, back, gravity)
+        then = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, then))
+        return inertial_path.propagate_along(then, path.without_biases(then), gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:
-        """Return True where the estimate of one drone is within ``max_pos`` and ``max_vel``. ()"""
-        return error_state.within_bounds(estimate, self.max_pos, self.max_vel)
+        return error_state.is_within_bounds(estimate, self.max_pos, self.max_vel)
 
-    def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
-        """Return the estimate with which the filter of one drone begins again."""
-        return self._started(data, pos, jnp.zeros_like(pos), quat, RESTART)
+    def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:
+        return self._initial_estimate(data, pos, jnp.zeros_like(pos), quat, RESTART_STD)
 
 
 def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
@@ -210,7 +213,7 @@ def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
     return 0 if due is None else due.shape[-1]
 
 
-def _takes(sensor: Sensor) -> Callable[[SimData], Array | None]:
+def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
     """Return when a sensor takes a measurement."""
     return lambda data: tick(data, sensor.freq or data.core.freq)
 
@@ -220,63 +223,63 @@ def _bias_walk(triad: TriadData, dt: float) -> Array:
     return dt * (triad.random_walk**2 + 2 * triad.instability**2 / triad.correlation_time)
 
 
-def _finalized(estimate: Estimate) -> Estimate:
+def _finalize(estimate: Estimate) -> Estimate:
     return error_state.finalize(estimate, least=0.0)
 
 
-def _size(*deviations: Array | float, least: float = LEAST) -> Array:
+def _combined_std(*deviations: Array | float, least: float = MIN_STD) -> Array:
     """Return the standard deviation of a sum of independent errors, at least ``least``. (...)"""
     return jnp.sqrt(sum((x * x for x in deviations), jnp.asarray(least * least)))
 
 
-def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
-    estimate = _finalized(updates.update_pos(estimate, sensor.part(data, "pos"), _size(record.noise)))
-    return updates.update_quat(estimate, sensor.part(data, "quat"), _size(record.angle_noise))
+    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), _combined_std(record.noise)))
+    return updates.update_quat(estimate, sensor.part(data, "quat"), _combined_std(record.angle_noise))
 
 
-def _satellites(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_satellites(sensor: GPS, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
-    std = _size(record.noise, record.drift)
-    estimate = _finalized(updates.update_pos(estimate, sensor.part(data, "pos"), std))
-    return updates.update_vel(estimate, sensor.part(data, "vel"), _size(record.vel_noise))
+    std = _combined_std(record.noise, record.drift)
+    estimate = _finalize(updates.update_pos(estimate, sensor.part(data, "pos"), std))
+    return updates.update_vel(estimate, sensor.part(data, "vel"), _combined_std(record.vel_noise))
 
 
-def _pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_pressure(sensor: Barometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     altitude = estimate.pos[2:] + record.altitude
     predicted = pressure_at(altitude)
-    slope = -EXPONENT * LAPSE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE * altitude)
-    std = _size(record.noise, record.drift, record.offset_spread, least=100 * LEAST)
+    slope = -PRESSURE_EXPONENT * LAPSE * predicted / (SEA_LEVEL_TEMPERATURE - LAPSE * altitude)
+    std = _combined_std(record.noise, record.drift, record.offset_spread, least=100 * MIN_STD)
     error = sensor.part(data, "pressure") - predicted
     return error_state.update(estimate, error_state.POS[2:], slope, error[0], std[0])
 
 
-def _field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_field(sensor: Magnetometer, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record = sensor.read(data)
     errors, size = record.errors, rotation.safe_norm(record.field)
     noise = errors.noise * math.sqrt(0.5 / sensor.interval(data))
-    std = _size(*(x / size for x in (noise, errors.spread[:3], errors.instability)))
+    std = _combined_std(*(x / size for x in (noise, errors.spread[:3], errors.instability)))
     measured = rotation.rotate(record.quat, sensor.part(data, "field") - errors.mean[:3]) / size
     return updates.update_direction(estimate, measured, record.field / size, std)
 
 
-def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, gyro = sensor.read(data), imu.measured_states(data)["ang_vel"]
     scale, rot = sensor.interval(data) * record.scale[0], rotation.matrix(estimate.quat)
-    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _size(record.noise[0]))
+    return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, _combined_std(record.noise[0]))
 
 
-def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, distance = sensor.read(data), sensor.latest(data)
-    std = _size(record.noise + range_deviation(distance, record.far_noise))
+    std = _combined_std(record.noise + range_deviation(distance, record.far_noise))
     after = updates.update_ray(estimate, distance[0], std[0])
-    return error_state.select(distance[0] < record.max_range[0], after, estimate)
+    return error_state.select_estimate(distance[0] < record.max_range[0], after, estimate)
 
 
-def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
     record, measured = sensor.read(data), sensor.latest(data)
-    std = _size(record.noise[0])
+    std = _combined_std(record.noise[0])
     if sensor.tdoa:
         return updates.update_differences(estimate, record.anchors, measured, std)
     for k in range(measured.shape[0]):
@@ -284,19 +287,19 @@ def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate) -> Estima
     return estimate
 
 
-def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
-    rot, std = rotation.matrix(estimate.quat), {"sweep": _size(sensor.read(data).noise[0], least=0.1 * LEAST)}
+def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate) -> Estimate:
+    rot, std = rotation.matrix(estimate.quat), {"sweep": _combined_std(sensor.read(data).noise[0], least=0.1 * MIN_STD)}
     return FIRMWARE[Lighthouse](sensor, imu, data, estimate, rot, std)
 
 
-UPDATES: dict[type, Callable[..., Estimate]] = {
-    MotionCapture: _pose,
-    GPS: _satellites,
-    Barometer: _pressure,
-    Magnetometer: _field,
-    OpticalFlow: _flow,
-    TimeOfFlight: _range,
-    UWB: _beacons,
-    Lighthouse: _sweeps,
+UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
+    MotionCapture: _use_pose,
+    GPS: _use_satellites,
+    Barometer: _use_pressure,
+    Magnetometer: _use_field,
+    OpticalFlow: _use_flow,
+    TimeOfFlight: _use_range,
+    UWB: _use_beacons,
+    Lighthouse: _use_sweeps,
 }
 """Functions that update an estimate with a measurement, by the class of the sensor."""

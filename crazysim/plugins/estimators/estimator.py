@@ -11,20 +11,20 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
 from crazysim.core.stage import Stage, as_stages
 from crazysim.errors import ConfigError, short_repr
 from crazysim.plugins.sensors.imu import IMU
 from crazysim.plugins.sensors.sensor import Sensor
 
-CONTROLLERS = ("state_controller", "attitude_controller", "body_rate_controller")
+CONTROLLER_STAGES = ("state_controller", "attitude_controller", "body_rate_controller")
 """Names of the stages that read the state of a drone to control it."""
 
 
 class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
-    A subclass defines ``kinds``, ``record``, ``begin_episode``, ``filter_stages`` and ``estimated_states``. With
+    A subclass defines ``kinds``, ``record``, ``reset_episode``, ``filter_stages`` and ``estimated_states``. With
     ``control`` controllers use the estimate in place of the state, as do policies of tasks that observe measurements.
     """
 
@@ -32,8 +32,8 @@ class Estimator(Plugin):
     """Sensors: an ``IMU``, and others. ``sim.add`` needs them added before; ``Sim(estimator=...)`` adds them."""
     control: bool = True
     """True where the controllers of the simulation fly on the estimate."""
-    begins_before: ClassVar[str | None] = "increment_steps"
-    """Name of the stage in front of which an episode begins: at the state after the first step."""
+    reset_before: ClassVar[str | None] = "increment_steps"
+    """Name of the stage before which an episode is reset: at the state after the first step."""
     _: dataclasses.KW_ONLY
     name: str = "estimator"
 
@@ -55,7 +55,6 @@ class Estimator(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The state that controllers read."""
         return ("the state that controllers read",) if self.control else ()
 
     @property
@@ -72,7 +71,7 @@ class Estimator(Plugin):
         raise NotImplementedError
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimate of fields of ``data.states`` of one drone; the ``IMU`` measures those that lack."""
+        """Return the estimated fields of ``data.states`` of one drone; the ``IMU`` measures the others."""
         raise NotImplementedError
 
     @property
@@ -85,15 +84,16 @@ class Estimator(Plugin):
         """Sensors besides the inertial measurement unit."""
         return [sensor for sensor in self.sensors if not isinstance(sensor, IMU)]
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages of the filter, and the controllers that use its estimate."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         placements = [
-            Placement(stage, before="increment_steps", name=f"{self.name}_{name}" if name else self.name)
+            StagePlacement(stage, before="increment_steps", name=f"{self.name}_{name}" if name else self.name)
             for name, stage in self.filter_stages(sim.data.core.freq)
         ]
         if self.control:
-            stages = as_stages({name: s for name, s in sim.step_pipeline.items() if name in CONTROLLERS})
-            placements += [Placement(self._blind(s), replaces=s.__name__, name=s.__name__) for s in stages]
+            stages = as_stages({name: s for name, s in sim.step_pipeline.items() if name in CONTROLLER_STAGES})
+            placements += [
+                StagePlacement(self._estimate_controller(s), replaces=s.__name__, name=s.__name__) for s in stages
+            ]
         return placements
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
@@ -104,7 +104,6 @@ class Estimator(Plugin):
         return self.imu.measured_states(data) | states
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated state."""
         return self.measured_states(data)
 
     def inertial(self, data: SimData) -> tuple[Array, Array]:
@@ -132,7 +131,7 @@ class Estimator(Plugin):
                     f"expected sensor {sensor.name!r} in the simulation, got none; add it before {self.name!r}"
                 )
 
-    def _blind(self, controller: Stage) -> Stage:
+    def _estimate_controller(self, controller: Stage) -> Stage:
         """Return a controller that reads the estimate in place of the state."""
 
         def blind(data: SimData) -> SimData:

@@ -16,15 +16,15 @@ import numpy as np
 from jax import Array
 
 from crazysim import rotation
-from crazysim.plugins.estimators.error_state import Estimate, bounded, covariance, turned
+from crazysim.plugins.estimators.error_state import Estimate, bound_covariance, covariance, turn_attitude
 
-LEVEL = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+IDENTITY_QUAT = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 """Attitude without a rotation, xyzw."""
-START = np.concatenate([LEVEL, np.zeros(6, np.float32)])
+EMPTY_PATH_ROW = np.concatenate([IDENTITY_QUAT, np.zeros(6, np.float32)])
 """Row of the path of no duration. (10,)"""
 
 
-class Path(NamedTuple):
+class InertialPath(NamedTuple):
     """Motion of a body during a time, in its own frame at the start, without gravity and velocity at the start."""
 
     quat: Array
@@ -37,15 +37,15 @@ class Path(NamedTuple):
     """Duration, s; negative for a path that goes back in time. ()"""
 
     @staticmethod
-    def unpacked(row: Array, duration: Array) -> Path:
-        """Return the path whose numbers ``packed`` are in a row. (10,)"""
-        return Path(row[:4], row[4:7], row[7:], duration)
+    def from_row(row: Array, duration: Array) -> InertialPath:
+        """Return the path whose numbers ``to_row`` are in a row. (10,)"""
+        return InertialPath(row[:4], row[4:7], row[7:], duration)
 
-    def packed(self) -> Array:
+    def to_row(self) -> Array:
         """Return the numbers of the path without its duration. (10,)"""
         return jnp.concatenate([self.quat, self.vel, self.pos])
 
-    def extended(self, accel: Array, gyro: Array, dt: Array | float) -> Path:
+    def extend(self, accel: Array, gyro: Array, dt: Array | float) -> InertialPath:
         """Return the path after another interval.
 
         Args:
@@ -53,26 +53,28 @@ class Path(NamedTuple):
             gyro: Mean angular velocity as measured, body frame, rad/s. (3,)
             dt: Length of the interval, s.
         """
-        force = rotation.rotate(turned(self.quat, 0.5 * dt * gyro), accel)
+        force = rotation.rotate(turn_attitude(self.quat, 0.5 * dt * gyro), accel)
         pos = self.pos + dt * self.vel + 0.5 * dt**2 * force
-        return Path(turned(self.quat, dt * gyro), self.vel + dt * force, pos, self.duration + dt)
+        return InertialPath(turn_attitude(self.quat, dt * gyro), self.vel + dt * force, pos, self.duration + dt)
 
-    def reversed(self) -> Path:
+    def reverse(self) -> InertialPath:
         """Return the path from the end to the start."""
         back = rotation.conjugate(self.quat)
         pos = rotation.rotate(back, self.duration * self.vel - self.pos)
-        return Path(back, -rotation.rotate(back, self.vel), pos, -self.duration)
+        return InertialPath(back, -rotation.rotate(back, self.vel), pos, -self.duration)
 
-    def without_biases(self, estimate: Estimate) -> Path:
+    def without_biases(self, estimate: Estimate) -> InertialPath:
         """Return the path for measurements without the biases of an estimate, to first order in them."""
-        half, t = _half(self.quat), self.duration
+        half, t = _half_rotation(self.quat), self.duration
         rate, force = (rotation.rotate(half, x) for x in (estimate.gyro_bias, estimate.accel_bias))  # type: ignore[arg-type]
         vel, pos = self.vel - t * force, self.pos - 0.5 * t**2 * force
         vel, pos = vel - rotation.cross(rate, t * vel - pos), pos - t / 3 * rotation.cross(rate, pos)
-        return Path(rotation.multiply(turned(jnp.asarray(LEVEL, rate.dtype), -t * rate), self.quat), vel, pos, t)
+        return InertialPath(
+            rotation.multiply(turn_attitude(jnp.asarray(IDENTITY_QUAT, rate.dtype), -t * rate), self.quat), vel, pos, t
+        )
 
 
-def carried(estimate: Estimate, path: Path, gravity: Array) -> Estimate:
+def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> Estimate:
     """Return an estimate with biases at the end of a path, with the covariance of its errors there.
 
     R and v are attitude and velocity at the start, R' and v' at the end, d, u and E^T are position, velocity and
@@ -89,7 +91,7 @@ def carried(estimate: Estimate, path: Path, gravity: Array) -> Estimate:
         path: The path, without the biases of the estimate.
         gravity: Acceleration of gravity, world frame, m/s^2. (3,)
     """
-    t, rot, half = path.duration, rotation.matrix(estimate.quat), rotation.matrix(_half(path.quat))
+    t, rot, half = path.duration, rotation.matrix(estimate.quat), rotation.matrix(_half_rotation(path.quat))
     quat, speed = rotation.multiply(estimate.quat, path.quat), rotation.matvec(rot, estimate.vel)
     pos = rotation.matvec(rot, path.pos, estimate.pos + t * speed + 0.5 * t**2 * gravity)
     vel = rotation.rotate_inverse(quat, rotation.matvec(rot, path.vel, speed + t * gravity))
@@ -107,11 +109,11 @@ def carried(estimate: Estimate, path: Path, gravity: Array) -> Estimate:
         moved = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
         return jnp.concatenate([moved, back @ pushed + turn @ att, att, p[9:]])
 
-    cov = bounded(rows(rows(covariance(estimate.cov)).T))
+    cov = bound_covariance(rows(rows(covariance(estimate.cov)).T))
     return estimate.replace(pos=pos, vel=vel, quat=quat, cov=cov)
 
 
-def _half(quat: Array) -> Array:
+def _half_rotation(quat: Array) -> Array:
     """Return half of a rotation by less than a turn. (4,)"""
-    level = jnp.asarray(LEVEL, quat.dtype)
+    level = jnp.asarray(IDENTITY_QUAT, quat.dtype)
     return rotation.safe_normalize(quat + level * jnp.where(quat[3] < 0, -1.0, 1.0), level)

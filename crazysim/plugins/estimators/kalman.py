@@ -28,9 +28,9 @@ from crazysim.pytree import PyTree, device_array, leaf
 
 FIRMWARE_RATE = 1000
 """Loops of the firmware's filter in a second, each of which adds process noise, Hz (estimator_kalman.c)."""
-START = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
+INITIAL_STD = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad (kalman_core_params_defaults.h)."""
-DEVIATIONS = {
+MEASUREMENT_STD = {
     "pos": 0.01,
     "quat": 4.5e-3,
     "flow": 0.2,
@@ -44,7 +44,7 @@ DEVIATIONS = {
 distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), angle of a light plane of a station of the
 second generation, rad (lighthouse_position_est.c, sweepStdLh2)."""
 Std = Mapping[str, Array]
-"""Standard deviations by the names of ``DEVIATIONS``."""
+"""Standard deviations by the names of ``MEASUREMENT_STD``."""
 
 
 class KalmanData(PyTree):
@@ -88,57 +88,54 @@ class Kalman(ErrorStateFilter):
     gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
     """Standard deviation of angular velocities, body frame, rad/s. (3,) or (n_worlds, n_drones, 3)"""
     deviations: Mapping[str, float] = setting(default_factory=dict, positive=True)
-    """Standard deviations that differ from ``DEVIATIONS``, by its names."""
+    """Standard deviations that differ from ``MEASUREMENT_STD``, by its names."""
     name: str = "kalman"
 
     @property
     def kinds(self) -> tuple[type[Sensor], ...]:
-        """Classes of the sensors that the filter can use besides the inertial measurement unit."""
-        return tuple(UPDATES)
+        return tuple(UPDATE_FNS)
 
     def record(self, sim: Simulation) -> KalmanData:
-        """Return the filter before its first step."""
         self.check_sensors(sim)
-        if unknown := self.deviations.keys() - DEVIATIONS.keys():
-            raise ConfigError(f"expected deviations of {', '.join(DEVIATIONS)}, got {', '.join(map(repr, unknown))}")
-        deviations = DEVIATIONS | dict(self.deviations)
+        if unknown := self.deviations.keys() - MEASUREMENT_STD.keys():
+            raise ConfigError(
+                f"expected deviations of {', '.join(MEASUREMENT_STD)}, got {', '.join(map(repr, unknown))}"
+            )
+        deviations = MEASUREMENT_STD | dict(self.deviations)
         level = drone_array(sim, (0.0, 0.0, 0.0, 1.0), 4)
         still = drone_array(sim, 0.0, 3)
-        cov = np.diag(np.square(START))[np.triu_indices(error_state.N)]
-        return self.record_of(
+        cov = np.diag(np.square(INITIAL_STD))[np.triu_indices(error_state.N)]
+        return self.initial_record(
             sim,
             KalmanData,
             Estimate(still, still, level, still, drone_array(sim, cov, *cov.shape), None, None),
             previous=level,
-            deviations=device_array(np.array([deviations[name] for name in DEVIATIONS]), level.dtype),
+            deviations=device_array(np.array([deviations[name] for name in MEASUREMENT_STD]), level.dtype),
         )
 
     def filter_stages(self, freq: int) -> Sequence[tuple[str, Stage]]:
-        """Return the stages of the filter by name, in their order."""
-        period, is_due = self.predictions(freq)
+        period, is_due = self.prediction_schedule(freq)
         return [
-            ("sample", Stage(self.sample, "drone")),
-            ("predict", Stage(self._predict(period), "drone", is_due)),
+            ("sample", Stage(self.add_sample, "drone")),
+            ("predict", Stage(self._prediction_stage(period), "drone", is_due)),
             ("noise", Stage(self._add_noise, "drone")),
-            *self.fusions(),
+            *self.fusion_stages(),
             ("finalize", Stage(self._finalize, "drone", self._is_updated)),
-            ("restart", self.restart()),
+            ("restart", self.restart_stage()),
             ("", Stage(self._finish, "drone")),
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated position, attitude and velocity of one drone."""
         estimate = self.read(data).estimate
         quat = rotation.safe_normalize(estimate.quat, data.states.quat)
         return {"pos": estimate.pos, "quat": quat, "vel": rotation.rotate(quat, estimate.vel)}
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Begin at the true state of one drone."""
+    def reset_episode(self, data: SimData) -> SimData:
         s, record = data.states, self.read(data)
-        estimate = error_state.start(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, START)
+        estimate = error_state.initial_estimate(s.pos, rotation.rotate_inverse(s.quat, s.vel), s.quat, INITIAL_STD)
         return self.write(data, record.replace(estimate=estimate, previous=s.quat))
 
-    def _predict(self, period: int) -> Callable[[SimData], SimData]:
+    def _prediction_stage(self, period: int) -> Callable[[SimData], SimData]:
         def predict(data: SimData) -> SimData:
             """Predict the state of one drone from the mean of its inertial measurements."""
             record = self.read(data)
@@ -157,10 +154,9 @@ class Kalman(ErrorStateFilter):
         deviations = jnp.concatenate([dt**2 * accel, dt * accel, dt * record.gyro_noise])
         return self.write(data, record.replace(estimate=error_state.add_noise(record.estimate, loops * deviations**2)))
 
-    def updated(self, sensor: Sensor, data: SimData, record: KalmanData) -> Estimate:
-        """Return the estimate of one drone after the latest measurement of a sensor."""
-        rot, std = rotation.matrix(record.previous), dict(zip(DEVIATIONS, record.deviations, strict=True))
-        return UPDATES[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
+    def update_estimate(self, sensor: Sensor, data: SimData, record: KalmanData) -> Estimate:
+        rot, std = rotation.matrix(record.previous), dict(zip(MEASUREMENT_STD, record.deviations, strict=True))
+        return UPDATE_FNS[type(sensor)](sensor, self.imu, data, record.estimate, rot, std)
 
     def _is_updated(self, data: SimData) -> Array:
         """Return True where measurements of this step have changed the attitude of one drone. ()"""
@@ -176,30 +172,29 @@ class Kalman(ErrorStateFilter):
         record = self.read(data)
         return self.write(data, record.replace(previous=record.estimate.quat))
 
-    def restarted(self, data: SimData, pos: Array, quat: Array) -> Estimate:
-        """Return the estimate with which the filter of one drone begins again."""
-        return error_state.start(pos, jnp.zeros_like(pos), quat, START)
+    def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:
+        return error_state.initial_estimate(pos, jnp.zeros_like(pos), quat, INITIAL_STD)
 
 
-def _pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _use_pose(sensor: MotionCapture, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     estimate = updates.update_pos(estimate, sensor.part(data, "pos"), std["pos"])
     return updates.update_quat(estimate, sensor.part(data, "quat"), std["quat"])
 
 
-def _flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _use_flow(sensor: OpticalFlow, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     scale = sensor.interval(data) * sensor.read(data).scale[0]
     gyro = imu.measured_states(data)["ang_vel"]
     return updates.update_flow(estimate, rot, sensor.part(data, "flow"), gyro, scale, std["flow"])
 
 
-def _range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _use_range(sensor: TimeOfFlight, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     distance = sensor.latest(data)
     deviation = range_deviation(distance, std["range"])[0]
     after = updates.update_range(estimate, rot, distance[0], deviation)
-    return error_state.select(distance[0] < sensor.read(data).max_range[0], after, estimate)
+    return error_state.select_estimate(distance[0] < sensor.read(data).max_range[0], after, estimate)
 
 
-def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _use_beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     anchors, measured = sensor.read(data).anchors, sensor.latest(data)
     for k in range(measured.shape[0]):
         if sensor.tdoa:
@@ -209,7 +204,7 @@ def _beacons(sensor: UWB, imu: IMU, data: SimData, estimate: Estimate, rot: Arra
     return estimate
 
 
-def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
+def _use_sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot: Array, std: Std) -> Estimate:
     system = sensor.read(data)
     angle, visible, k = sensor.part(data, "angle"), sensor.part(data, "visible"), 0
     for pos, quat in zip(system.stations, system.quat, strict=True):
@@ -217,16 +212,16 @@ def _sweeps(sensor: Lighthouse, imu: IMU, data: SimData, estimate: Estimate, rot
             for plane, tilt in enumerate(SWEEP_TILTS):
                 station = pos, rotation.matrix(quat)
                 after = updates.update_sweep(estimate, rot, diode, station, tilt, angle[2 * k + plane], std["sweep"])
-                estimate = error_state.select(visible[k] > 0, after, estimate)
+                estimate = error_state.select_estimate(visible[k] > 0, after, estimate)
             k += 1
     return estimate
 
 
-UPDATES: dict[type, Callable[..., Estimate]] = {
-    MotionCapture: _pose,
-    OpticalFlow: _flow,
-    TimeOfFlight: _range,
-    UWB: _beacons,
-    Lighthouse: _sweeps,
+UPDATE_FNS: dict[type, Callable[..., Estimate]] = {
+    MotionCapture: _use_pose,
+    OpticalFlow: _use_flow,
+    TimeOfFlight: _use_range,
+    UWB: _use_beacons,
+    Lighthouse: _use_sweeps,
 }
 """Functions that use the measurements of each kind of sensor."""

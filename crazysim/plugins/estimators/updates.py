@@ -13,19 +13,19 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim import rotation
-from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate, select, update
+from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate, select_estimate, update
 
-LOWEST = 0.1
+MIN_FLOW_HEIGHT = 0.1
 """Least height that the flow is predicted for, m (mm_flow.c)."""
-LOWEST_COSINE = 0.1
+MIN_TILT_COSINE = 0.1
 """Least cosine of the tilt at which a distance to the ground is used (mm_tof.c)."""
-HALF_CONE = 0.5 * 15 * math.pi / 180
+HALF_CONE_ANGLE = 0.5 * 15 * math.pi / 180
 """Half the opening angle of the sensor's cone, rad (mm_tof.c)."""
 
 
 def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Estimate:
     """Return the estimate after a measured position, world frame, m, (3,), of a standard deviation, m. () or (3,)"""
-    for k, std in enumerate(_each(deviation)):
+    for k, std in enumerate(_per_axis(deviation)):
         estimate = update(estimate, [k], jnp.ones_like(pos[:1]), pos[k] - estimate.pos[k], std)
     return estimate
 
@@ -33,7 +33,7 @@ def update_pos(estimate: Estimate, pos: Array, deviation: Array | float) -> Esti
 def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Estimate:
     """Return the estimate after a measured velocity, world frame, m/s, (3,), of a standard deviation. () or (3,)"""
     rot = rotation.matrix(estimate.quat)
-    for k, std in enumerate(_each(deviation)):
+    for k, std in enumerate(_per_axis(deviation)):
         across = rotation.cross(estimate.vel, rot[k])  # the derivative with respect to the attitude
         predicted = rotation.dot(rot[k], estimate.vel)[0] + rotation.dot(across, estimate.att_error)[0]
         estimate = update(estimate, [*VEL, *ATT], jnp.concatenate([rot[k], across]), vel[k] - predicted, std)
@@ -41,17 +41,17 @@ def update_vel(estimate: Estimate, vel: Array, deviation: Array | float) -> Esti
 
 
 def update_direction(estimate: Estimate, direction: Array, known: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after a measured direction, such as that of a magnetic field.
+    """Return the estimate after a measured direction, such as the direction of a magnetic field.
 
     Args:
         estimate: The estimate.
-        direction: Measured direction, body frame; its length is that of ``known`` but for errors. (3,)
+        direction: Measured direction, body frame, as long as ``known`` but for errors. (3,)
         known: The direction, world frame, unit. (3,)
         deviation: Standard deviation along each axis, rad. () or (3,)
     """
     predicted = rotation.rotate_inverse(estimate.quat, known)
     slopes = rotation.cross_matrix(predicted)
-    for k, std in enumerate(_each(deviation)):
+    for k, std in enumerate(_per_axis(deviation)):
         error = direction[k] - predicted[k] - rotation.dot(slopes[k], estimate.att_error)[0]
         estimate = update(estimate, ATT, slopes[k], error, std)
     return estimate
@@ -64,7 +64,7 @@ def update_quat(estimate: Estimate, quat: Array, deviation: Array | float) -> Es
     """
     residual = rotation.multiply(rotation.conjugate(estimate.quat), quat)
     error = 2 * residual[:3] / residual[3]
-    for k, std in enumerate(_each(deviation)):
+    for k, std in enumerate(_per_axis(deviation)):
         estimate = update(estimate, [ATT[k]], jnp.ones_like(quat[:1]), error[k], std)
     return estimate
 
@@ -87,7 +87,7 @@ def update_flow(
     """
     at = estimate
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
-        height = jnp.maximum(at.pos[2], LOWEST)
+        height = jnp.maximum(at.pos[2], MIN_FLOW_HEIGHT)
         rate = rot[2, 2] / height
         turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-at.vel[k] * rate / height, rate]
         if at.gyro_bias is not None:
@@ -108,12 +108,12 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
         distance: Shortest distance within the cone of the sensor. ()
         deviation: Standard deviation of the distance, m.
     """
-    upright = rot[2, 2] > LOWEST_COSINE
+    upright = rot[2, 2] > MIN_TILT_COSINE
     cosine = jnp.where(upright, rot[2, 2], 1.0)
     tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum(1 - cosine**2, 0.0)), cosine)
-    gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE, 0.0))
+    gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE_ANGLE, 0.0))
     after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
-    return select(upright, after, estimate)
+    return select_estimate(upright, after, estimate)
 
 
 def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) -> Estimate:
@@ -125,11 +125,11 @@ def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) ->
         deviation: Standard deviation of the distance, m.
     """
     down = rotation.matrix(estimate.quat)[2]
-    sees = down[2] > LOWEST_COSINE
+    sees = down[2] > MIN_TILT_COSINE
     gain = 1 / jnp.where(sees, down[2], 1.0)
     predicted = gain * estimate.pos[2]
     h = gain * jnp.stack([jnp.ones_like(gain), predicted * down[1], -predicted * down[0]])
-    return select(sees, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate)
+    return select_estimate(sees, update(estimate, [POS[2], *ATT[:2]], h, distance - predicted, deviation), estimate)
 
 
 def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
@@ -158,7 +158,7 @@ def update_difference(
     away = (d_first > 0) & (d_second > 0)
     h = to_second / jnp.where(away, d_second, 1.0) - to_first / jnp.where(away, d_first, 1.0)
     after = update(estimate, POS, h, difference - (d_second - d_first)[0], deviation)
-    return select(away[0], after, estimate)
+    return select_estimate(away[0], after, estimate)
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
@@ -204,8 +204,8 @@ def update_sweep(
         angle: The angle of the sweep, rad. ()
         deviation: Standard deviation of the angle, rad.
     """
-    place, frame = station
-    x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - place)
+    origin, frame = station
+    x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - origin)
     tangent, squared = math.tan(tilt), x * x + y * y
     rest = squared - (z * tangent) ** 2
     sees = rest > 1e-4
@@ -214,9 +214,9 @@ def update_sweep(
     predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt(1 - ratio**2))
     q = tangent / jnp.sqrt(rest)
     h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
-    return select(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
+    return select_estimate(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
 
 
-def _each(deviation: Array | float) -> Sequence[Array | float]:
+def _per_axis(deviation: Array | float) -> Sequence[Array | float]:
     """Return the standard deviation of each of three axes."""
     return [deviation] * 3 if jnp.ndim(deviation) == 0 else [deviation[k] for k in range(3)]  # type: ignore[index]

@@ -1,9 +1,9 @@
 """Loads that hang from drones, on rods, cables and hooks or below several drones, and jets of rotors on them."""
 
-from crazysim.plugins.payloads.flatness import LoadedState, load_flat_state
 from crazysim.plugins.payloads.hook import Hook, HookData
 from crazysim.plugins.payloads.jet_table import JetTable, load_jet_table
-from crazysim.plugins.payloads.load import LoadData, direction, load_pos, load_vel
+from crazysim.plugins.payloads.load_flatness import LoadedState, load_flat_state
+from crazysim.plugins.payloads.point_load import LoadData, direction, load_pos, load_vel
 from crazysim.plugins.payloads.rotor_jet import RotorJet, RotorJetData
 from crazysim.plugins.payloads.shared import SharedLoad, SharedLoadData
 from crazysim.plugins.payloads.slung import SlungLoad

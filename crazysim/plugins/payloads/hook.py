@@ -12,24 +12,24 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import as_mask, color, setting
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError, short_repr
 from crazysim.geometry import Shape
 from crazysim.plugins.effects.ground import ground_height
-from crazysim.plugins.payloads.body import Collider, Colliding, LoadBody, rest_height
-from crazysim.plugins.payloads.link import SMALLEST_MASS, Link, couple, end_relative_motion, relative
-from crazysim.plugins.payloads.load import (
+from crazysim.plugins.payloads.colliders import Collider, CollidingPlugin, LoadBody, rest_height
+from crazysim.plugins.payloads.link import MIN_MASS, LinkParams, couple_bodies, end_relative_motion, link_geometry
+from crazysim.plugins.payloads.point_load import (
     HEAD_HEIGHT,
     HEAD_RADIUS,
     LoadData,
-    air_and_gravity,
-    hanging,
-    on_floor,
-    turned_z,
+    clip_to_floor,
+    free_acceleration,
+    hanging_state,
+    rotation_from_z,
 )
-from crazysim.plugins.payloads.slung import load_record, place_loads, upward
+from crazysim.plugins.payloads.slung import load_record, move_loads, shape_axis
 from crazysim.pytree import device_array, leaf, select_worlds
 from crazysim.rotation import dot
 
@@ -51,7 +51,7 @@ class HookData(LoadData):
     """Speed of the hook relative to the ring below which it picks up, m/s. (1,)"""
 
 
-class Hook(Colliding, Plugin):
+class Hook(CollidingPlugin, Plugin):
     """A hook on a rigid rod, with one load for each drone.
 
     With two degrees of freedom the rod swings freely. With one it turns about the body's y axis, and passes roll and
@@ -117,30 +117,30 @@ class Hook(Colliding, Plugin):
         pos = np.array(np.broadcast_to(at, load.pos.shape))
         pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
         no_clearance = device_array(np.zeros(load.clearance.shape))
-        tip_pos, tip_vel = hanging(sim.data.states, load.attach, load.length, no_clearance, False)
+        tip_pos, tip_vel = hanging_state(sim.data.states, load.attach, load.length, no_clearance, False)
         free = {name: device_array(np.zeros(load.attached.shape), bool) for name in ("attached", "grip")}
         return load.replace(
             pos=device_array(pos), vel=device_array(np.zeros_like(pos)), tip_pos=tip_pos, tip_vel=tip_vel, **free
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages of picking up and letting go, and of the floor."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return [
-            Placement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
-            Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
+            StagePlacement(Stage(self.pick_up_and_release, "drone"), "integration", name=f"{self.name}_grip"),
+            StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor"),
         ]
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-        """Return the derivative with the pull of hook and load, and their rates; of one drone."""
         load, p = self.read(data), data.params
-        falling = air_and_gravity(data, load, self.name, dt)
-        link = self._link(load)
+        falling = free_acceleration(data, load, self.name, dt)
+        link = self._link_params(load)
         free = jnp.where(
             load.attached,
-            p.gravity_vec + load.mass / (link.mass + SMALLEST_MASS) * (falling - p.gravity_vec),
+            p.gravity_vec + load.mass / (link.mass + MIN_MASS) * (falling - p.gravity_vec),
             p.gravity_vec,
         )
-        linked = couple(data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, free, dt, data.core.freq)
+        linked = couple_bodies(
+            data.states, deriv, p.mass, p.J_inv, link, load.tip_pos, load.tip_vel, free, dt, data.core.freq
+        )
         loose = load.vel if dt is None else load.vel + dt * falling
         rates = {
             "tip_pos": linked.rate,
@@ -161,8 +161,8 @@ class Hook(Colliding, Plugin):
         near = (dot(apart, apart) < load.reach**2) & (dot(speed, speed) < load.max_speed**2) & (load.mass > 0)
         picks = load.grip & ~load.attached & near[..., 0]
         held = load.replace(attached=load.grip & (load.attached | picks))
-        link = self._link(held)
-        joint = load.tip_vel + load.mass / (link.mass + SMALLEST_MASS) * speed
+        link = self._link_params(held)
+        joint = load.tip_vel + load.mass / (link.mass + MIN_MASS) * speed
         after, tip_vel = end_relative_motion(s, p.mass, p.J_inv, link, load.tip_pos, joint)
 
         def change(new: Array, old: Array) -> Array:
@@ -178,8 +178,8 @@ class Hook(Colliding, Plugin):
         load = self.read(data)
         height = jnp.where(load.attached, load.clearance, jnp.zeros_like(load.clearance))
         height = height + ground_height(data, load.tip_pos)
-        tip_pos, tip_vel = on_floor(load.tip_pos, load.tip_vel, height, load.friction)
-        pos, vel = on_floor(load.pos, load.vel, load.clearance + ground_height(data, load.pos), load.friction)
+        tip_pos, tip_vel = clip_to_floor(load.tip_pos, load.tip_vel, height, load.friction)
+        pos, vel = clip_to_floor(load.pos, load.vel, load.clearance + ground_height(data, load.pos), load.friction)
         pos, vel = jnp.where(load.attached, tip_pos, pos), jnp.where(load.attached, tip_vel, vel)
         return self.write(data, load.replace(pos=pos, vel=vel, tip_pos=tip_pos, tip_vel=tip_vel))
 
@@ -219,7 +219,7 @@ class Hook(Colliding, Plugin):
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
         height = jnp.where(load.attached[..., None], load.clearance, 0.0)
-        tip_pos, tip_vel = hanging(data.states, load.attach, load.length, height, False)
+        tip_pos, tip_vel = hanging_state(data.states, load.attach, load.length, height, False)
         tip_pos, tip_vel = select_worlds(mask, tip_pos, load.tip_pos), select_worlds(mask, tip_vel, load.tip_vel)
         on_hook = load.attached[..., None]
         new = load.replace(
@@ -230,67 +230,66 @@ class Hook(Colliding, Plugin):
         )
         return self.write(data, new)
 
-    def place(self, data: SimData) -> Objects:
+    def move_objects(self, data: SimData) -> Objects:
         """Return the scene's objects with loads and rods at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
         holds = np.ones(load.tip_pos.shape[0], bool)
-        objects = place_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring, bare=True)  # type: ignore[arg-type]
-        heads = {f"{self.name}_hook": (load.tip_pos, turned_z(-self._along(data, load)))}
+        objects = move_loads(data, self.name, load, load.tip_pos, holds, 1, self.ring, show_free_links=True)  # type: ignore[arg-type]
+        heads = {f"{self.name}_hook": (load.tip_pos, rotation_from_z(-self._rod_directions(data, load)))}
         return objects.with_poses(heads)
 
     @property
     def solid_kinds(self) -> tuple[str, ...]:
-        """Names of the objects of the scene that stand for loads and hooks, without their numbers."""
         return (self.name, f"{self.name}_hook")
 
     def colliders(self) -> tuple[Collider, ...]:
-        """Return all bodies that collide: the loads, and balls around the hooks that carry none."""
-        head = Collider(Shape("sphere", (HEAD_RADIUS,)), self.head, self.with_head_vel, self.joined_head)
+        head = Collider(Shape("sphere", (HEAD_RADIUS,)), self.head, self.with_head_vel, self.joined_head_mask)
         return (*super().colliders(), head)
 
     def body(self, data: SimData) -> LoadBody:
-        """Return the loads, with the hooks that hold them; of one drone or of one world."""
         load = self.read(data)
-        up = upward(data, load, load.tip_pos)
-        return LoadBody(load.pos - self.ring * up, turned_z(up), load.vel, load.mass + self._held(load, load.hook_mass))
+        up = shape_axis(data, load, load.tip_pos)
+        return LoadBody(
+            load.pos - self.ring * up, rotation_from_z(up), load.vel, load.mass + self._held_mass(load, load.hook_mass)
+        )
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
         """Return the data with other velocities of loads and of hooks that hold them. (..., 3)"""
         load = self.read(data)
         return self.write(data, load.replace(vel=vel, tip_vel=jnp.where(load.attached[..., None], vel, load.tip_vel)))
 
-    def joined(self, data: SimData) -> Array:
+    def joined_mask(self, data: SimData) -> Array:
         """Return True where a load is on the hook of a drone; of one world. (n_drones, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
 
     def head(self, data: SimData) -> LoadBody:
         """Return the hooks, which collide while they carry nothing; of one drone or of one world."""
         load = self.read(data)
-        up = -self._along(data, load)
+        up = -self._rod_directions(data, load)
         mass = jnp.broadcast_to(load.hook_mass, (*load.tip_pos.shape[:-1], 1))
-        return LoadBody(load.tip_pos + HEAD_HEIGHT * up, turned_z(up), load.tip_vel, mass, ~load.attached)
+        return LoadBody(load.tip_pos + HEAD_HEIGHT * up, rotation_from_z(up), load.tip_vel, mass, ~load.attached)
 
     def with_head_vel(self, data: SimData, vel: Array) -> SimData:
         """Return the data with other velocities of hooks that carry nothing. (..., 3)"""
         load = self.read(data)
         return self.write(data, load.replace(tip_vel=jnp.where(load.attached[..., None], load.tip_vel, vel)))
 
-    def joined_head(self, data: SimData) -> Array:
+    def joined_head_mask(self, data: SimData) -> Array:
         """Return True for a hook and its drone; of one world. (n_drones, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
 
     @staticmethod
-    def _along(data: SimData, load: HookData) -> Array:
+    def _rod_directions(data: SimData, load: HookData) -> Array:
         """Return the unit vectors along the rods, world frame. (..., 3)"""
-        return relative(data.states, load.tip_pos, load.tip_vel, load.attach).direction
+        return link_geometry(data.states, load.tip_pos, load.tip_vel, load.attach).direction
 
     @staticmethod
-    def _held(load: HookData, mass: Array) -> Array:
+    def _held_mass(load: HookData, mass: Array) -> Array:
         """Return a mass where the load is on the hook, else zero. (..., 1)"""
         return jnp.where(load.attached[..., None], mass, jnp.zeros_like(mass))
 
-    def _link(self, load: HookData) -> Link:
+    def _link_params(self, load: HookData) -> LinkParams:
         mass = load.hook_mass + jnp.where(load.attached, load.mass, jnp.zeros_like(load.mass))
-        return Link(load.attach, load.length, mass, load.damping, is_hinge=self.dof == 1)
+        return LinkParams(load.attach, load.length, mass, load.damping, is_hinge=self.dof == 1)

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from crazysim.errors import ConfigError
 from crazysim.tables import POSITIVE, read_numbers
 
-CENTIMETRE = 0.01
+VOXEL_EDGE = 0.01
 """Edge of a voxel of AIMotionLab's tables, m."""
-LAB_SIDE = 81
+LAB_VOXELS = 81
 """Voxels along x and y of AIMotionLab's later tables (facts of AIMotionLab-Virtual, July 2026)."""
 
 
@@ -29,7 +29,7 @@ class JetTable(NamedTuple):
     """Velocities of the air, body frame, m/s; None for none. (k, n_x, n_y, n_z, 3)"""
     origin: ArrayLike = (0.0, 0.0, 0.0)
     """Node of the smallest x, y and z, from the drone's centre of mass, body frame, m. (3,)"""
-    spacing: ArrayLike = CENTIMETRE
+    spacing: ArrayLike = VOXEL_EDGE
     """Distance between neighbouring nodes, m: () or (3,)."""
 
     @property
@@ -77,7 +77,7 @@ class JetTable(NamedTuple):
 def load_jet_table(
     folder: str | Path,
     shape: tuple[int, int, int] | None = None,
-    spacing: float = CENTIMETRE,
+    spacing: float = VOXEL_EDGE,
     origin: ArrayLike | None = None,
 ) -> JetTable:
     """Return the table in a folder of text files as AIMotionLab writes them.
@@ -120,7 +120,7 @@ def load_jet_table(
     n_rows = {len(rows) for tables in (pressure, velocity) for rows in tables.values()}
     if len(n_rows) > 1:
         raise ConfigError(f"expected the same number of rows in all files of {str(folder)!r}, got {sorted(n_rows)}")
-    dims = _dims(n_rows.pop(), shape)
+    dims = _table_shape(n_rows.pop(), shape)
     at = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else np.asarray(origin)
     return JetTable(
         speeds=np.array(speeds, np.float64),
@@ -131,11 +131,11 @@ def load_jet_table(
     ).checked()
 
 
-def _dims(n_rows: int, shape: tuple[int, int, int] | None) -> tuple[int, int, int]:
+def _table_shape(n_rows: int, shape: tuple[int, int, int] | None) -> tuple[int, int, int]:
     """Return the nodes along x, y and z of a table with some number of rows."""
     side = round(n_rows ** (1 / 3))
     if shape is None:
-        shape = (side, side, side) if side**3 == n_rows else (LAB_SIDE, LAB_SIDE, n_rows // LAB_SIDE**2)
+        shape = (side, side, side) if side**3 == n_rows else (LAB_VOXELS, LAB_VOXELS, n_rows // LAB_VOXELS**2)
     if len(shape) != 3 or int(np.prod(shape)) != n_rows:
         raise ConfigError(f"expected {' x '.join(map(str, shape))} rows, got {n_rows}. Use shape=(n_x, n_y, n_z).")
     return tuple(map(int, shape))  # type: ignore[return-value]

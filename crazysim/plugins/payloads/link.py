@@ -24,22 +24,22 @@ from crazysim import rotation
 from crazysim.core.data import SimState, SimStateDeriv
 from crazysim.rotation import add_cross, cross, dot, matvec
 
-SMALLEST_MASS = 1e-12
+MIN_MASS = 1e-12
 """Summand of denominators that vanish where both mass and damping are zero, kg."""
-LENGTHLESS = 1e-20
+MIN_SQUARED_LENGTH = 1e-20
 """Summand of the squared distance, m^2, by which the direction of a link without length is zero."""
 BOUNCE_SPEED = 0.1
 """Speed below which a cable that becomes taut does not bounce, m/s."""
 CORRECTION, MOST_CORRECTION = 50.0, 0.5
 """Rate at which a scheme of higher order removes errors in length, 1/s: the same at all rates of steps, which the order
 of the scheme needs. No step removes a larger share than the second."""
-SLACK = 1e9
+SLACK_ACCELERATION = 1e9
 """Acceleration that no tension of a slack cable outweighs, m/s^2."""
-BAND = 1e-4
+TAUT_BAND = 1e-4
 """Relative slack up to which a cable counts as taut: 0.04 mm of 0.4 m."""
 
 
-class Link(NamedTuple):
+class LinkParams(NamedTuple):
     """Parameters of a link."""
 
     attach: Array | None
@@ -60,7 +60,7 @@ class Link(NamedTuple):
     """True if the link turns about the body's y axis only."""
 
 
-class Relative(NamedTuple):
+class LinkGeometry(NamedTuple):
     """Geometry of a link at an instant, world frame unless noted."""
 
     rot: Array
@@ -77,7 +77,7 @@ class Relative(NamedTuple):
     """Velocity of the tip relative to the attachment, m/s. (3,)"""
 
 
-def relative(s: SimState, pos: Array, vel: Array, attach: Array | None) -> Relative:
+def link_geometry(s: SimState, pos: Array, vel: Array, attach: Array | None) -> LinkGeometry:
     """Return the geometry of the link from a body to a tip."""
     rot, arm = rotation.matrix(s.quat), None
     offset, rel_vel = pos - s.pos, vel - s.vel
@@ -85,12 +85,12 @@ def relative(s: SimState, pos: Array, vel: Array, attach: Array | None) -> Relat
         arm = matvec(rot, attach)
         offset, rel_vel = offset - arm, matvec(rot, -cross(s.ang_vel, attach), rel_vel)
     square = dot(offset, offset)
-    inverse = lax.rsqrt(square + LENGTHLESS)
-    return Relative(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
+    inverse = lax.rsqrt(square + MIN_SQUARED_LENGTH)
+    return LinkGeometry(rot, arm, offset, square * inverse, offset * inverse, rel_vel)
 
 
-class Linked(NamedTuple):
-    """Result of ``couple``."""
+class LinkedMotion(NamedTuple):
+    """Result of ``couple_bodies``."""
 
     deriv: SimStateDeriv
     """Derivative of the body under the reaction of the link."""
@@ -100,7 +100,7 @@ class Linked(NamedTuple):
     """Acceleration of the tip, m/s^2. (3,)"""
 
 
-class Pull(NamedTuple):
+class UnitPull(NamedTuple):
     """A unit force on the tip along a direction, and the same backwards on the body."""
 
     direction: Array
@@ -111,23 +111,23 @@ class Pull(NamedTuple):
     """Angular acceleration of the body, body frame, 1/(kg m). (3,)"""
 
     @staticmethod
-    def create(direction: Array, rot: Array, J_inv: Array, point: Array | None) -> Pull:
+    def create(direction: Array, rot: Array, J_inv: Array, point: Array | None) -> UnitPull:
         """Return the pull at a point of the body, from its centre of mass, body frame, m; None for there."""
         if point is None:
-            return Pull(direction, None, None)
-        lever = cross(point, to_body(rot, direction))
-        return Pull(direction, lever, matvec(J_inv, lever))
+            return UnitPull(direction, None, None)
+        lever = cross(point, to_body_frame(rot, direction))
+        return UnitPull(direction, lever, matvec(J_inv, lever))
 
-    def response(self, other: Pull, mass: Array) -> Array:
+    def response(self, other: UnitPull, mass: Array) -> Array:
         """Return the acceleration of the body at this pull, along it, under the other. (1,)"""
         along = dot(self.direction, other.direction) / mass
         return along if self.lever is None or other.turn is None else along + dot(self.lever, other.turn)
 
 
-def couple(
-    s: SimState, deriv: SimStateDeriv, mass: Array, J_inv: Array, link: Link, pos: Array, vel: Array, free_acc: Array,
-    dt: float | None, freq: int,
-) -> Linked:  # fmt: skip
+def couple_bodies(
+    s: SimState, deriv: SimStateDeriv, mass: Array, J_inv: Array, link: LinkParams, pos: Array, vel: Array,
+    free_acc: Array, dt: float | None, freq: int,
+) -> LinkedMotion:  # fmt: skip
     """Return the derivative of a body and a tip that a link joins.
 
     Schemes of order 1 get the mean over a step. Then the impulse that ends all relative motion along the link is part
@@ -148,19 +148,19 @@ def couple(
         dt: Duration of the step, s; None for the derivative at an instant.
         freq: Steps per second, Hz.
     """
-    r, m = relative(s, pos, vel, link.attach), link.mass
+    r, m = link_geometry(s, pos, vel, link.attach), link.mass
     out = dot(r.direction, r.vel)
     attach_acc = acceleration_at(s, deriv, r.rot, link.attach, 1.0 if dt is None else 0.5)
     rel_acc = free_acc - attach_acc
 
-    first = Pull.create(r.direction, r.rot, J_inv, link.attach)
+    first = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
     # Of equal directions: their product is 1 but for rounding.
     share = m / mass if first.lever is None or first.turn is None else m / mass + m * dot(first.lever, first.turn)
     rhs = dot(r.direction, rel_acc) + (1.0 if dt is None else 0.5) / link.length * (dot(r.vel, r.vel) - out * out)
-    rhs = rhs + _radial(r, out, rhs, link, dt, freq)
+    rhs = rhs + _radial_term(r, out, rhs, link, dt, freq)
     pulls = [first]
     if link.is_hinge:
-        second, rhs_2 = _hinge(s, deriv, r, rel_acc, J_inv, link, dt, freq)
+        second, rhs_2 = _hinge_pull(s, deriv, r, rel_acc, J_inv, link, dt, freq)
         cross_share = dot(first.direction, second.direction) + m * first.response(second, mass)
         share_2 = m * second.response(second, mass)
         inverse = 1 / ((1 + share) * (1 + share_2) - cross_share * cross_share)
@@ -174,7 +174,7 @@ def couple(
         tensions = [jnp.where(link.holds, t, 0.0) for t in tensions]
     damping = None
     if link.damping is not None:  # it pulls against the swing across the link
-        rate, swing = _damping(link, dt, freq), _swing(s, r)[1]
+        rate, swing = _damping_rate(link, dt, freq), _swing_velocities(s, r)[1]
         damping = rate * swing
         tensions[0] = tensions[0] - rate * out
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
@@ -184,19 +184,19 @@ def couple(
     if damping is not None:
         pull = pull + damping
         # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
-        torque = to_body(r.rot, cross(pos - s.pos, pull))
-        turned = _turned(deriv, m * J_inv, torque, dt)
+        torque = to_body_frame(r.rot, cross(pos - s.pos, pull))
+        turned = _with_torque(deriv, m * J_inv, torque, dt)
     elif any(p.turn is not None for p in pulls):
         turns = [m * t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
-        turned = _turned(deriv, None, sum(turns[1:], turns[0]), dt)
+        turned = _with_torque(deriv, None, sum(turns[1:], turns[0]), dt)
     tip_acc = free_acc - pull
     after = turned.replace(acc=deriv.acc + share * pull)
     after = after if dt is None else after.replace(vel=deriv.vel + dt * share * pull)
     rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
-    return Linked(after, rate, tip_acc)
+    return LinkedMotion(after, rate, tip_acc)
 
 
-def _turned(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
+def _with_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
     """Return a derivative with the angular acceleration ``factor @ torque`` added, and its share in the velocity."""
     if factor is None:
         turned = deriv.replace(ang_acc=deriv.ang_acc + torque)
@@ -205,7 +205,7 @@ def _turned(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float
     return turned if dt is None else turned.replace(ang_vel=matvec(dt * factor, torque, deriv.ang_vel))
 
 
-def to_body(rot: Array, vector: Array) -> Array:
+def to_body_frame(rot: Array, vector: Array) -> Array:
     """Return a world vector in the frame of a body. (3,)"""
     return matvec(jnp.swapaxes(rot, -1, -2), vector)
 
@@ -218,18 +218,18 @@ def acceleration_at(s: SimState, deriv: SimStateDeriv, rot: Array, point: Array 
     return matvec(rot, add_cross(centripetal, deriv.ang_acc, point), deriv.acc)
 
 
-def _swing(s: SimState, r: Relative) -> tuple[Array, Array]:
+def _swing_velocities(s: SimState, r: LinkGeometry) -> tuple[Array, Array]:
     """Return the body's angular velocity, world frame, and the velocity of the tip relative to the turning body."""
     ang_vel = matvec(r.rot, s.ang_vel)
     return ang_vel, add_cross(r.vel, r.offset, ang_vel)
 
 
-def correction(freq: int) -> float:
+def correction_rate(freq: int) -> float:
     """Return the rate at which a scheme of higher order removes errors in length, 1/s."""
     return min(CORRECTION, MOST_CORRECTION * freq)
 
 
-def decay(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:
+def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:
     """Return the deceleration by a linear drag over the speed, 1/s, which cannot reverse a motion in a step. (1,)
 
     In a step of a scheme of order 1 it is implicit in time. The derivative at an instant is exact up to a rate of one
@@ -242,28 +242,28 @@ def decay(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array
         freq: Steps per second, Hz.
     """
     heavy = jnp.maximum(mass, coefficient / freq) if dt is None else mass + coefficient / freq
-    return coefficient / (heavy + SMALLEST_MASS)
+    return coefficient / (heavy + MIN_MASS)
 
 
-def _damping(link: Link, dt: float | None, freq: int) -> Array:
+def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
     """Return the deceleration of the tip by the damped joint over its speed of swing, 1/s. (1,)"""
-    rate = decay(link.damping / (link.length * link.length), link.mass, dt, freq)  # type: ignore[operator]
+    rate = drag_rate(link.damping / (link.length * link.length), link.mass, dt, freq)  # type: ignore[operator]
     return rate if link.holds is None else jnp.where(link.holds, rate, 0.0)
 
 
-def _radial(r: Relative, out: Array, free: Array, link: Link, dt: float | None, freq: int) -> Array:
+def _radial_term(r: LinkGeometry, out: Array, free: Array, link: LinkParams, dt: float | None, freq: int) -> Array:
     """Return the summand of the tension, before it is shared, that ends relative motion along the link."""
     if dt is None:
         if not link.is_cable:
-            return 2 * correction(freq) * out
+            return 2 * correction_rate(freq) * out
         # A faster tip gets the impulse of ``end_relative_motion`` in front of the next step.
-        is_taut = (r.distance > (1 - BAND) * link.length) & (out < BOUNCE_SPEED)
-        return jnp.where(is_taut, 2 * correction(freq) * out, -SLACK)
+        is_taut = (r.distance > (1 - TAUT_BAND) * link.length) & (out < BOUNCE_SPEED)
+        return jnp.where(is_taut, 2 * correction_rate(freq) * out, -SLACK_ACCELERATION)
     if not link.is_cable:
         return freq * out
     # Within the band a cable is taut, and smooth in its parameters like a rod.
     slack = link.length - r.distance
-    gap = jnp.where(slack > BAND * link.length, freq * slack, 0.0)
+    gap = jnp.where(slack > TAUT_BAND * link.length, freq * slack, 0.0)
     if link.restitution is None:
         return freq * (out - gap)
     # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
@@ -273,31 +273,31 @@ def _radial(r: Relative, out: Array, free: Array, link: Link, dt: float | None, 
     return freq * (out - jnp.where(bounces, -back, gap))
 
 
-def _hinge(
-    s: SimState, deriv: SimStateDeriv, r: Relative, rel_acc: Array, J_inv: Array, link: Link, dt: float | None,
-    freq: int,
-) -> tuple[Pull, Array]:  # fmt: skip
+def _hinge_pull(
+    s: SimState, deriv: SimStateDeriv, r: LinkGeometry, rel_acc: Array, J_inv: Array, link: LinkParams,
+    dt: float | None, freq: int,
+) -> tuple[UnitPull, Array]:  # fmt: skip
     """Return the pull that keeps the tip in the body's x-z plane, and the relative acceleration that it prevents."""
     y = r.rot[..., 1]
-    ang_vel, swing = _swing(s, r)
-    offset = to_body(r.rot, r.offset)
-    pull = Pull.create(y, r.rot, J_inv, offset if link.attach is None else offset + link.attach)
+    ang_vel, swing = _swing_velocities(s, r)
+    offset = to_body_frame(r.rot, r.offset)
+    pull = UnitPull.create(y, r.rot, J_inv, offset if link.attach is None else offset + link.attach)
     turning = matvec(r.rot, cross(deriv.ang_acc, offset))
     coriolis = cross(ang_vel, cross(ang_vel, r.offset) - 2 * r.vel)
     aside = dot(y, swing)
-    end = freq * aside if dt is not None else 2 * correction(freq) * aside
+    end = freq * aside if dt is not None else 2 * correction_rate(freq) * aside
     return pull, dot(y, rel_acc - turning + (1.0 if dt is None else 0.5) * coriolis) + end
 
 
 def _tip_rate(
-    s: SimState, deriv: SimStateDeriv, r: Relative, link: Link, vel: Array, tip_acc: Array, attach_acc: Array,
+    s: SimState, deriv: SimStateDeriv, r: LinkGeometry, link: LinkParams, vel: Array, tip_acc: Array, attach_acc: Array,
     dt: float | None, freq: int,
 ) -> Array:  # fmt: skip
     """Return the rate of the tip's position, which removes errors in length, m/s. (3,)"""
     holds, stretch = link.holds, r.distance - link.length
     if link.is_cable:
-        stretch = jnp.where(stretch > -BAND * link.length, stretch, 0.0)
-    share = freq if dt is not None else correction(freq)
+        stretch = jnp.where(stretch > -TAUT_BAND * link.length, stretch, 0.0)
+    share = freq if dt is not None else correction_rate(freq)
     share = share if holds is None else jnp.where(holds, share, 0.0)
     rate = vel if dt is None else vel + dt * tip_acc  # as the integrator has it: computed once
     rate = rate - share * stretch * r.direction
@@ -315,7 +315,7 @@ def _tip_rate(
 
 
 def end_relative_motion(
-    s: SimState, mass: Array, J_inv: Array, link: Link, pos: Array, vel: Array
+    s: SimState, mass: Array, J_inv: Array, link: LinkParams, pos: Array, vel: Array
 ) -> tuple[SimState, Array]:
     """Return the body and the tip's velocity after the impulse that ends relative motion along the link.
 
@@ -330,13 +330,13 @@ def end_relative_motion(
         pos: Position of the tip, world frame, m. (3,)
         vel: Velocity of the tip, world frame, m/s. (3,)
     """
-    r = relative(s, pos, vel, link.attach)
+    r = link_geometry(s, pos, vel, link.attach)
     out = dot(r.direction, r.vel)
-    pull = Pull.create(r.direction, r.rot, J_inv, link.attach)
+    pull = UnitPull.create(r.direction, r.rot, J_inv, link.attach)
     change = out / (1 + link.mass * pull.response(pull, mass))
     if link.is_cable:
         back = 1.0 if link.restitution is None else 1 + link.restitution
-        taut = (r.distance > (1 - BAND) * link.length) & (out > 0)
+        taut = (r.distance > (1 - TAUT_BAND) * link.length) & (out > 0)
         change = jnp.where(taut, jnp.where(out > BOUNCE_SPEED, back, 1.0) * change, 0.0)
     change = change if link.holds is None else jnp.where(link.holds, change, 0.0)
     s = s.replace(vel=s.vel + link.mass / mass * change * pull.direction)

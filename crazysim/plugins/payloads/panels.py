@@ -9,7 +9,7 @@ import numpy as np
 
 from crazysim.geometry import Shape
 
-N_OF_BALL = 24
+MIN_BALL_PANELS = 24
 """Least number of panels of a ball."""
 
 
@@ -24,7 +24,7 @@ class Panels(NamedTuple):
     """Areas, m^2. (n, 1)"""
 
 
-def panels_of(shape: Shape, largest: float) -> Panels:
+def shape_panels(shape: Shape, largest: float) -> Panels:
     """Return the surface of a ball or a box as panels.
 
     The panels of a box are equal rectangles on each side. Those of a ball lie on a spiral of equal areas (Fibonacci).
@@ -34,7 +34,7 @@ def panels_of(shape: Shape, largest: float) -> Panels:
         largest: Largest edge of a panel, m.
     """
     if shape.kind == "sphere":
-        return _of_ball(shape.size[0], largest)
+        return _ball_panels(shape.size[0], largest)
     half = np.array(shape.size)
     pos, normal, area = [], [], []
     for axis in range(3):
@@ -51,9 +51,9 @@ def panels_of(shape: Shape, largest: float) -> Panels:
     return Panels(*(np.concatenate(x) for x in (pos, normal, area)))
 
 
-def _of_ball(radius: float, largest: float) -> Panels:
+def _ball_panels(radius: float, largest: float) -> Panels:
     surface = 4 * math.pi * radius**2
-    n = max(N_OF_BALL, math.ceil(surface / largest**2))
+    n = max(MIN_BALL_PANELS, math.ceil(surface / largest**2))
     z = 1 - 2 * (np.arange(n) + 0.5) / n
     angle = np.arange(n) * math.pi * (3 - math.sqrt(5))
     level = np.sqrt(1 - z**2)

@@ -12,18 +12,18 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import Stage
-from crazysim.drones.estimate import AIR_DENSITY
+from crazysim.drones.airframe_estimate import AIR_DENSITY
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects.downwash import collective_thrust, jet, mean_rotor_vel, stream_diameter
-from crazysim.plugins.effects.grid import LARGEST_FUSED, TOO_LARGE, interpolate, is_inside
+from crazysim.plugins.effects.downwash import collective_thrust, hover_jet_speed, mean_rotor_vel, stream_diameter
+from crazysim.plugins.effects.grid import MAX_FUSED_VALUES, WHY_UNFUSED, interpolate, is_inside
 from crazysim.plugins.effects.moving_air import checked_propeller_radius, require_rotors
-from crazysim.plugins.payloads.body import Colliding
+from crazysim.plugins.payloads.colliders import CollidingPlugin
 from crazysim.plugins.payloads.jet_table import JetTable
-from crazysim.plugins.payloads.panels import panels_of
+from crazysim.plugins.payloads.panels import shape_panels
 from crazysim.pytree import PyTree, device_array, leaf, static
 
 PANELS_PER_LENGTH = 2
@@ -58,10 +58,10 @@ class RotorJetData(PyTree):
 class RotorJet(Plugin):
     """Jet of a drone's rotors on the panels of loads, from tables or an analytic jet; needs rotors.
 
-    The force on a panel of area A with the outward normal n is ``-P A n`` for a pressure P of a table, and
-    ``rho v max(-v.n, 0) A`` for air of velocity v relative to the load: the momentum of the air that arrives. The
-    analytic jet is that of ``Downwash``. A table is linear between nodes and between rotor speeds, and zero outside its
-    box; below its smallest speed the jet falls to zero with the speed, above its largest it stays.
+    The force on a panel of area A with the outward normal n is ``-P A n`` for a pressure P of a table, and ``rho v
+    max(-v.n, 0) A`` for air of velocity v relative to the load: the momentum of the air that arrives. The analytic jet
+    is the same as in ``Downwash``. A table is linear between nodes and between rotor speeds, and zero outside its box;
+    below its smallest speed the jet falls to zero with the speed, above its largest it stays.
     """
 
     table: JetTable | None = None
@@ -71,7 +71,7 @@ class RotorJet(Plugin):
     panel: float | None = setting(default=None, positive=True)
     """Largest edge of a panel, m; None for half the longest edge of the load."""
     all_drones: bool = False
-    """True for the jets of all drones of a world on each load; False for that of the load's own drone."""
+    """True for the jets of all drones of a world on each load; False for the jet of the load's own drone."""
     air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)
     """Density of air, kg/m^3. () or (n_worlds, n_drones)"""
     propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
@@ -79,7 +79,6 @@ class RotorJet(Plugin):
     name: str = "rotor_jet"
 
     def record(self, sim: Simulation) -> RotorJetData:
-        """Return the table, and no wrench until the first step."""
         require_rotors(sim, "the jet of rotors")
         self._loads(sim)
         table = None if self.table is None else self.table.checked()
@@ -89,28 +88,27 @@ class RotorJet(Plugin):
         shared = {name: None if x is None else device_array(x, radius.dtype) for name, x in values.items()}
         return self.filled(sim, RotorJetData, diameter=stream_diameter(sim, radius), load=self.load, **shared)
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that adds up the forces on the panels."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         loads, shape = self._loads(sim), self._loads(sim).shape()
         edge = 2 * max(shape.size) / PANELS_PER_LENGTH if self.panel is None else self.panel
-        panels = panels_of(shape, edge)
+        panels = shape_panels(shape, edge)
 
         def press(data: SimData) -> SimData:
             if self.load not in data.plugins:
-                return self.write(data, still(self.read(data)))
+                return self.write(data, without_wrench(self.read(data)))
             record, body, s = self.read(data), loads.body(data), data.states
             arm = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.pos, s.pos.dtype))
             normal = rotation.rotate(body.quat[..., None, :], jnp.asarray(panels.normal, s.pos.dtype))
             total: Any = 0.0
             for k in range(s.pos.shape[-2]) if self.all_drones else (None,):
-                total = total + pressed(data, record, k, body.pos[..., None, :] + arm, normal, body.vel)
+                total = total + jet_pressure(data, record, k, body.pos[..., None, :] + arm, normal, body.vel)
             force = total * jnp.asarray(panels.area, s.pos.dtype)
             torque = jnp.sum(rotation.cross(arm, force), axis=-2)
             return self.write(data, record.replace(force=jnp.sum(force, axis=-2), torque=torque))
 
         numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
-        scope = "world" if self.all_drones else "drone" if numbers <= LARGEST_FUSED else "batch"
-        return [Placement(Stage(press, scope, batched=not self.all_drones, why=TOO_LARGE))]  # type: ignore[arg-type]
+        scope = "world" if self.all_drones else "drone" if numbers <= MAX_FUSED_VALUES else "batch"
+        return [StagePlacement(Stage(press, scope, batched=not self.all_drones, why=WHY_UNFUSED))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the force of the jet on the load, world frame, N."""
@@ -118,9 +116,9 @@ class RotorJet(Plugin):
 
     def _loads(self, sim: Simulation) -> Any:
         """Return the plugin of the loads."""
-        found = [p for p in sim.scene.plugins() if isinstance(p, Colliding) and p.name == self.load]
+        found = [p for p in sim.scene.plugins() if isinstance(p, CollidingPlugin) and p.name == self.load]
         if not found:
-            names = [p.name for p in sim.scene.plugins() if isinstance(p, Colliding)]
+            names = [p.name for p in sim.scene.plugins() if isinstance(p, CollidingPlugin)]
             raise ConfigError(
                 f"expected the name of a plugin of loads, {' or '.join(map(repr, names)) or 'none of which is there'}, "
                 f"got {self.load!r}. Use sim.add(SlungLoad(...)) first, and load= for another name."
@@ -133,7 +131,7 @@ class RotorJet(Plugin):
         return found[0]
 
 
-def still(record: RotorJetData) -> RotorJetData:
+def without_wrench(record: RotorJetData) -> RotorJetData:
     """Return the record without a wrench, for loads that were removed."""
     return record.replace(force=jnp.zeros_like(record.force), torque=jnp.zeros_like(record.torque))
 
@@ -144,7 +142,9 @@ def jet_force(data: SimData, name: str) -> Array | None:
     return sum(forces[1:], forces[0]) if forces else None
 
 
-def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, normal: Array, vel: Array) -> Array:
+def jet_pressure(
+    data: SimData, record: RotorJetData, drone: int | None, pos: Array, normal: Array, vel: Array
+) -> Array:
     """Return the force of a drone's jet per area of panels, world frame, Pa. (..., n, 3)
 
     Args:
@@ -172,14 +172,14 @@ def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, 
 
     if record.speeds is None:
         axis = rotation.z_axis(quat)
-        return momentum(-jet(offset, axis, thrust, diameter, density) * axis)
+        return momentum(-hover_jet_speed(offset, axis, thrust, diameter, density) * axis)
     speed = rotor_vel * RPM_TO_RAD_S
-    share, place = between(speed, record.speeds)
-    # A record with tables has their place.
+    share, table = table_position(speed, record.speeds)
+    # A record with tables has a position among them.
     cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing  # type: ignore[operator]
     shape = record.velocity.shape if record.pressure is None else record.pressure.shape
     share = jnp.where(is_inside(shape[1:4], cell)[..., None], share, 0.0)
-    where = jnp.concatenate([jnp.broadcast_to(place, (*cell.shape[:-1], 1)), cell], axis=-1)
+    where = jnp.concatenate([jnp.broadcast_to(table, (*cell.shape[:-1], 1)), cell], axis=-1)
     total: Any = 0.0
     if record.pressure is not None:
         total = total - share * interpolate(record.pressure, where)[..., None] * normal
@@ -188,15 +188,15 @@ def pressed(data: SimData, record: RotorJetData, drone: int | None, pos: Array, 
     return total
 
 
-def between(speed: Array, speeds: Array) -> tuple[Array, Array]:
-    """Return the factor of a rotor speed below the smallest of a table, and its place between tables.
+def table_position(speed: Array, speeds: Array) -> tuple[Array, Array]:
+    """Return the factor of a rotor speed below the smallest of a table, and its position between tables.
 
     Args:
         speed: Rotor speed, rad/s. (..., 1)
         speeds: Rotor speeds of the tables, ascending, rad/s. (k,)
 
     Returns:
-        Factor, 0 to 1 (..., 1), and place in units of tables, 0 to k - 1 (..., 1).
+        Factor, 0 to 1 (..., 1), and position in units of tables, 0 to k - 1 (..., 1).
     """
     share = rotation.safe_clip(speed / speeds[0], 0.0, 1.0)
     steps = [

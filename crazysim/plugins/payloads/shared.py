@@ -13,27 +13,27 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData, SimState, SimStateDeriv
 from crazysim.core.integration import euler
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import color, setting
 from crazysim.core.stage import Stage
 from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError
-from crazysim.geometry.linear import solve
-from crazysim.plugins.payloads.body import LoadBody, rest_height
-from crazysim.plugins.payloads.link import BAND, Pull, acceleration_at, correction, relative
-from crazysim.plugins.payloads.load import (
+from crazysim.geometry.small_matrices import solve_symmetric
+from crazysim.plugins.payloads.colliders import LoadBody, rest_height
+from crazysim.plugins.payloads.link import TAUT_BAND, UnitPull, acceleration_at, correction_rate, link_geometry
+from crazysim.plugins.payloads.point_load import (
     CABLE_SEGMENTS,
     PointLoad,
     add_to_scene,
-    integrator_of,
-    pieces,
-    turned_z,
+    find_integrator,
+    link_pieces,
+    rotation_from_z,
 )
 from crazysim.pytree import PyTree, device_array, leaf
 
-SOFT = 1e-6
+TENSION_REGULARIZATION = 1e-6
 """Summand of the matrix of tensions, 1, without which four rods at one load would have no unique tensions."""
-ROUNDS = 3
+N_ITERATIONS = 3
 """Solutions of the tensions, each without the cables that would push in the one before."""
 
 
@@ -59,7 +59,7 @@ class SharedLoadData(PyTree):
 
 
 @jit_unless_traced()
-def below(states: SimState, length: Array, clearance: Array) -> tuple[Array, Array]:
+def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Array, Array]:
     """Return position and velocity of a load at rest below the drones of each world.
 
     Args:
@@ -106,8 +106,7 @@ class SharedLoad(PointLoad, Plugin):
     name: str = "load"
 
     def record(self, sim: Simulation) -> SharedLoadData:
-        """Return a load at rest below the drones."""
-        method = integrator_of(sim)
+        method = find_integrator(sim)
         if method is euler:
             raise ConfigError(
                 "expected an integrator that moves positions with new velocities, which a load between several drones "
@@ -127,7 +126,7 @@ class SharedLoad(PointLoad, Plugin):
                 sim, self.name, self.size, self.rgba, float(np.max(length)), 1,
                 CABLE_SEGMENTS if self.cable else 1,
             )  # fmt: skip
-        pos, vel = below(sim.data.states, length, scalars["size"])
+        pos, vel = hanging_load(sim.data.states, length, scalars["size"])
         return SharedLoadData(
             pos=pos,
             vel=vel,
@@ -139,31 +138,30 @@ class SharedLoad(PointLoad, Plugin):
             clearance=scalars["size"],
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage of the floor."""
-        return [Placement(Stage(self.stop_at_floor, "world"), "increment_steps", name=f"{self.name}_floor")]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        return [StagePlacement(Stage(self.stop_at_floor, "world"), "increment_steps", name=f"{self.name}_floor")]
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         """Return the derivative with the pull of the load on all drones, and the load's rates; of one world."""
         load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
         m, n = load.mass, s.pos.shape[0]
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
-        r = relative(s, load.pos, load.vel, load.attach)
+        r = link_geometry(s, load.pos, load.vel, load.attach)
         q, out = r.direction, rotation.dot(r.direction, r.vel)
-        pull = Pull.create(q, r.rot, p.J_inv, load.attach)
+        pull = UnitPull.create(q, r.rot, p.J_inv, load.attach)
         share = 1.0 if dt is None else 0.5
         rel_acc = gravity - acceleration_at(s, deriv, r.rot, load.attach, share)
         rhs = rotation.dot(q, rel_acc) + share / load.length * (rotation.dot(r.vel, r.vel) - out * out)
         acts = load.attached
         if dt is None:
-            rhs = rhs + 2 * correction(freq) * out
-            acts = acts & (r.distance > (1 - BAND) * load.length)[..., 0] if self.cable else acts
+            rhs = rhs + 2 * correction_rate(freq) * out
+            acts = acts & (r.distance > (1 - TAUT_BAND) * load.length)[..., 0] if self.cable else acts
         else:
             gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
             rhs = rhs + freq * (out - freq * gap)
         own = jnp.broadcast_to(m / p.mass, (n, 1))
         own = own if pull.lever is None or pull.turn is None else own + m * rotation.dot(pull.lever, pull.turn)
-        gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (own + SOFT)
+        gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (own + TENSION_REGULARIZATION)
         tension = _tensions(gram, rhs[:, 0], acts, self.cable)[:, None]
 
         force = tension * q
@@ -180,25 +178,24 @@ class SharedLoad(PointLoad, Plugin):
         stretch = r.distance - load.length
         stretch = jnp.maximum(stretch, 0.0) if self.cable else stretch
         error = jnp.sum(jnp.where(load.attached[:, None], stretch * q, 0.0), axis=0) / n
-        rate = load.vel - correction(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
+        rate = load.vel - correction_rate(freq) * error if dt is None else load.vel + dt * tip_acc - freq * error
         rates = {"pos": rate, "vel": tip_acc}
         return deriv.replace(**changes, plugins=deriv.plugins | {self.name: rates})
 
-    def place(self, data: SimData) -> Objects:
+    def move_objects(self, data: SimData) -> Objects:
         """Return the scene's objects with load and links at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
-        r = relative(data.states, load.pos, load.vel, load.attach)
+        r = link_geometry(data.states, load.pos, load.vel, load.attach)
         offset = jnp.where(load.attached[:, None], r.offset, -load.length * r.rot[..., 2])
         top = data.states.pos if r.arm is None else data.states.pos + r.arm
-        links = pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
+        links = link_pieces(top, offset, load.length, CABLE_SEGMENTS if self.cable else 1)
         up = jnp.asarray([[0.0, 0.0, 1.0]], load.pos.dtype)
-        rows = {self.name: (load.pos[None], turned_z(up)), f"{self.name}_link": links}
+        rows = {self.name: (load.pos[None], rotation_from_z(up)), f"{self.name}_link": links}
         return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
     def body(self, data: SimData) -> LoadBody:
-        """Return the load; of one world."""
         load = self.read(data)
         upright = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], load.pos.dtype)
         return LoadBody(load.pos[None], upright, load.vel[None], load.mass[None])
@@ -207,7 +204,7 @@ class SharedLoad(PointLoad, Plugin):
         """Return the data with another velocity of the load; of one world. (1, 3)"""
         return self.write(data, self.read(data).replace(vel=vel[0]))
 
-    def joined(self, data: SimData) -> Array:
+    def joined_mask(self, data: SimData) -> Array:
         """Return True for drones that a rod joins to the load; of one world. (1, n_drones)"""
         return self.read(data).attached[None] & (not self.cable)
 
@@ -223,8 +220,8 @@ def _tensions(matrix: Array, rhs: Array, acts: Array, one_sided: bool) -> Array:
     """
     eye = jnp.eye(rhs.shape[0], dtype=rhs.dtype)
     tension = jnp.zeros_like(rhs)
-    for _ in range(ROUNDS if one_sided else 1):
+    for _ in range(N_ITERATIONS if one_sided else 1):
         both = acts[:, None] & acts[None]
-        tension = solve(jnp.where(both, matrix, eye), jnp.where(acts, rhs, 0.0))
+        tension = solve_symmetric(jnp.where(both, matrix, eye), jnp.where(acts, rhs, 0.0))
         acts = acts & (tension > 0) if one_sided else acts
     return jnp.maximum(tension, 0.0) if one_sided else tension

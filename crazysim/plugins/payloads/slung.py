@@ -12,27 +12,27 @@ from numpy.typing import ArrayLike
 
 from crazysim.core.data import Objects, SimData, SimStateDeriv
 from crazysim.core.integration import rk4
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import as_mask, color, setting
 from crazysim.core.stage import Stage
-from crazysim.plugins.payloads.body import LoadBody, rest_height
-from crazysim.plugins.payloads.link import Link, couple, end_relative_motion, relative
-from crazysim.plugins.payloads.load import (
+from crazysim.plugins.payloads.colliders import LoadBody, rest_height
+from crazysim.plugins.payloads.link import LinkParams, couple_bodies, end_relative_motion, link_geometry
+from crazysim.plugins.payloads.point_load import (
     CABLE_SEGMENTS,
     LoadData,
     PointLoad,
     add_to_scene,
-    air_and_gravity,
-    hanging,
-    integrator_of,
-    pieces,
-    turned_z,
+    find_integrator,
+    free_acceleration,
+    hanging_state,
+    link_pieces,
+    rotation_from_z,
 )
 from crazysim.pytree import device_array, select_worlds
 
 L = TypeVar("L", bound=LoadData)
 
-OUT_OF_SIGHT = 1000.0
+ABSENT_LOAD_DEPTH = 1000.0
 """Depth at which loads are that do not exist, m."""
 
 
@@ -69,23 +69,22 @@ class SlungLoad(PointLoad, Plugin):
     name: str = "load"
 
     def record(self, sim: Simulation) -> LoadData:
-        """Return loads at rest below their drones."""
         return load_record(self, sim, LoadData, self.cable, rest_height(self.size))
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage of the floor, and for cables in schemes of higher order that of becoming taut."""
-        found = [Placement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
-        method = integrator_of(sim)
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        """Return the floor's stage, and for cables in schemes of higher order the stage of becoming taut."""
+        found = [StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
+        method = find_integrator(sim)
         if self.cable and method is rk4:
-            found.append(Placement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
+            found.append(StagePlacement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
         return found
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
         """Return the derivative with the pull of the load, and the load's rates; of one drone."""
         load, p = self.read(data), data.params
-        free = air_and_gravity(data, load, self.name, dt)
-        linked = couple(
-            data.states, deriv, p.mass, p.J_inv, self._link(load), load.pos, load.vel, free, dt, data.core.freq
+        free = free_acceleration(data, load, self.name, dt)
+        linked = couple_bodies(
+            data.states, deriv, p.mass, p.J_inv, self._link_params(load), load.pos, load.vel, free, dt, data.core.freq
         )
         rates = {"pos": linked.rate, "vel": linked.acc}
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
@@ -93,7 +92,7 @@ class SlungLoad(PointLoad, Plugin):
     def become_taut(self, data: SimData) -> SimData:
         """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
         load, p = self.read(data), data.params
-        states, vel = end_relative_motion(data.states, p.mass, p.J_inv, self._link(load), load.pos, load.vel)
+        states, vel = end_relative_motion(data.states, p.mass, p.J_inv, self._link_params(load), load.pos, load.vel)
         return self.write(data.replace(states=states), load.replace(vel=vel))
 
     def hang(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
@@ -109,7 +108,7 @@ class SlungLoad(PointLoad, Plugin):
             ConfigError: If the mask has another shape or type.
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
-        pos, vel = hanging(data.states, load.attach, load.length, load.clearance, self.cable)
+        pos, vel = hanging_state(data.states, load.attach, load.length, load.clearance, self.cable)
         new = load.replace(
             pos=select_worlds(mask, pos, load.pos),
             vel=select_worlds(mask, vel, load.vel),
@@ -117,30 +116,30 @@ class SlungLoad(PointLoad, Plugin):
         )
         return self.write(data, new)
 
-    def place(self, data: SimData) -> Objects:
+    def move_objects(self, data: SimData) -> Objects:
         """Return the scene's objects with loads and links at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
-        return place_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
+        return move_loads(data, self.name, load, load.pos, load.attached, CABLE_SEGMENTS if self.cable else 1)
 
     def body(self, data: SimData) -> LoadBody:
-        """Return the loads; of one drone or of one world."""
         load = self.read(data)
         mass = jnp.broadcast_to(load.mass, (*load.pos.shape[:-1], 1))
-        return LoadBody(load.pos, turned_z(upward(data, load, load.pos)), load.vel, mass)
+        return LoadBody(load.pos, rotation_from_z(shape_axis(data, load, load.pos)), load.vel, mass)
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
-        """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
         return self.write(data, self.read(data).replace(vel=vel))
 
-    def joined(self, data: SimData) -> Array:
+    def joined_mask(self, data: SimData) -> Array:
         """Return True where a rod joins a load to a drone; of one world. (n_drones, n_drones)"""
         n = data.states.pos.shape[0]
         return np.eye(n, dtype=bool) & self.read(data).attached & (not self.cable)
 
-    def _link(self, load: LoadData) -> Link:
-        return Link(load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable)
+    def _link_params(self, load: LoadData) -> LinkParams:
+        return LinkParams(
+            load.attach, load.length, load.mass, load.damping, load.restitution, load.attached, self.cable
+        )
 
 
 def load_record(
@@ -177,11 +176,11 @@ def load_record(
             sim, plugin.name, plugin.size, plugin.rgba, float(np.max(load.length)), sim.n_drones,
             CABLE_SEGMENTS if is_cable else 1, ring,
         )  # fmt: skip
-    pos, vel = hanging(states, load.attach, load.length, rest, is_cable)
+    pos, vel = hanging_state(states, load.attach, load.length, rest, is_cable)
     return load.replace(pos=pos, vel=vel)
 
 
-def place_loads(
+def move_loads(
     data: SimData,
     name: str,
     load: LoadData,
@@ -189,7 +188,7 @@ def place_loads(
     holds: Array,
     n_pieces: int,
     ring: float = 0.0,
-    bare: bool = False,
+    show_free_links: bool = False,
 ) -> Objects:
     """Return the scene's objects with loads and links at their poses; of one world.
 
@@ -203,19 +202,19 @@ def place_loads(
         holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
         n_pieces: Straight pieces of a link.
         ring: Height of the point by which a load hangs above its middle, m.
-        bare: True to show links without loads.
+        show_free_links: True to show links of loads that do not exist.
     """
-    away = jnp.where(load.mass > 0, 0.0, OUT_OF_SIGHT) * np.array([0.0, 0.0, 1.0], tip.dtype)
-    r = relative(data.states, tip, load.vel, load.attach)
+    away = jnp.where(load.mass > 0, 0.0, ABSENT_LOAD_DEPTH) * np.array([0.0, 0.0, 1.0], tip.dtype)
+    r = link_geometry(data.states, tip, load.vel, load.attach)
     offset = jnp.where(holds[..., None], r.offset, -load.length * r.rot[..., 2])
-    up = upward(data, load, tip)
+    up = shape_axis(data, load, tip)
     top = data.states.pos if r.arm is None else data.states.pos + r.arm
-    links = pieces(top if bare else top - away, offset, load.length, n_pieces)
-    rows = {name: (load.pos - away - ring * up, turned_z(up)), f"{name}_link": links}
+    links = link_pieces(top if show_free_links else top - away, offset, load.length, n_pieces)
+    rows = {name: (load.pos - away - ring * up, rotation_from_z(up)), f"{name}_link": links}
     return data.objects.with_poses(rows)  # type: ignore[union-attr]
 
 
-def upward(data: SimData, load: LoadData, tip: Array) -> Array:
+def shape_axis(data: SimData, load: LoadData, tip: Array) -> Array:
     """Return the axis of the loads' shapes: along the link where a load hangs, else vertical. (..., 3)
 
     Args:
@@ -223,5 +222,5 @@ def upward(data: SimData, load: LoadData, tip: Array) -> Array:
         load: Record of the loads.
         tip: Ends of the links, world frame, m. (..., 3)
     """
-    direction = relative(data.states, tip, load.vel, load.attach).direction
+    direction = link_geometry(data.states, tip, load.vel, load.attach).direction
     return jnp.where(load.attached[..., None], -direction, jnp.asarray([0.0, 0.0, 1.0], tip.dtype))

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from crazysim.core.data import SimData
 from crazysim.core.plugin import parameter
 from crazysim.core.random import normal
-from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated, quantise
+from crazysim.plugins.sensors.sensor import Samples, Sensor, gauss_markov_step, quantise
 from crazysim.pytree import PyTree, leaf
 
 SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE, LAPSE = 101325.0, 288.15, 0.0065
 """Pressure, Pa, and temperature, K, at sea level, and decrease of temperature with height, K/m (ISO 2533:1975)."""
-EXPONENT = 9.80665 * 0.0289644 / (8.31432 * LAPSE)
+PRESSURE_EXPONENT = 9.80665 * 0.0289644 / (8.31432 * LAPSE)
 """Exponent of the pressure, 5.256: g M / (R L) with the constants of the US Standard Atmosphere 1976."""
 
 
@@ -68,7 +68,6 @@ class Barometer(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"pressure": 1, "height": 1}
 
     def ideal(self, data: SimData) -> Array:
@@ -76,17 +75,15 @@ class Barometer(Sensor):
         height = data.states.pos[2:]
         return jnp.concatenate([pressure_at(height + self.read(data).altitude), height])
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Draw the offset of one barometer, and where its drift begins."""
+    def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
-        noise = normal(self.begin_key(data), (2,), record.offset.dtype)
+        noise = normal(self.episode_key(data), (2,), record.offset.dtype)
         drawn = record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
         return self.write(data, drawn)
 
     def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, BarometerData]:
-        """Return the pressure and the height of one barometer, and the record after it."""
         noise = normal(key, (2,), record.offset.dtype)
-        wander = correlated(record.wander, record.drift, record.drift_time, self.interval(data), noise[:1])
+        wander = gauss_markov_step(record.wander, record.drift, record.drift_time, self.interval(data), noise[:1])
         pressure = self.ideal(data)[:1] + record.offset + wander + record.noise * noise[1:]
         pressure = quantise(pressure, record.resolution)
         height = altitude_of(pressure) - record.altitude
@@ -99,10 +96,10 @@ def pressure_at(altitude: Array) -> Array:
     Args:
         altitude: Geopotential altitude above sea level, m. (...)
     """
-    return SEA_LEVEL_PRESSURE * jnp.exp(EXPONENT * jnp.log1p(-LAPSE / SEA_LEVEL_TEMPERATURE * altitude))
+    return SEA_LEVEL_PRESSURE * jnp.exp(PRESSURE_EXPONENT * jnp.log1p(-LAPSE / SEA_LEVEL_TEMPERATURE * altitude))
 
 
 def altitude_of(pressure: Array) -> Array:
     """Return the altitude at which the standard atmosphere has a pressure, m; the inverse of ``pressure_at``. (...)"""
     log = jnp.log1p((pressure - SEA_LEVEL_PRESSURE) / SEA_LEVEL_PRESSURE)
-    return -SEA_LEVEL_TEMPERATURE / LAPSE * jnp.expm1(log / EXPONENT)
+    return -SEA_LEVEL_TEMPERATURE / LAPSE * jnp.expm1(log / PRESSURE_EXPONENT)

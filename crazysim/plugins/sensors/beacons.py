@@ -1,4 +1,4 @@
-"""Sensors that measure to known places: ranges of ultra-wideband anchors, and sweep angles of lighthouses."""
+"""Sensors that measure to known positions: ranges of ultra-wideband anchors, and sweep angles of lighthouses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 SWEEP_TILTS = -math.pi / 6, math.pi / 6
 """Tilts of the two light planes of a lighthouse of the second generation, rad: 30 degrees either way (Taffanel et al.
 2021, arXiv:2104.11523)."""
-STEEPEST = 1 - 1e-4
+MAX_SINE = 1 - 1e-4
 """Limit of the argument of the arcsine in a sweep angle, which keeps gradients finite."""
 
 
@@ -47,7 +47,7 @@ class UWBData(PyTree):
 
 
 class UWB(Sensor):
-    """Distances to anchors by two-way ranging, m, or their differences to that of the first anchor (TDoA), m.
+    """Distances to anchors by two-way ranging, m, or their differences to the first distance (TDoA), m.
 
     A distance has a bias, white noise, and, at random, a detour of exponentially distributed length, as of reflected
     signals. All anchors are measured at the same time.
@@ -74,13 +74,12 @@ class UWB(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         n = len(np.asarray(self.anchors))
         return {"difference": n - 1} if self.tdoa else {"distance": n}
 
     def record(self, sim: Simulation) -> UWBData:
         """Return the system before its first measurement."""
-        anchors = _places("anchors", self.anchors, 2 if self.tdoa else 1)
+        anchors = _point_array("anchors", self.anchors, 2 if self.tdoa else 1)
         return self.filled(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
 
     def ideal(self, data: SimData) -> Array:
@@ -123,7 +122,7 @@ class LighthouseData(PyTree):
 class Lighthouse(Sensor):
     """Angles at which the two light planes of base stations pass photodiodes, rad, and where these are in view.
 
-    In a station's frame, x forwards and z upwards, a plane with tilt t passes the place (x, y, z) at
+    In a station's frame, x forwards and z upwards, a plane with tilt t passes the point (x, y, z) at
     ``atan2(y, x) + asin(z tan(t) / sqrt(x^2 + y^2))`` (Taffanel et al. 2021, arXiv:2104.11523). A diode is in view in
     front of a station that is above the plane of the body's x and y axes; other angles are zero. Nothing hides a diode.
     """
@@ -148,8 +147,7 @@ class Lighthouse(Sensor):
         return {"angle": 2 * n, "visible": n}
 
     def record(self, sim: Simulation) -> LighthouseData:
-        """Return the system before its first measurement."""
-        stations, rpy = _places("stations", self.stations, 1), _places("rpy", self.rpy, 1)
+        stations, rpy = _point_array("stations", self.stations, 1), _point_array("rpy", self.rpy, 1)
         if stations.shape != rpy.shape:
             raise ConfigError(f"expected rpy of shape {stations.shape}, one for each station, got {rpy.shape}")
         dtype = sim.data.states.pos.dtype
@@ -158,14 +156,14 @@ class Lighthouse(Sensor):
             LighthouseData,
             stations=device_array(stations, dtype),
             quat=jax.jit(rotation.from_rpy)(device_array(rpy, dtype)),
-            diodes=device_array(_places("diodes", self.diodes, 1), dtype),
+            diodes=device_array(_point_array("diodes", self.diodes, 1), dtype),
         )
 
     def ideal(self, data: SimData) -> Array:
         """Return the angles, rad, and 1 where they are in view, else 0. (3 n_stations n_diodes,)"""
         record, s = self.read(data), data.states
-        places = rotation.rotate(s.quat, record.diodes, s.pos)
-        offset = places - record.stations[:, None]
+        diodes = rotation.rotate(s.quat, record.diodes, s.pos)
+        offset = diodes - record.stations[:, None]
         local = rotation.rotate_inverse(record.quat[:, None], offset)
         angle = jnp.stack([sweep_angle(local, tilt) for tilt in SWEEP_TILTS], axis=-1)
         above = -rotation.dot(offset, rotation.z_axis(s.quat))[..., 0] > 0
@@ -183,25 +181,25 @@ class Lighthouse(Sensor):
 
 
 def sweep_angle(pos: Array, tilt: float) -> Array:
-    """Return the angle at which a tilted light plane passes a place, rad. (...)
+    """Return the angle at which a tilted light plane passes a point, rad. (...)
 
     Args:
-        pos: The place in the frame of the base station, x forwards, z upwards, m. (..., 3)
+        pos: The point in the frame of the base station, x forwards, z upwards, m. (..., 3)
         tilt: Tilt of the plane, rad.
     """
     across = rotation.safe_norm(pos[..., :2])[..., 0]
     sine = pos[..., 2] * math.tan(tilt) / jnp.where(across > 1e-6, across, 1e-6)
-    sine = rotation.safe_clip(sine, -STEEPEST, STEEPEST)
+    sine = rotation.safe_clip(sine, -MAX_SINE, MAX_SINE)
     return rotation.safe_arctan2(pos[..., 1], pos[..., 0]) + jnp.arcsin(sine)
 
 
-def _places(name: str, value: ArrayLike, least: int) -> np.ndarray:
+def _point_array(name: str, value: ArrayLike, least: int) -> np.ndarray:
     """Return vectors as an array. (n, 3)
 
     Raises:
         ConfigError: If the shape is not (n, 3), a number is not finite, or n is less than ``least``.
     """
-    places = np.asarray(value, np.float64)
-    if places.ndim != 2 or places.shape[1] != 3 or len(places) < least or not np.isfinite(places).all():
-        raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got {places.tolist()}")
-    return places
+    points = np.asarray(value, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < least or not np.isfinite(points).all():
+        raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got {points.tolist()}")
+    return points

@@ -21,9 +21,9 @@ from crazysim.pytree import PyTree, leaf
 
 PIXELS_PER_RADIAN = 35.0 / 0.71674
 """Pixels by which the image moves per radian (mm_flow.c of crazyflie-firmware: 35 pixels, aperture 0.71674)."""
-LOWEST_COSINE = 0.1
+MIN_TILT_COSINE = 0.1
 """Least cosine of the tilt at which the ground is seen, 84 degrees. An assumption."""
-LOWEST = 0.02
+MIN_FLOW_DISTANCE = 0.02
 """Least distance of the ground, m, that the flow is divided by. An assumption."""
 FAR_NOISE = math.log(0.2 / 0.0025) / (4.0 - 2.5), 2.5, 0.0025
 """Growth b, 1/m, distance c, m, and scale a, m, of the noise of the time of flight, ``a (1 + exp(b (d - c)))``, as the
@@ -69,7 +69,6 @@ class OpticalFlow(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"flow": 2}
 
     def ideal(self, data: SimData) -> Array:
@@ -78,11 +77,10 @@ class OpticalFlow(Sensor):
         distance, sees = ground_distance(data, record.pos)
         vel = rotation.rotate_inverse(s.quat, s.vel, rotation.cross(s.ang_vel, record.pos))
         turn = jnp.stack([-s.ang_vel[1], s.ang_vel[0]])
-        rate = vel[:2] / jnp.where(distance > LOWEST, distance, LOWEST) + turn
+        rate = vel[:2] / jnp.where(distance > MIN_FLOW_DISTANCE, distance, MIN_FLOW_DISTANCE) + turn
         return jnp.where(sees, record.scale * self.interval(data) * rate, 0.0)
 
     def measure(self, data: SimData, record: OpticalFlowData, key: Array) -> tuple[Array, OpticalFlowData]:
-        """Return the motion of the image of one camera, pixels, and the record."""
         truth = self.ideal(data)
         value = truth + record.noise * normal(key, (2,), truth.dtype)
         return quantise(value, record.resolution), record
@@ -132,7 +130,6 @@ class TimeOfFlight(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"distance": 1}
 
     def ideal(self, data: SimData) -> Array:
@@ -165,10 +162,10 @@ def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
 
     Args:
         data: The data of one drone.
-        pos: Place from which it is measured, relative to the centre of mass, body frame, m. (3,)
+        pos: Point from which it is measured, relative to the centre of mass, body frame, m. (3,)
     """
     s = data.states
     cosine = rotation.z_axis(s.quat)[2:]
-    sees = cosine > LOWEST_COSINE
+    sees = cosine > MIN_TILT_COSINE
     height = s.pos[2:] + rotation.rotate(s.quat, pos)[2:] - ground_below(data)
     return height / jnp.where(sees, cosine, 1.0), sees

@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import parameter
 from crazysim.core.random import normal
-from crazysim.plugins.sensors.sensor import Samples, Sensor, correlated
+from crazysim.plugins.sensors.sensor import Samples, Sensor, gauss_markov_step
 from crazysim.pytree import PyTree, leaf
 
 
@@ -59,7 +59,6 @@ class GPS(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"pos": 3, "vel": 3}
 
     def ideal(self, data: SimData) -> Array:
@@ -68,19 +67,16 @@ class GPS(Sensor):
         vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, pos), s.vel)
         return jnp.concatenate([rotation.rotate(s.quat, pos, s.pos), vel])
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Draw where the drift of one receiver begins."""
+    def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
-        wander = record.drift * normal(self.begin_key(data), (3,), record.wander.dtype)
+        wander = record.drift * normal(self.episode_key(data), (3,), record.wander.dtype)
         return self.write(data, record.replace(wander=wander))
 
     def measure(self, data: SimData, record: GPSData, key: Array) -> tuple[Array, GPSData]:
-        """Return position and velocity from one receiver, and the record after it."""
         noise = normal(key, (9,), record.wander.dtype)
-        wander = correlated(record.wander, record.drift, record.drift_time, self.interval(data), noise[:3])
+        wander = gauss_markov_step(record.wander, record.drift, record.drift_time, self.interval(data), noise[:3])
         error = jnp.concatenate([wander + record.noise * noise[3:6], record.vel_noise * noise[6:]])
         return self.ideal(data) + error, record.replace(wander=wander)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return position and velocity, as if the antenna were at the centre of mass."""
         return self.split(self.latest(data))

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Simulation, drone_array, parameter
+from crazysim.core.plugin import Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.random import normal, uniform
 from crazysim.core.stage import Stage
 from crazysim.dynamics.rotor import RPM_TO_RAD_S
@@ -25,24 +25,24 @@ from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
 
-DEGREE = math.pi / 180
-G = 9.80665
+RAD_PER_DEGREE = math.pi / 180
+STANDARD_GRAVITY = 9.80665
 """Standard acceleration of gravity, m/s^2 (CGPM 1901), the unit of data sheets."""
 
 BMI088: dict[str, Any] = {
     "gyro": Triad(
-        noise=0.014 * DEGREE,
-        bias_spread=1.0 * DEGREE,
+        noise=0.014 * RAD_PER_DEGREE,
+        bias_spread=1.0 * RAD_PER_DEGREE,
         bandwidth=116.0,
-        limit=2000 * DEGREE,
-        resolution=2000 / 32768 * DEGREE,
+        limit=2000 * RAD_PER_DEGREE,
+        resolution=2000 / 32768 * RAD_PER_DEGREE,
     ),
     "accel": Triad(
-        noise=np.array([160e-6, 160e-6, 190e-6]) * G,
-        bias_spread=20e-3 * G,
+        noise=np.array([160e-6, 160e-6, 190e-6]) * STANDARD_GRAVITY,
+        bias_spread=20e-3 * STANDARD_GRAVITY,
         bandwidth=145.0,
-        limit=24 * G,
-        resolution=24 / 32768 * G,
+        limit=24 * STANDARD_GRAVITY,
+        resolution=24 / 32768 * STANDARD_GRAVITY,
     ),
 }
 """Bosch BMI088, of the Crazyflie 2.1. Noise densities and offsets: data sheet BST-BMI088, revision 1.9, tables 4 and 5
@@ -50,10 +50,12 @@ BMI088: dict[str, Any] = {
 as the firmware sets them (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz). The data sheet
 states no instability or random walk of the bias: they are zero."""
 
-_FIRMWARE_GYRO_BIAS = 0.014 * DEGREE / math.sqrt(2 * 0.512)
+_FIRMWARE_GYRO_BIAS = 0.014 * RAD_PER_DEGREE / math.sqrt(2 * 0.512)
 CRAZYFLIE: dict[str, Any] = {
     "gyro": dataclasses.replace(BMI088["gyro"], bias_spread=_FIRMWARE_GYRO_BIAS, bandwidth=38.0),
-    "accel": dataclasses.replace(BMI088["accel"], bias_spread=np.array([20e-3, 20e-3, 0.0]) * G, bandwidth=18.5),
+    "accel": dataclasses.replace(
+        BMI088["accel"], bias_spread=np.array([20e-3, 20e-3, 0.0]) * STANDARD_GRAVITY, bandwidth=18.5
+    ),
 }
 """BMI088 behind the firmware of the Crazyflie (sensors_bmi088_bmp3xx.c). Before take-off the mean of 512 samples
 of the gyroscope is subtracted, so the mean of their noise is the bias that is left; the accelerometer is scaled to 1 g,
@@ -62,22 +64,22 @@ of 80 and 30 Hz; the corners here are those of a filter of first order that dela
 
 MPU9250: dict[str, Any] = {
     "gyro": Triad(
-        noise=0.01 * DEGREE,
-        bias_spread=5.0 * DEGREE,
+        noise=0.01 * RAD_PER_DEGREE,
+        bias_spread=5.0 * RAD_PER_DEGREE,
         scale_spread=0.03,
         misalignment_spread=0.02,
         bandwidth=92.0,
-        limit=2000 * DEGREE,
-        resolution=DEGREE / 16.4,
+        limit=2000 * RAD_PER_DEGREE,
+        resolution=RAD_PER_DEGREE / 16.4,
     ),
     "accel": Triad(
-        noise=300e-6 * G,
-        bias_spread=np.array([60e-3, 60e-3, 80e-3]) * G,
+        noise=300e-6 * STANDARD_GRAVITY,
+        bias_spread=np.array([60e-3, 60e-3, 80e-3]) * STANDARD_GRAVITY,
         scale_spread=0.03,
         misalignment_spread=0.02,
         bandwidth=94.0,
-        limit=16 * G,
-        resolution=G / 2048,
+        limit=16 * STANDARD_GRAVITY,
+        resolution=STANDARD_GRAVITY / 2048,
     ),
 }
 """InvenSense MPU-9250, of the Crazyflie 2.0: product specification PS-MPU-9250A-01, revision 1.0, tables 1 and 2, at
@@ -85,13 +87,18 @@ MPU9250: dict[str, Any] = {
 that of a rotation. It states no instability or random walk of the bias: they are zero."""
 
 MPU6050: dict[str, Any] = {
-    "gyro": dataclasses.replace(MPU9250["gyro"], noise=0.005 * DEGREE, bias_spread=20 * DEGREE, bandwidth=100.0),
+    "gyro": dataclasses.replace(
+        MPU9250["gyro"], noise=0.005 * RAD_PER_DEGREE, bias_spread=20 * RAD_PER_DEGREE, bandwidth=100.0
+    ),
     "accel": dataclasses.replace(
-        MPU9250["accel"], noise=400e-6 * G, bias_spread=np.array([50e-3, 50e-3, 80e-3]) * G, bandwidth=100.0
+        MPU9250["accel"],
+        noise=400e-6 * STANDARD_GRAVITY,
+        bias_spread=np.array([50e-3, 50e-3, 80e-3]) * STANDARD_GRAVITY,
+        bandwidth=100.0,
     ),
 }
 """InvenSense MPU-6050: product specification PS-MPU-6000A-00, revision 3.4, sections 6.1 and 6.2, otherwise as
-``MPU9250``. The corner of the accelerometer is taken to be that of the gyroscope."""
+``MPU9250``. The corner of the accelerometer is assumed to equal the gyroscope's."""
 
 
 class IMUData(PyTree):
@@ -122,8 +129,8 @@ class IMUData(PyTree):
 class IMU(Sensor):
     """Gyroscope, rad/s, and accelerometer, m/s^2, in the sensor's frame.
 
-    The accelerometer measures the acceleration of its place, with gravity subtracted: 9.81 m/s^2 upwards at rest. The
-    acceleration is the change of the velocity in the step, whatever caused it, contacts and loads included. An
+    The accelerometer measures the acceleration of its position, with gravity subtracted: 9.81 m/s^2 upwards at rest.
+    The acceleration is the change of the velocity in the step, whatever caused it, contacts and loads included. An
     unbalanced rotor shakes the drone with the centrifugal force ``imbalance w^2``.
     """
 
@@ -163,11 +170,9 @@ class IMU(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"gyro": 3, "accel": 3}
 
     def record(self, sim: Simulation) -> IMUData:
-        """Return the unit before its first measurement."""
         shakes = self.imbalance is not None
         if shakes:
             require_rotors(sim, "vibration")
@@ -181,11 +186,10 @@ class IMU(Sensor):
             phase=drone_array(sim, 0.0, sim.data.states.rotor_vel.shape[-1]) if shakes else None,
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that notes the velocity before the step, and those of every sensor."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         stages = super().stages(sim)
         when = next(p.stage for p in stages if p.name is None).when  # type: ignore[attr-defined]
-        before = Placement(Stage(self._note, "drone", when), name=f"{self.name}_before")
+        before = StagePlacement(Stage(self._store_velocities, "drone", when), name=f"{self.name}_before")
         return [before, *stages]
 
     def ideal(self, data: SimData) -> Array:
@@ -193,13 +197,12 @@ class IMU(Sensor):
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.vel)
         force = specific_force(s.quat, zero, s.ang_vel, zero, data.params.gravity_vec, record.pos)
-        return _to_sensor(record.quat, s.ang_vel, force)
+        return _to_sensor_frame(record.quat, s.ang_vel, force)
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Draw the errors of one unit, and the angles of its rotors."""
-        record, truth, keys = self.read(data), self.ideal(data), jax.random.split(self.begin_key(data))
+    def reset_episode(self, data: SimData) -> SimData:
+        record, truth, keys = self.read(data), self.ideal(data), jax.random.split(self.episode_key(data))
         noise = normal(keys[0], (12, 2), truth.dtype)
-        gyro, accel = record.gyro.drawn(truth[:3], noise[:, 0]), record.accel.drawn(truth[3:], noise[:, 1])
+        gyro, accel = record.gyro.draw_errors(truth[:3], noise[:, 0]), record.accel.draw_errors(truth[3:], noise[:, 1])
         record = record.replace(gyro=gyro, accel=accel)
         if record.phase is not None:
             phase = 2 * math.pi * uniform(keys[1], record.phase.shape, truth.dtype)
@@ -216,13 +219,13 @@ class IMU(Sensor):
             phase = record.phase + dt * speed
             phase = phase - 2 * math.pi * jnp.floor(phase / (2 * math.pi))
             p = data.params
-            push, twist, swing = shaking(record.imbalance, speed, phase, record.rotor_pos)  # type: ignore[arg-type]
+            push, twist, swing = vibration(record.imbalance, speed, phase, record.rotor_pos)  # type: ignore[arg-type]
             acc = acc + rotation.rotate(s.quat, push) / p.mass
             ang_acc = ang_acc + rotation.matvec(p.J_inv, twist)
             ang_vel = ang_vel + rotation.matvec(p.J_inv, swing)
             record = record.replace(phase=phase)
         force = specific_force(s.quat, acc, s.ang_vel, ang_acc, data.params.gravity_vec, record.pos)
-        truth = _to_sensor(record.quat, ang_vel, force)
+        truth = _to_sensor_frame(record.quat, ang_vel, force)
         noise = normal(key, (9, 2), truth.dtype)
         rates, gyro = record.gyro.measure(truth[:3], noise[:, 0], dt)
         forces, accel = record.accel.measure(truth[3:], noise[:, 1], dt)
@@ -232,16 +235,16 @@ class IMU(Sensor):
         """Return the angular velocity, body frame, rad/s."""
         return {"ang_vel": rotation.rotate(self.read(data).quat, self.part(data, "gyro"))}
 
-    def _note(self, data: SimData) -> SimData:
+    def _store_velocities(self, data: SimData) -> SimData:
         """Note the velocities of one drone before the step."""
         s = data.states
         return self.write(data, self.read(data).replace(vel=s.vel, ang_vel=s.ang_vel))
 
 
 def specific_force(quat: Array, acc: Array, ang_vel: Array, ang_acc: Array, gravity: Array, pos: Array) -> Array:
-    """Return the specific force at a place of a rigid body, body frame, m/s^2. (..., 3)
+    """Return the specific force at a point of a rigid body, body frame, m/s^2. (..., 3)
 
-    ``R^T (a - g) + w' x r + w x (w x r)``: the acceleration of the place without gravity.
+    ``R^T (a - g) + w' x r + w x (w x r)``: the acceleration of the point without gravity.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
@@ -249,14 +252,14 @@ def specific_force(quat: Array, acc: Array, ang_vel: Array, ang_acc: Array, grav
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         ang_acc: Angular acceleration, body frame, rad/s^2. (..., 3)
         gravity: Acceleration of gravity, world frame, m/s^2. (..., 3)
-        pos: The place relative to the centre of mass, body frame, m. (..., 3)
+        pos: The point relative to the centre of mass, body frame, m. (..., 3)
     """
     force = rotation.rotate_inverse(quat, acc - gravity)
     force = rotation.add_cross(force, ang_acc, pos)
     return rotation.add_cross(force, ang_vel, rotation.cross(ang_vel, pos))
 
 
-def shaking(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) -> tuple[Array, Array, Array]:
+def vibration(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) -> tuple[Array, Array, Array]:
     """Return force, N, torque, N m, and angular momentum, N m s, of unbalanced rotors, body frame. (3,) each
 
     The centrifugal force ``m e w^2`` turns with the rotor in its plane; the angular momentum is the integral of its
@@ -276,6 +279,6 @@ def shaking(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) -> t
     return jnp.sum(force, axis=0), jnp.sum(torque, axis=0), jnp.sum(swing, axis=0)
 
 
-def _to_sensor(quat: Array, *vectors: Array) -> Array:
+def _to_sensor_frame(quat: Array, *vectors: Array) -> Array:
     """Return vectors of the body frame in the sensor's frame, joined. (3 n,)"""
     return jnp.concatenate([rotation.rotate_inverse(quat, v) for v in vectors])

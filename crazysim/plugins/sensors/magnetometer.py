@@ -18,8 +18,8 @@ from crazysim.plugins.sensors.sensor import Samples, Sensor, mounting
 from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
 
-STRONGEST = 1e-3
-"""Strongest field accepted, T, some fifteen times that of the earth, so that other units are noticed. An assumption."""
+MAX_FIELD = 1e-3
+"""Strongest field accepted, T, some fifteen times the earth's, so that other units are noticed. An assumption."""
 
 
 class MagnetometerData(PyTree):
@@ -52,15 +52,13 @@ class Magnetometer(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"field": 3}
 
     def record(self, sim: Simulation) -> MagnetometerData:
-        """Return the magnetometer before its first measurement."""
         field = np.asarray(self.field)
-        if field.dtype.kind in "iuf" and np.any(np.abs(field) > STRONGEST):
+        if field.dtype.kind in "iuf" and np.any(np.abs(field) > MAX_FIELD):
             raise ConfigError(
-                f"expected field in tesla, of at most {STRONGEST} T along an axis, got {short_repr(self.field)}. "
+                f"expected field in tesla, of at most {MAX_FIELD} T along an axis, got {short_repr(self.field)}. "
                 f"Use 20e-6 for 20 microtesla, 1e-4 for one gauss."
             )
         errors, quat = self.errors.record(sim, "errors"), mounting(sim, self.rpy)
@@ -71,10 +69,9 @@ class Magnetometer(Sensor):
         record = self.read(data)
         return rotation.rotate_inverse(rotation.multiply(data.states.quat, record.quat), record.field)
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Draw the errors of one magnetometer."""
+    def reset_episode(self, data: SimData) -> SimData:
         record, truth = self.read(data), self.ideal(data)
-        errors = record.errors.drawn(truth, normal(self.begin_key(data), (12,), truth.dtype))
+        errors = record.errors.draw_errors(truth, normal(self.episode_key(data), (12,), truth.dtype))
         return self.write(data, record.replace(errors=errors))
 
     def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, MagnetometerData]:

@@ -36,7 +36,7 @@ class MotionCaptureData(PyTree):
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
     """Origin of the tracked body relative to the centre of mass, body frame, m. (3,)"""
     quat: Array = leaf("parameter", 1, (4,), sparse=True)
-    """Attitude of the tracked body, its frame to that of the drone, unit, xyzw. (4,)"""
+    """Attitude of the tracked body, its frame to the drone's, unit, xyzw. (4,)"""
 
 
 class MotionCapture(Sensor):
@@ -63,11 +63,9 @@ class MotionCapture(Sensor):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"pos": 3, "quat": 4, "vel": 3}
 
     def record(self, sim: Simulation) -> MotionCaptureData:
-        """Return the system before its first measurement."""
         return self.filled(sim, MotionCaptureData, quat=mounting(sim, self.rpy))
 
     def ideal(self, data: SimData) -> Array:
@@ -77,13 +75,11 @@ class MotionCapture(Sensor):
         vel = rotation.rotate(s.quat, rotation.cross(s.ang_vel, record.pos), s.vel)
         return jnp.concatenate([pos, rotation.multiply(s.quat, record.quat), vel])
 
-    def begin_episode(self, data: SimData) -> SimData:
-        """Write the place and the velocity of one drone before the first measurement into the record."""
+    def reset_episode(self, data: SimData) -> SimData:
         pos, vel = jnp.split(self.ideal(data), (7,))
         return self.write(data, self.read(data).replace(last=pos[:3] - self.interval(data) * vel, vel=vel))
 
     def measure(self, data: SimData, record: MotionCaptureData, key: Array) -> tuple[Array, MotionCaptureData]:
-        """Return position, attitude and velocity of one tracked body, and the record after it."""
         truth, dt = self.ideal(data), self.interval(data)
         noise = normal(key, (6,), truth.dtype)
         pos = truth[:3] + record.noise * noise[:3]

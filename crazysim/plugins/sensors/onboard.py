@@ -22,7 +22,7 @@ from crazysim.plugins.sensors.range_finder import RangeFinderData
 from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
 from crazysim.pytree import PyTree, leaf
 
-ERPM = 100.0
+ELECTRICAL_SPEED_STEP = 100.0
 """Step of the electrical speed in telemetry, rpm: the flights of IDSIA's Crazyflies (2025) have it."""
 
 
@@ -37,7 +37,7 @@ class NoisyData(PyTree):
     """Smallest difference of two measurements, in its unit; None for none. (1,)"""
 
 
-class Noisy(Sensor):
+class NoisySensor(Sensor):
     """Base class of sensors whose measurement is the true one with white noise, rounded."""
 
     kind: ClassVar[type[PyTree]] = NoisyData
@@ -49,13 +49,12 @@ class Noisy(Sensor):
     name: str = "noisy"
 
     def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
-        """Return the measurement of one drone, and the record."""
         truth = self.ideal(data)
         value = truth + record.noise * normal(key, truth.shape, truth.dtype)
         return quantise(value, record.resolution), record
 
 
-class RotorSpeeds(Noisy):
+class RotorSpeeds(NoisySensor):
     """Rotor speeds as telemetry of the motors reports them, rpm; needs rotors.
 
     Telemetry counts electrical revolutions in steps of 100 rpm: with six pole pairs, ``resolution=100 / 6``.
@@ -71,15 +70,13 @@ class RotorSpeeds(Noisy):
         """Return a sensor with the resolution of telemetry for motors with a number of pole pairs."""
         if not pole_pairs > 0:
             raise ConfigError(f"expected pole_pairs to be positive, got {pole_pairs}")
-        return cls(resolution=ERPM / pole_pairs, **settings)
+        return cls(resolution=ELECTRICAL_SPEED_STEP / pole_pairs, **settings)
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"speed": self.n_rotors}
 
     def record(self, sim: Simulation) -> PyTree:
-        """Return the sensor before its first measurement."""
         require_rotors(sim, "measuring rotor speeds")
         own = sim.data.states.rotor_vel.shape[-1]
         if self.n_rotors != own:
@@ -95,7 +92,7 @@ class RotorSpeeds(Noisy):
         return {"rotor_vel": self.latest(data)}
 
 
-class BatteryVoltage(Noisy):
+class BatteryVoltage(NoisySensor):
     """Voltage of the battery, V; needs the plugin ``Battery``, added before."""
 
     battery: str = "battery"
@@ -107,11 +104,9 @@ class BatteryVoltage(Noisy):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"voltage": 1}
 
     def record(self, sim: Simulation) -> PyTree:
-        """Return the sensor before its first measurement."""
         if not isinstance(sim.data.plugins.get(self.battery), BatteryData):
             raise ConfigError(f"expected a Battery named {self.battery!r}, got none. Use sim.add(Battery()) first.")
         return super().record(sim)
@@ -121,10 +116,10 @@ class BatteryVoltage(Noisy):
         return data.plugins[self.battery].voltage
 
 
-class MultiRanger(Noisy):
+class MultiRanger(NoisySensor):
     """Distances of a ``RangeFinder``, added before, at a rate, late and with noise, m.
 
-    A distance beyond the range is that of the range finder's ``max_range``, without noise.
+    A distance beyond the range is the range finder's ``max_range``, without noise.
     """
 
     n_rays: int = setting(default=6, low=1)
@@ -138,11 +133,9 @@ class MultiRanger(Noisy):
 
     @property
     def channels(self) -> Mapping[str, int]:
-        """Names and lengths of the parts of a measurement."""
         return {"distance": self.n_rays}
 
     def record(self, sim: Simulation) -> PyTree:
-        """Return the sensor before its first measurement."""
         found = sim.data.plugins.get(self.range_finder)
         if not isinstance(found, RangeFinderData):
             raise ConfigError(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, drone_array, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, drone_array, parameter
 from crazysim.core.stage import Stage
 from crazysim.eager import jit_unless_traced
 from crazysim.errors import ConfigError
@@ -43,13 +43,13 @@ class RadarData(PyTree):
 
     @jit_unless_traced()
     def margin_at(self, pos: Array) -> Array:
-        """Return the depth of a place within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
+        """Return the depth of a point within each lobe, m, negative outside; see ``lobe_margin``. (..., n_radars)"""
         offset = pos[..., None, :] - self.pos
         return lobe_margin(offset, self.max_range, self.exponent, self.height_scale, self.tilt)
 
 
 class Radar(Plugin):
-    """Radars, each of which detects the drones within its lobe; nothing hides a drone.
+    """Radars, each detecting the drones within its lobe; nothing hides a drone.
 
     The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: the range is the same in
     all directions. Settings are one for all radars, or one for each.
@@ -70,7 +70,6 @@ class Radar(Plugin):
     name: str = "radar"
 
     def record(self, sim: Simulation) -> RadarData:
-        """Return the radars, before any detection."""
         pos = np.asarray(self.pos, np.float64)
         pos = pos[None] if pos.ndim == 1 else pos
         if pos.ndim != 2 or pos.shape[1] != 3 or not len(pos):
@@ -86,9 +85,8 @@ class Radar(Plugin):
             found[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
         return RadarData(pos=device_array(pos, dtype), **found, exposure=drone_array(sim, 0.0, len(pos)))
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that counts the time within the lobes."""
-        return [Placement(Stage(self.count, "drone"), before="increment_steps")]
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
+        return [StagePlacement(Stage(self.count, "drone"), before="increment_steps")]
 
     def count(self, data: SimData) -> SimData:
         """Add a step to the time within each lobe, of one drone."""
@@ -106,7 +104,6 @@ class Radar(Plugin):
         return {"margin": record.margin_at(data.states.pos), "exposure": record.exposure}
 
     def draw(self, sim: Simulation, world: int) -> None:
-        """Draw the lobes."""
         if not self.visible:
             return
         detected = np.any(np.asarray(self.detects(sim.data))[world], axis=0).reshape(-1)
@@ -119,7 +116,7 @@ class Radar(Plugin):
 
 @jit_unless_traced()
 def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
-    """Return the depth of a place within a radar's lobe along the normal to its axis, m, negative outside. (...)
+    """Return the depth of a point within a radar's lobe along the normal to its axis, m, negative outside. (...)
 
     With a half the range, the lobe is the teardrop ``x = a (1 - cos t)``, ``|z| <= h a sin(t) sin(t / 2)^e``, t from 0
     to pi, tilted in the vertical plane and then turned about the vertical axis (facts of AIMotionLab-Virtual, 2024).

@@ -14,16 +14,16 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, parameter
 from crazysim.core.stage import Stage
 from crazysim.errors import ConfigError
 from crazysim.plugins.sensors.sensor import steps_between
 from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.scene.collision import CollisionModel
-from crazysim.scene.placement import place, placed_by
-from crazysim.scene.rays import MAX_UNROLLED, RayKernels, cast
+from crazysim.scene.object_poses import moving_plugins, with_moved_objects
+from crazysim.scene.ray_casting import MAX_UNROLLED_GEOMS, RayKernels, cast_rays
 
-MULTI_RANGER = {
+MULTI_RANGER_DIRECTIONS = {
     "front": (1, 0, 0),
     "back": (-1, 0, 0),
     "left": (0, 1, 0),
@@ -31,7 +31,7 @@ MULTI_RANGER = {
     "up": (0, 0, 1),
     "down": (0, 0, -1),
 }
-GREEN = (0.1, 0.8, 0.2, 1.0)
+RAY_COLOR = (0.1, 0.8, 0.2, 1.0)
 
 
 class RangeFinderData(PyTree):
@@ -52,7 +52,7 @@ class RangeFinder(Plugin):
     collide with.
     """
 
-    MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER
+    MULTI_RANGER: ClassVar[Mapping[str, tuple[int, int, int]]] = MULTI_RANGER_DIRECTIONS
     """Directions of a multi-ranger deck by name, body frame."""
 
     directions: ArrayLike | None = parameter(default=None)
@@ -68,8 +68,9 @@ class RangeFinder(Plugin):
     name: str = "range_finder"
 
     def record(self, sim: Simulation) -> RangeFinderData:
-        """Return rays that have measured nothing."""
-        rays = np.asarray(list(MULTI_RANGER.values()) if self.directions is None else self.directions, np.float64)
+        rays = np.asarray(
+            list(MULTI_RANGER_DIRECTIONS.values()) if self.directions is None else self.directions, np.float64
+        )
         if rays.ndim != 2 or rays.shape[1] != 3 or not rays.any(axis=-1).all():
             raise ConfigError(f"expected directions as vectors (n_rays, 3), none of them zero, got {rays.tolist()}")
         steps_between(self, sim)
@@ -78,21 +79,21 @@ class RangeFinder(Plugin):
         distance = np.full((sim.n_worlds, sim.n_drones, len(rays)), far)
         return RangeFinderData(device_array(distance), device_array(rays), device_array(far))
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that measures: of one drone; of one world if drones or loads are to be measured; or of all
         worlds if more can move than a step's kernel has code for.
         """
         visual, solid = sim.scene.visual_model, sim.scene.collision_model
-        placed = placed_by(sim.scene.plugins(), [body.name for body in visual.objects])
+        moved = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
         touched = {body.name for body in solid.objects}
-        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in placed)
+        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in moved)
         # The outline of a drone is enough for a few rays.
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
-        placed = {name: plugin for name, plugin in placed.items() if name in touched}
+        moved = {name: plugin for name, plugin in moved.items() if name in touched}
         n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
         if self.drones:
             n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
-        scope = "batch" if n_movable > MAX_UNROLLED else "world" if self.drones or placed else "drone"
+        scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or moved else "drone"
         period, scene = steps_between(self, sim), sim.scene
 
         def is_due(data: SimData) -> Array:
@@ -101,8 +102,9 @@ class RangeFinder(Plugin):
 
         def measure(data: SimData) -> SimData:
             """Measure distances, to loads where they are now."""
-            present = {name: plugin for name, plugin in placed.items() if plugin.name in data.plugins}
-            return self.write(data, self._measured(model, place(data, present), scope == "drone", scene.ray_kernels))
+            present = {name: plugin for name, plugin in moved.items() if plugin.name in data.plugins}
+            current = with_moved_objects(data, present)
+            return self.write(data, self._measure(model, current, scope == "drone", scene.ray_kernels))
 
         def measure_at_times(data: SimData) -> SimData:
             """Measure in a call that is left out where no world measures."""
@@ -110,15 +112,14 @@ class RangeFinder(Plugin):
 
         fn = measure_at_times if scope == "batch" and period > 1 else measure
         when = None if period == 1 else is_due
-        why = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED}, are cast by a kernel of their own"
-        return [Placement(Stage(fn, scope, when, name="range_finder", why=why), before="increment_steps")]
+        why = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a kernel of their own"
+        return [StagePlacement(Stage(fn, scope, when, name="range_finder", why=why), before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the distances, m."""
         return {"distance": self.read(data).distance}
 
     def draw(self, sim: Simulation, world: int) -> None:
-        """Draw the rays up to what they met."""
         if not self.visible:
             return
         record, states = self.read(sim.data), sim.data.states
@@ -126,9 +127,9 @@ class RangeFinder(Plugin):
         direction = rotation.rotate(states.quat[world][:, None], record.direction)
         end = start + np.asarray(record.distance[world])[..., None] * np.asarray(direction)
         for points in np.stack(np.broadcast_arrays(start, end), axis=-2).reshape(-1, 2, 3):
-            sim.scene.renderer.overlays.line(points, GREEN, 2.0, 2.0)
+            sim.scene.renderer.overlays.line(points, RAY_COLOR, 2.0, 2.0)
 
-    def _measured(self, model: CollisionModel, data: SimData, of_drone: bool, kernels: RayKernels) -> RangeFinderData:
+    def _measure(self, model: CollisionModel, data: SimData, of_drone: bool, kernels: RayKernels) -> RangeFinderData:
         """Return the record with the distances of one drone, of one world, or of all worlds."""
         record, states = self.read(data), data.states
         pos, quat = (states.pos[None], states.quat[None]) if of_drone else (states.pos, states.quat)
@@ -137,6 +138,6 @@ class RangeFinder(Plugin):
         origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
         own = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
         origin, direction = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
-        hits = cast(model, data, origin, direction, own, self.drones, kernels=kernels, limit=record.max_range)
+        hits = cast_rays(model, data, origin, direction, own, self.drones, kernels=kernels, limit=record.max_range)
         distance = jnp.minimum(hits.distance, record.max_range).reshape(*pos.shape[:-1], n_rays)
         return record.replace(distance=distance[0] if of_drone else distance)

@@ -1,4 +1,4 @@
-"""Base class of sensors: a rate, a delay with jitter, and lost measurements; errors are those of each sensor."""
+"""Base class of sensors: a rate, a delay with jitter, and lost measurements; each sensor has its own errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, drone_array, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import dividing_rate, setting
 from crazysim.core.stage import Stage, tick
@@ -26,9 +26,9 @@ R = TypeVar("R", bound=PyTree)
 
 MAX_ROWS = 64
 """Most measurements of one sensor in transit."""
-NEVER = 2**31 - 1
+NEVER_ARRIVES = 2**31 - 1
 """Step of arrival of a measurement that is lost."""
-LONGEST = 100.0
+MAX_DELAY = 100.0
 """Longest delay, s."""
 
 
@@ -54,28 +54,28 @@ class Samples(PyTree):
 class Sensor(Plugin):
     """Base class of sensors that measure at a rate, and whose measurements may arrive late or never.
 
-    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``begin_episode`` if a
-    sensor has errors of its own, drawn once an episode with ``begin_key``. Its record has a field ``samples``.
+    A subclass defines ``kind`` or ``record``, ``channels``, ``ideal`` and ``measure``, and ``reset_episode`` if a
+    sensor has errors of its own, drawn once an episode with ``episode_key``. Its record has a field ``samples``.
     Measurements are taken after the state of the step is known; the latest one is held. A measurement that is overtaken
     by a newer one is discarded.
     """
 
     kind: ClassVar[type[PyTree]]
     """Class of the record."""
-    begins_before: ClassVar[str | None] = "increment_steps"
-    """Name of the stage in front of which an episode begins: at the state of the first measurement."""
+    reset_before: ClassVar[str | None] = "increment_steps"
+    """Name of the stage before which an episode is reset: at the state of the first measurement."""
 
     _: dataclasses.KW_ONLY
     freq: int | None = None
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
-    delay: ArrayLike = parameter(default=0.0, low=0.0, high=LONGEST)
+    delay: ArrayLike = parameter(default=0.0, low=0.0, high=MAX_DELAY)
     """Time from measurement to arrival, s, rounded to steps. () or (n_worlds, n_drones)"""
-    jitter: ArrayLike = parameter(default=0.0, low=0.0, high=LONGEST)
+    jitter: ArrayLike = parameter(default=0.0, low=0.0, high=MAX_DELAY)
     """Largest random addition to the delay, s, uniform from zero. () or (n_worlds, n_drones)"""
     dropout: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Probability that a measurement is lost, 0 to 1. () or (n_worlds, n_drones)"""
-    max_delay: float | None = setting(default=None, low=0.0, high=LONGEST)
-    """Largest delay with jitter that the record can take later on, s; None for that of ``delay`` and ``jitter``."""
+    max_delay: float | None = setting(default=None, low=0.0, high=MAX_DELAY)
+    """Largest delay with jitter that the record can take later on, s; None for ``delay`` plus ``jitter``."""
     name: str = "sensor"
 
     @property
@@ -91,12 +91,11 @@ class Sensor(Plugin):
         """Return a measurement of one drone, (k,), and the record of the plugin after it."""
         raise NotImplementedError
 
-    def begin_key(self, data: SimData) -> Array:
+    def episode_key(self, data: SimData) -> Array:
         """Return the random key of one drone for the errors that stay the same in an episode. ()"""
         return drone_key(data, f"{self.name}_begin")
 
     def record(self, sim: Simulation) -> PyTree:
-        """Return the sensor before its first measurement."""
         if not hasattr(self, "kind"):
             raise NotImplementedError(f"{type(self).__name__} needs kind, the class of its record, or a method record")
         return self.filled(sim, self.kind)
@@ -108,7 +107,7 @@ class Sensor(Plugin):
     def samples(self, sim: Simulation) -> Samples:
         """Return the field ``samples`` of the record, before the first measurement; check the common settings."""
         period = steps_between(self, sim)
-        k, shape, longest = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._longest
+        k, shape, longest = sum(self.channels.values()), sim.data.states.pos.shape[:2], self._max_delay
         rows = math.floor(longest * sim.data.core.freq / period + 0.5) + 2 if longest > 0 else 0
         if rows > MAX_ROWS:
             raise ConfigError(
@@ -122,7 +121,7 @@ class Sensor(Plugin):
                 "delay": check_parameter(sim, "delay", self.delay, (1,), 0.0, longest),
                 "jitter": check_parameter(sim, "jitter", self.jitter, (1,), 0.0, longest),
                 "queue": drone_array(sim, 0.0, rows, k),
-                "due": device_array(np.full((*shape, rows), NEVER), np.int32),
+                "due": device_array(np.full((*shape, rows), NEVER_ARRIVES), np.int32),
             }
         return Samples(
             value=drone_array(sim, 0.0, k),
@@ -134,17 +133,18 @@ class Sensor(Plugin):
             due=transit.get("due"),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stages that measure, and deliver late measurements."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         end, placements = "increment_steps", []
         when = None if steps_between(self, sim) == 1 else lambda data: tick(data, self.freq or data.core.freq)
-        placements.append(Placement(Stage(self._take, "drone", when), before=end))
+        placements.append(StagePlacement(Stage(self._take_measurement, "drone", when), before=end))
         if self.is_late:
-            placements.append(Placement(Stage(self._deliver, "drone"), before=end, name=f"{self.name}_arrival"))
+            placements.append(
+                StagePlacement(Stage(self._deliver_measurement, "drone"), before=end, name=f"{self.name}_arrival")
+            )
         return placements
 
     def latest(self, data: SimData) -> Array:
-        """Return the latest measurement of one drone; that of a perfect sensor before the first one arrives. (k,)"""
+        """Return the latest measurement of one drone; a perfect one before the first arrives. (k,)"""
         samples = self.read(data).samples
         return jnp.where(samples.taken >= 0, samples.value, self.ideal(data))
 
@@ -167,7 +167,6 @@ class Sensor(Plugin):
         return parts
 
     def observations(self, data: SimData) -> dict[str, Array]:
-        """Return the parts of the latest measurement."""
         return self.split(self.latest(data))
 
     def interval(self, data: SimData) -> float:
@@ -177,16 +176,16 @@ class Sensor(Plugin):
     @property
     def is_late(self) -> bool:
         """True where measurements arrive after a delay."""
-        return bool(self._longest)
+        return bool(self._max_delay)
 
     @property
-    def _longest(self) -> float:
+    def _max_delay(self) -> float:
         """Longest delay that a record has room for, s."""
         if self.max_delay is not None:
             return self.max_delay
         return float(np.max(np.asarray(self.delay)) + np.max(np.asarray(self.jitter)))
 
-    def _take(self, data: SimData) -> SimData:
+    def _take_measurement(self, data: SimData) -> SimData:
         """Take a measurement of one drone, and send it on its way."""
         key, step = drone_key(data, self.name), data.core.steps
         value, record = self.measure(data, self.read(data), key)
@@ -202,12 +201,12 @@ class Sensor(Plugin):
             samples = samples.replace(value=value, taken=taken)
         else:
             due = step + jnp.round(data.core.freq * (samples.delay + late * samples.jitter)).astype(jnp.int32)
-            due = due if samples.dropout is None else jnp.where(lost, NEVER, due)
+            due = due if samples.dropout is None else jnp.where(lost, NEVER_ARRIVES, due)
             queue = jnp.concatenate([value[None], samples.queue[:-1]])
             samples = samples.replace(queue=queue, due=jnp.concatenate([due, samples.due[:-1]]))
         return self.write(data, record.replace(samples=samples))
 
-    def _deliver(self, data: SimData) -> SimData:
+    def _deliver_measurement(self, data: SimData) -> SimData:
         """Replace the latest measurement of one drone by the newest one that has arrived."""
         record, step = self.read(data), data.core.steps
         samples, period = record.samples, data.core.freq // (self.freq or data.core.freq)
@@ -236,7 +235,7 @@ def mounting(sim: Simulation, rpy: ArrayLike) -> Array:
 
 
 def quantise(x: Array, resolution: Array | None) -> Array:
-    """Return the nearest multiple of a resolution, ``x`` for None; its gradient is that of ``x`` itself. (...)"""
+    """Return the nearest multiple of a resolution, with the gradient of ``x``; ``x`` itself for None. (...)"""
     return x if resolution is None else _nearest_multiple(x, resolution)
 
 
@@ -250,7 +249,7 @@ def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Arra
     return _nearest_multiple(*primals), tangents[0]
 
 
-def correlated(state: Array, deviation: Array, time: Array, dt: float, noise: Array) -> Array:
+def gauss_markov_step(state: Array, deviation: Array, time: Array, dt: float, noise: Array) -> Array:
     """Return a first-order Gauss-Markov process one interval later; the variance is exact for any interval.
 
     Args:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crazysim import rotation
 from crazysim.core.plugin import Simulation, check_parameter, drone_array
 from crazysim.core.settings import check_settings, setting
-from crazysim.plugins.sensors.sensor import correlated, quantise
+from crazysim.plugins.sensors.sensor import gauss_markov_step, quantise
 from crazysim.pytree import PyTree, leaf
 
 
@@ -49,7 +49,7 @@ class TriadData(PyTree):
     resolution: Array | None = leaf("parameter", 1, (3,))
     """Smallest difference of two measurements, u; None for none. (3,)"""
 
-    def drawn(self, truth: Array, noise: Array) -> TriadData:
+    def draw_errors(self, truth: Array, noise: Array) -> TriadData:
         """Return the errors of one sensor in an episode.
 
         Args:
@@ -76,7 +76,7 @@ class TriadData(PyTree):
             dt: Time between measurements, s.
         """
         bias = self.bias + self.random_walk * math.sqrt(dt) * noise[3:6]
-        wander = correlated(self.wander, self.instability, self.correlation_time, dt, noise[6:])
+        wander = gauss_markov_step(self.wander, self.instability, self.correlation_time, dt, noise[6:])
         triad = self.replace(bias=bias, wander=wander)
         # a one-sided density up to half the rate
         value = triad.without_noise(truth) + self.noise * math.sqrt(0.5 / dt) * noise[:3]
@@ -135,23 +135,23 @@ class Triad:
         check_settings(self)
 
     def record(self, sim: Simulation, name: str) -> TriadData:
-        """Return the record before the first measurement; ``name`` is that of the sensor in messages."""
+        """Return the record before the first measurement; ``name`` is the sensor's name in messages."""
 
         def vector(field: str) -> Array:
             return check_parameter(sim, f"{field} of {name}", getattr(self, field), (3,), per_axis=True)
 
-        def joined(*fields: str) -> Array:
+        def join_fields(*fields: str) -> Array:
             parts = [np.asarray(vector(field)) for field in fields]
             batch = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
             parts = [np.broadcast_to(x, (*batch, 3)) for x in parts]
             return check_parameter(sim, name, np.concatenate(parts, axis=-1), (9,))
 
-        def optional(field: str, n: int) -> Array | None:
+        def optional_field(field: str, n: int) -> Array | None:
             value = getattr(self, field)
             named = f"{field} of {name}"
             return None if value is None else check_parameter(sim, named, value, (n,), per_axis=True)
 
-        mean = joined("bias", "scale", "misalignment")
+        mean = join_fields("bias", "scale", "misalignment")
         each = drone_array(sim, mean, 9)
         return TriadData(
             bias=each[..., :3],
@@ -164,8 +164,8 @@ class Triad:
             instability=vector("instability"),
             correlation_time=check_parameter(sim, f"correlation_time of {name}", self.correlation_time, (1,)),
             mean=mean,
-            spread=joined("bias_spread", "scale_spread", "misalignment_spread"),
-            bandwidth=optional("bandwidth", 1),
-            limit=optional("limit", 3),
-            resolution=optional("resolution", 3),
+            spread=join_fields("bias_spread", "scale_spread", "misalignment_spread"),
+            bandwidth=optional_field("bandwidth", 1),
+            limit=optional_field("limit", 3),
+            resolution=optional_field("resolution", 3),
         )

@@ -1,17 +1,17 @@
 """Ground vehicles: cars, bicycles and trailers, paths on the ground, and controllers that follow them."""
 
 from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState, ackermann
 from crazysim.plugins.vehicles.cars import Bicycles, Cars
 from crazysim.plugins.vehicles.commonroad import CommonRoadParams, CommonRoadState, commonroad_single_track
 from crazysim.plugins.vehicles.following import PathController, PathState, PurePursuit, Stanley
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.lpv import LPV
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle, vehicle_names
-from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.path import Path, PathPoint
 from crazysim.plugins.vehicles.path_lqr import PathLQR
 from crazysim.plugins.vehicles.single_track import single_track
-from crazysim.plugins.vehicles.state import CarState, ackermann
 
 __all__ = [
     "LPV",

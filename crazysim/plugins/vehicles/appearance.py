@@ -14,8 +14,8 @@ from crazysim.core.data import Objects
 from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_rgba
 from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.car_state import ackermann, heading_quat, tilted_quat
 from crazysim.plugins.vehicles.model import VehicleModel, load_vehicle
-from crazysim.plugins.vehicles.state import ackermann, heading_quat, tilted
 from crazysim.plugins.vehicles.trailer import trailer_axles
 
 BODY, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 0.65, 1.0)
@@ -23,18 +23,18 @@ RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
 """Colours of bodies, rims, spokes, tyres and decks."""
 TOUCHES, GHOST = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
 """Attributes of geoms that drones touch, and of others."""
-SPOKES = 5
+N_SPOKES = 5
 """Spokes of a wheel, which make its rotation visible."""
 
 
-def kinds(cars: Any) -> tuple[str, ...]:
+def part_names(cars: Any) -> tuple[str, ...]:
     """Return the names of the objects of cars, without their numbers."""
     parts = ("body", "wheel", "drawbar", "trailer", "trailer_wheel") if cars.trailer else ("body", "wheel")
     return tuple(_kind(cars, part) for part in parts)
 
 
 def _kind(cars: Any, part: str) -> str:
-    """Return the name of the objects of a part; those of bodies begin with the names of cars."""
+    """Return the name of the objects of a part; names of bodies begin with the names of cars."""
     return cars.name if part == "body" else f"{cars.name}_{part}"
 
 
@@ -43,7 +43,7 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
     number, n = vehicle.number, cars.n_members
     wheel = _wheel(number("wheels.radius"), number("wheels.width"))
     parts = {"body": (_body(vehicle, as_rgba(BODY if cars.rgba is None else cars.rgba)), n)}
-    parts["wheel"] = (wheel, n * len(wheel_places(vehicle)))
+    parts["wheel"] = (wheel, n * len(wheel_positions(vehicle)))
     if cars.trailer:
         length, small = number("trailer.drawbar"), _wheel(number("trailer.wheel_radius"), number("trailer.wheel_width"))
         parts["drawbar"] = (_drawbar(length, number("trailer.track")), n)
@@ -53,8 +53,8 @@ def add_to_scene(sim: Simulation, cars: Any, vehicle: VehicleModel) -> None:
         sim.scene.add_once(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", _kind(cars, part), count)
 
 
-def wheel_places(vehicle: VehicleModel) -> np.ndarray:
-    """Return the places of the wheels in the body frame, front left, front right, rear left, rear right, m. (n, 2)"""
+def wheel_positions(vehicle: VehicleModel) -> np.ndarray:
+    """Return the positions of the wheels, body frame: front left, front right, rear left, rear right, m. (n, 2)"""
     front, rear = vehicle.number("axles.front"), -vehicle.number("axles.rear")
     half = vehicle.number("axles.track") / 2
     sides = (half, -half) if vehicle.number("wheels.number") == 4 else (0.0,)
@@ -62,7 +62,7 @@ def wheel_places(vehicle: VehicleModel) -> np.ndarray:
 
 
 def with_poses(objects: Objects, cars: Any, car: CarData) -> Objects:
-    """Return the objects of a world with those of its cars at their poses.
+    """Return the objects of a world with its cars at their poses.
 
     Args:
         objects: Objects of the world.
@@ -78,11 +78,11 @@ def with_poses(objects: Objects, cars: Any, car: CarData) -> Objects:
 
 def _wheels(vehicle: VehicleModel, car: CarData) -> tuple[Array, Array]:
     """Return positions, m, and attitudes of all wheels; a wheel's axis is its y axis. (n_members n_wheels, ...)"""
-    places = wheel_places(vehicle)
-    shape = (car.pos.shape[0], len(places))
+    positions = wheel_positions(vehicle)
+    shape = (car.pos.shape[0], len(positions))
     body = jnp.broadcast_to(car.quat[:, None], (*shape, 4))
-    pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(places, ((0, 0), (0, 1))), car.pos.dtype))
-    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))[:, : len(places) // 2]
+    pos = car.pos[:, None] + rotation.rotate(body, jnp.asarray(np.pad(positions, ((0, 0), (0, 1))), car.pos.dtype))
+    front = ackermann(car.steer, vehicle.wheelbase, vehicle.number("axles.track"))[:, : len(positions) // 2]
     steer = jnp.concatenate([front, jnp.zeros_like(front)], axis=-1)[..., None]
     rolled = _rolled(jnp.broadcast_to((car.distance / vehicle.number("wheels.radius"))[:, None], steer.shape))
     quat = rotation.multiply(body, rotation.multiply(heading_quat(steer), rolled))
@@ -93,7 +93,7 @@ def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]
     """Return positions, m, and attitudes of drawbars, decks and wheels of trailers, on the plane below their cars."""
     number = vehicle.number
     radius, half = number("trailer.wheel_radius"), number("trailer.track") / 2
-    bar, deck = (tilted(car.joints[:, k : k + 1], car.normal) for k in range(2))
+    bar, deck = (tilted_quat(car.joints[:, k : k + 1], car.normal) for k in range(2))
     front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
     turn = _rolled(car.distance / radius)
     wheels = []
@@ -107,7 +107,7 @@ def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]
 
 
 def _above_plane(at: Array, car: CarData, height: float) -> Array:
-    """Return places, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
+    """Return level positions, (n, 2), at a height above the plane through the cars' centres of mass, m. (n, 3)"""
     off, normal = at - car.pos[:, :2], car.normal
     rise = -(normal[:, :1] * off[:, :1] + normal[:, 1:2] * off[:, 1:]) / normal[:, 2:]
     return jnp.concatenate([at, car.pos[:, 2:] + rise + height], axis=-1)
@@ -149,7 +149,7 @@ def _wheel(radius: float, width: float) -> str:
     axis, reach = 'zaxis="0 1 0"', 0.29 * radius
     rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, GHOST, axis)
     spokes = ""
-    for angle in np.arange(SPOKES) * 2 * np.pi / SPOKES:
+    for angle in np.arange(N_SPOKES) * 2 * np.pi / N_SPOKES:
         at, turn = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
         quat = f'quat="{turn[0]:.6g} 0 {turn[1]:.6g} 0"'
         spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), at, STEEL, GHOST, quat)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.eager import jit_unless_traced
-from crazysim.plugins.vehicles.parameters import CarParams
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState, tilted_quat, to_body_frame, to_world_frame
 from crazysim.plugins.vehicles.path import Path
-from crazysim.plugins.vehicles.state import CarState, tilted, to_body, to_world
 from crazysim.pytree import Members, leaf
 
 
@@ -26,7 +26,7 @@ class CarData(Members):
     yaw_rate: Array = leaf("member", 1)
     """Rate of the heading, rad/s. (n_worlds, n_members, 1)"""
     normal: Array = leaf("member", 1)
-    """Unit normal of the ground below, upwards, world frame; it follows terrain within ``SETTLING``.
+    """Unit normal of the ground below, upwards, world frame; it follows terrain within ``SETTLING_TIME``.
     (n_worlds, n_members, 3)"""
     steer: Array = leaf("member", 1)
     """Steering angle in the middle of the front axle, rad, positive to the left. (n_worlds, n_members, 1)"""
@@ -43,7 +43,7 @@ class CarData(Members):
     force: Array = leaf("member", 1)
     """External force on the centre of mass, world frame, N; kept until it is changed. (n_worlds, n_members, 3)"""
     torque: Array = leaf("member", 1)
-    """External torque, world frame, N m, of which z acts; kept until it is changed. (n_worlds, n_members, 3)"""
+    """External torque, world frame, N m; only z acts. It stays until it is changed. (n_worlds, n_members, 3)"""
     params: CarParams
     """Parameters of the dynamics."""
     path: Path | None
@@ -67,7 +67,7 @@ class CarData(Members):
     @property
     def quat(self) -> Array:
         """Attitude, body to world, xyzw. (n_worlds, n_members, 4)"""
-        return tilted(self.yaw, self.normal)
+        return tilted_quat(self.yaw, self.normal)
 
     @property
     def vel(self) -> Array:
@@ -86,12 +86,12 @@ class CarData(Members):
             vel: Velocity of the centre of mass, world frame, m/s. (..., 3)
             ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         """
-        return self.replace(body_vel=to_body(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
+        return self.replace(body_vel=to_body_frame(self.yaw, vel[..., :2]), yaw_rate=ang_vel[..., 2:])
 
 
 @jit_unless_traced()
 def _level_vel(yaw: Array, body_vel: Array) -> Array:
-    level = to_world(yaw, body_vel)
+    level = to_world_frame(yaw, body_vel)
     return jnp.concatenate([level, jnp.zeros_like(yaw)], axis=-1)
 
 

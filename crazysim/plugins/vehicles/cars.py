@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import Objects, SimData
-from crazysim.core.plugin import Placement, Simulation, parameter
+from crazysim.core.plugin import Simulation, StagePlacement, parameter
 from crazysim.core.population import Population
 from crazysim.core.settings import color, default_rates
 from crazysim.core.stage import Stage, tick
@@ -23,13 +23,13 @@ from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import TerrainData, ground_at
 from crazysim.plugins.vehicles import appearance, starts
 from crazysim.plugins.vehicles.car_data import CarData
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import to_body_frame
 from crazysim.plugins.vehicles.following import PathController, PurePursuit, motor_reference, path_state
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel, VehicleSource, load_vehicle
-from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.path import Path
 from crazysim.plugins.vehicles.single_track import single_track
-from crazysim.plugins.vehicles.state import to_body
 from crazysim.pytree import PyTree, device_array
 from crazysim.trajectories import Trajectory
 
@@ -37,8 +37,8 @@ CONTROL_FREQ = 50
 """Default rate of the controllers, Hz, lowered to the next divisor of the simulation's rate."""
 SPEED_GAIN = 4.0
 """Acceleration over the error of speed at the command level ``speed``, 1/s."""
-SETTLING = 0.02
-"""Time in which height and tilt of a car follow the ground, s: that of stiff springs."""
+SETTLING_TIME = 0.02
+"""Time in which height and tilt of a car follow the ground, s, as with stiff springs."""
 
 
 class Cars(Population):
@@ -57,7 +57,7 @@ class Cars(Population):
     """Positions at the start, x and y, m; None for the start of the path, or a row along y with gaps of 1 m.
     (2,), (n_members, 2) or (n_worlds, n_members, 2)"""
     yaw: ArrayLike | None = parameter(default=None)
-    """Headings at the start, rad; None for that of the path, or zero. (), (n_members,) or (n_worlds, n_members)"""
+    """Headings at the start, rad; None for the path's heading, or zero. (), (n_members,) or (n_worlds, n_members)"""
     level: Literal["drive", "speed"] = "drive"
     """Command level of cars without a path."""
     path: Path | Trajectory | Sequence[Path | Trajectory] | None = None
@@ -65,7 +65,7 @@ class Cars(Population):
     controller: PathController | None = None
     """Controller that follows paths; None for ``PurePursuit()``."""
     reference: Literal["time", "arc"] = "time"
-    """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the place where the car is."""
+    """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the path where the car is."""
     index: ArrayLike | None = parameter(default=None)
     """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
     start: ArrayLike | None = parameter(default=None)
@@ -85,7 +85,6 @@ class Cars(Population):
     command_field: ClassVar[str | None] = "command"
 
     def with_poses(self, record: CarData, pos: Array, quat: Array) -> CarData:
-        """Return a record with other positions and headings; trailers stand straight behind."""
         yaw = rotation.yaw(quat)[..., None]
         joints = None if record.joints is None else jnp.broadcast_to(yaw, record.joints.shape)
         return record.replace(pos=pos, yaw=yaw, joints=joints)
@@ -114,28 +113,27 @@ class Cars(Population):
         return default_rates(freq, {"rate": CONTROL_FREQ}, f" of {self.name!r}")["rate"]
 
     def record(self, sim: Simulation) -> CarData:
-        """Return the cars at rest at their starts."""
         self.check(sim)
         vehicle, freq, counts = self.model, sim.data.core.freq, (sim.n_worlds, self.n_members)
         self._check_settings(vehicle)
         paths, follows = self._paths(), self.follows
         index = start = arc = gains = memory = None
         params = CarParams.create(vehicle, freq, self.trailer)
-        pos, yaw = starts.in_a_row(self.n_members), np.zeros((self.n_members, 1))
+        pos, yaw = starts.row_positions(self.n_members), np.zeros((self.n_members, 1))
         if paths is not None and follows is not None:
             follows.check(vehicle, paths)
-            index = starts.numbers("index", self._indices(paths), counts, paths.n_paths)
-            given = starts.spread(paths, index, self.n_members) if self.start is None else self.start
-            start = starts.numbers("start", given, counts)
-            pos, yaw, arc = starts.on_path(paths, index, start, counts)
+            index = starts.member_numbers("index", self._indices(paths), counts, paths.n_paths)
+            given = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
+            start = starts.member_numbers("start", given, counts)
+            pos, yaw, arc = starts.path_poses(paths, index, start, counts)
             gains, memory = follows.gains(vehicle, params, self.rate_in(freq)), follows.memory()
         if self.pos is not None:
-            pos = starts.per_member("pos", self.pos, counts, (2,))
+            pos = starts.member_array("pos", self.pos, counts, (2,))
         if self.yaw is not None:
-            yaw = starts.per_member("yaw", np.asarray(self.yaw)[..., None], counts, (1,))
+            yaw = starts.member_array("yaw", np.asarray(self.yaw)[..., None], counts, (1,))
         pos, yaw = (np.broadcast_to(x, (*counts, x.shape[-1])) for x in (pos, yaw))
         if arc is not None and self.pos is not None:
-            arc = starts.projected(paths, index, pos, arc)
+            arc = starts.project_arcs(paths, index, pos, arc)
         height, normal = ground_at(sim.data, device_array(np.concatenate([pos, pos[..., :1]], axis=-1)))
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
@@ -161,23 +159,22 @@ class Cars(Population):
             index=index,
             start=start,
             arc=arc,
-            memory=_for_members(memory, counts),
+            memory=_repeat_for_members(memory, counts),
             gains=gains,
         )
         if self.in_scene:
             appearance.add_to_scene(sim, self, vehicle)
         return record
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of controller and integration; commands of the level ``drive`` need no controller."""
-        placed = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
+        inherited = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
         if self.follows is None and self.level == "drive":
-            return placed
+            return inherited
         name, when = f"{self.name}_control", functools.partial(tick, freq=self.rate_in(sim.data.core.freq))
-        return [Placement(Stage(self._controlled, self.name, when, name=name), name=name), *placed]
+        return [StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name), *inherited]
 
     def control(self, data: SimData) -> CarData:
-        """Return the record of one car with motor reference and steering angle for the next period."""
         car = self.read(data)
         follows = self.follows
         if follows is None:
@@ -190,7 +187,6 @@ class Cars(Population):
         return car.replace(applied=applied, arc=at.arc, memory=memory)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
-        """Return the rates of the states of one car."""
         car = self.read(data)
         model = kinematic if self.model.dynamics == "kinematic" else single_track
         command = car.command if car.applied is None else car.applied
@@ -198,30 +194,27 @@ class Cars(Population):
         if any(isinstance(record, TerrainData) for record in data.plugins.values()):
             force = force - GRAVITY[2] * car.params.mass * car.normal[2:] * car.normal[:2]
             settling = self._settling(data, car)
-        push = jnp.concatenate([to_body(car.yaw, force), car.torque[2:]])
+        push = jnp.concatenate([to_body_frame(car.yaw, force), car.torque[2:]])
         rates = model(car.state, command, car.params, push)._asdict() | settling
         return {name: rate for name, rate in rates.items() if rate is not None}
 
     def _settling(self, data: SimData, car: CarData) -> dict[str, Array]:
         """Return the rates of position and normal of one car that follows terrain."""
         height, normal = ground_at(data, car.pos)
-        vel, rate = car.vel, 1 / max(SETTLING, 2 / data.core.freq)
+        vel, rate = car.vel, 1 / max(SETTLING_TIME, 2 / data.core.freq)
         climb = -(normal[:1] * vel[:1] + normal[1:2] * vel[1:2]) / normal[2:]
         sink = rate * (height + self.model.number("wheels.radius") - car.pos[2:])
         return {"pos": jnp.concatenate([vel[:2], climb + sink]), "normal": rate * (normal - car.normal)}
 
-    def place(self, data: SimData) -> Objects:
-        """Return the objects of a world with the cars' bodies, wheels and trailers at their poses."""
+    def move_objects(self, data: SimData) -> Objects:
         return appearance.with_poses(data.objects, self, self.read(data))  # type: ignore[arg-type]
 
     @property
-    def placed_kinds(self) -> tuple[str, ...] | None:
-        """Names of the objects that ``place`` moves, without their numbers."""
-        return appearance.kinds(self)
+    def moved_kinds(self) -> tuple[str, ...] | None:
+        return appearance.part_names(self)
 
     @property
-    def places(self) -> bool:
-        """True if the cars are in the scene."""
+    def moves_objects(self) -> bool:
         return self.in_scene
 
     def _check_settings(self, vehicle: VehicleModel) -> None:
@@ -255,7 +248,7 @@ class Cars(Population):
         return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index
 
 
-def _for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:
+def _repeat_for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:
     """Return a record of one member repeated for all."""
     return None if record is None else jax.tree.map(lambda x: np.array(np.broadcast_to(x, (*counts, *x.shape))), record)
 

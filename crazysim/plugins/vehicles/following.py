@@ -10,10 +10,10 @@ from jax import Array
 
 from crazysim.core.settings import check_settings, setting
 from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 from crazysim.plugins.vehicles.model import VehicleModel
-from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.path import Path
-from crazysim.plugins.vehicles.state import CarState, to_world
 from crazysim.pytree import PyTree
 from crazysim.rotation import safe_arctan2, safe_clip
 
@@ -21,7 +21,7 @@ from crazysim.rotation import safe_arctan2, safe_clip
 class PathState(NamedTuple):
     """A vehicle relative to its path at one instant.
 
-    Offset, heading error and curvature are those of the path along the direction in which the vehicle points:
+    Offset, heading error and curvature refer to the path along the direction in which the vehicle points:
     of a path that is driven backwards, against its direction.
     """
 
@@ -34,7 +34,7 @@ class PathState(NamedTuple):
     offset: Array
     """Distance of the projected point of the vehicle from the path, m, positive to the left of it. (1,)"""
     heading_error: Array
-    """Heading relative to that of the path, rad, from -pi to pi, positive to the left. (1,)"""
+    """Heading relative to the path, rad, from -pi to pi, positive to the left. (1,)"""
     curvature: Array
     """Signed curvature of the path, 1/m. (1,)"""
     speed: Array
@@ -201,15 +201,13 @@ class PurePursuit(PathController):
     """Growth of the look-ahead distance with speed, s."""
 
     def ahead(self, car: CarParams) -> Array:
-        """Return the distance to the rear axle."""
         return -car.rear
 
     def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
-        """Return the steering angle."""
         distance = self.lookahead + self.lookahead_time * jnp.abs(state.body_vel[0])
         goal = at.path.at(at.index, at.arc[0] + distance).pos
         axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
-        seen = to_world(-state.yaw, goal - axle)
+        seen = to_world_frame(-state.yaw, goal - axle)
         square = seen[:1] * seen[:1] + seen[1:] * seen[1:]
         # Past the end of an open path the point is that end, as near as one likes.
         curvature = 2 * seen[1:] / jnp.maximum(square, 0.25 * self.lookahead * self.lookahead + 1e-4)
@@ -230,10 +228,8 @@ class Stanley(PathController):
     """Speed v_0 that is added, so that slow vehicles steer gently, m/s."""
 
     def ahead(self, car: CarParams) -> Array:
-        """Return the distance to the front axle."""
         return car.front
 
     def steering(self, state: CarState, at: PathState, memory: Any, gains: Any, car: CarParams) -> tuple[Array, Any]:
-        """Return the steering angle."""
         speed = self.soft_speed + jnp.abs(state.body_vel[:1])
         return -at.heading_error - jnp.arctan(self.gain * at.offset / speed), memory

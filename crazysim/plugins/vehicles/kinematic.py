@@ -5,11 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.plugins.vehicles.parameters import CarParams
-from crazysim.plugins.vehicles.single_track import drive_force, rates_of, steer_rate
-from crazysim.plugins.vehicles.state import CarState
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState
+from crazysim.plugins.vehicles.single_track import drive_force, state_rates, steer_rate
 
-RETURN = 50.0
+RETURN_RATE = 50.0
 """Rate at which velocities that no rolling wheels allow decrease, 1/s."""
 
 
@@ -36,6 +36,6 @@ def kinematic(state: CarState, command: Array, params: CarParams, push: Array | 
     tan, turn = jnp.tan(state.steer), steer_rate(state, command, p)
     yaw_rate = speed * tan / wheelbase
     yaw_acc = (forward * tan + speed * turn * (1 + tan * tan)) / wheelbase
-    side = p.rear * yaw_acc + RETURN * (p.rear * yaw_rate - state.body_vel[..., 1:])
+    side = p.rear * yaw_acc + RETURN_RATE * (p.rear * yaw_rate - state.body_vel[..., 1:])
     acc = jnp.concatenate([forward, side], axis=-1)
-    return rates_of(state, acc, yaw_acc + RETURN * (yaw_rate - state.yaw_rate), turn, p)
+    return state_rates(state, acc, yaw_acc + RETURN_RATE * (yaw_rate - state.yaw_rate), turn, p)

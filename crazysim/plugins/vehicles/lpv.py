@@ -10,21 +10,21 @@ import numpy as np
 from jax import Array
 
 from crazysim.errors import ConfigError
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.following import PathController, PathState
 from crazysim.plugins.vehicles.model import VehicleModel
-from crazysim.plugins.vehicles.parameters import CarParams
-from crazysim.plugins.vehicles.state import CarState
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import safe_arctan2, safe_clip
 
-LATERAL = {
+LATERAL_GAINS = {
     "aiml_apr24": ((0.00127, -0.00864, 0.0192, 0.0159), (0.172, -1.17, 2.59, 2.14), (0.00423, 0.0948, 0.463, 0.00936)),
     "aiml_head": ((0.00127, -0.00864, 0.0192, 0.0159), (0.172, -1.17, 2.59, 5.14), (0.00423, 0.0948, 0.463, 0.00936)),
 }
 """Gains of integral, offset and its rate as polynomials of the speed, highest power first. Sources:
 AIMotionLab-Virtual, commit ea392436, aiml_virtual/controller/car_controller.py, and commit fc1bc3e0,
 aiml_virtual/controller/car_lpv_controller.py."""
-LONGITUDINAL = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
+LONGITUDINAL_GAINS = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
 """Gains of distance and speed as polynomials of the model's parameter p, highest power first. Sources: the same."""
 RATE, INTEGRAL_MAX, SMOOTHING = 40, 0.1, 0.5
 """Rate of the controller for which the integral's gain is, Hz, limit of the integral, m, and weight of the newest
@@ -61,16 +61,17 @@ class LPV(PathController):
         steer = -heading_error + k1(v) q + k2(v) e + k3(v) e' + f curvature
 
     Along the path, with ``p = |cos(heading_error + slip) / cos(slip) / (1 - curvature offset)|`` and the lag l behind a
-    reference by time, the motor reference is that of speed ``v_ref / p``, plus ``kl1(p) l + kl2(p) (v_ref / p - v)``.
+    reference by time, the motor reference belongs to the speed ``v_ref / p``, plus ``kl1(p) l + kl2(p) (v_ref / p -
+    v)``.
 
-    Gains and feed-forward f are published (``LATERAL``, ``LONGITUDINAL``). The lab's curvature has no sign, which
-    steers the wrong way in one direction of turning; here it has. Forwards only, for the F1TENTH cars.
+    Gains and feed-forward f are published (``LATERAL_GAINS``, ``LONGITUDINAL_GAINS``). The lab's curvature has no sign,
+    which steers the wrong way in one direction of turning; here it has. Forwards only, for the F1TENTH cars.
     """
 
     backwards: ClassVar[bool] = False
-    lateral: Sequence[Sequence[float]] = LATERAL["aiml_head"]
+    lateral: Sequence[Sequence[float]] = LATERAL_GAINS["aiml_head"]
     """Gains k1, k2, k3 as polynomials of the speed, highest power first."""
-    longitudinal: Sequence[Sequence[float]] = LONGITUDINAL
+    longitudinal: Sequence[Sequence[float]] = LONGITUDINAL_GAINS
     """Gains kl1, kl2 as polynomials of p, highest power first; in place of ``position_gain`` and ``speed_gain``."""
 
     def __post_init__(self) -> None:
@@ -92,13 +93,11 @@ class LPV(PathController):
         return LPVGains(as_parameter(feedforward), as_parameter(1 / freq))
 
     def memory(self) -> LPVMemory:
-        """Return the memory before the first tick."""
         return LPVMemory(*[as_parameter(0.0) for _ in range(4)])
 
     def steering(
         self, state: CarState, at: PathState, memory: LPVMemory, gains: LPVGains, car: CarParams
     ) -> tuple[Array, LPVMemory]:
-        """Return the steering angle."""
         right, speed = -at.offset, state.body_vel[:1]
         integral = safe_clip(memory.integral + RATE * gains.period * right, -INTEGRAL_MAX, INTEGRAL_MAX)
         newest = (right - memory.offset) / gains.period
@@ -109,7 +108,6 @@ class LPV(PathController):
         return steer, LPVMemory(integral, right, rate, jnp.ones_like(memory.started))
 
     def driving(self, state: CarState, at: PathState, gains: LPVGains, car: CarParams) -> Array:
-        """Return the motor reference."""
         vx, vy = state.body_vel[:1], state.body_vel[1:]
         slip = safe_arctan2(vy, jnp.abs(vx))
         room = jnp.maximum(1 - at.curvature * at.offset, 0.2)

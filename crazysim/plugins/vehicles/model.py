@@ -29,9 +29,9 @@ from crazysim.tables import (
     read_source,
 )
 
-FOLDER = Path(__file__).parent
+VEHICLE_FOLDER = Path(__file__).parent
 GUIDE = "docs/guides/vehicles.md"
-DYNAMICS = ("single_track", "kinematic")
+DYNAMICS_NAMES = ("single_track", "kinematic")
 """Names of the dynamics of vehicles."""
 
 _SIZE, _MAYBE_SIZE = Key(((),), LENGTH), Key(((),), LENGTH_OR_ZERO)
@@ -77,7 +77,7 @@ KEYS: dict[str, Key] = {
     "shape.height": _SIZE,
 }
 """Shapes and ranges of all numbers, by table and key."""
-OPTIONAL = ("tyres.front", "tyres.rear", "drive.", "trailer.")
+OPTIONAL_KEYS = ("tyres.front", "tyres.rear", "drive.", "trailer.")
 """Beginnings of the keys that a vehicle may lack; ``drive`` needs its force or its torque."""
 LAYOUT = Layout(KEYS, ("name", "base", "model", "sources"), GUIDE)
 """Keys of vehicles."""
@@ -90,7 +90,7 @@ class VehicleModel:
     name: str
     """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
     dynamics: str
-    """Dynamics of the vehicle, one of ``DYNAMICS``."""
+    """Dynamics of the vehicle, one of ``DYNAMICS_NAMES``."""
     numbers: Mapping[str, NDArray[np.float64]]
     """All numbers by table and key, such as ``rigid_body.mass``."""
 
@@ -129,7 +129,7 @@ VehicleSource = str | Path | Mapping[str, Any] | VehicleModel
 
 def vehicle_names() -> tuple[str, ...]:
     """Return the names of the built-in vehicle models."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
+    return tuple(sorted(path.stem for path in VEHICLE_FOLDER.glob("*.toml")))
 
 
 def load_vehicle(source: VehicleSource) -> VehicleModel:
@@ -143,40 +143,41 @@ def load_vehicle(source: VehicleSource) -> VehicleModel:
 
     Raises:
         UnknownNameError: If the source is neither the name of a vehicle nor a file.
-        ConfigError: If a table or key does not exist, or the numbers cannot be those of a vehicle.
+        ConfigError: If a table or key does not exist, or the numbers cannot belong to a vehicle.
     """
-    return _load(source, ())
+    return _load_model(source, ())
 
 
-def _load(source: Any, bases: tuple[str, ...]) -> VehicleModel:
+def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
     """Return the vehicle model of a source, which is the base of others."""
     if isinstance(source, VehicleModel):
         return source
     bases = extend_bases(bases, source)
-    stem, origin, tables = read_source(source, "vehicle", "a VehicleModel", FOLDER, vehicle_names(), GUIDE)
+    stem, origin, tables = read_source(source, "vehicle", "a VehicleModel", VEHICLE_FOLDER, vehicle_names(), GUIDE)
     name = str(tables.get("name", stem))
-    base = _load(tables["base"], bases) if "base" in tables else None
+    base = _load_model(tables["base"], bases) if "base" in tables else None
     numbers = dict(base.numbers) if base is not None else {}
     own = dict(LAYOUT.numbers(f"vehicle {name!r}{origin}", tables))
     for kind, other in (("torque", "force"), ("force", "torque")):
         if f"drive.{kind}" in own:
             numbers = {key: x for key, x in numbers.items() if not key.startswith(f"drive.{other}")}
-    dynamics = tables.get("model", base.dynamics if base is not None else DYNAMICS[0])
+    dynamics = tables.get("model", base.dynamics if base is not None else DYNAMICS_NAMES[0])
     vehicle = VehicleModel(name, dynamics, numbers | own)
-    _check(vehicle)
+    _check_model(vehicle)
     return vehicle
 
 
-def _check(vehicle: VehicleModel) -> None:
-    """Check that the numbers are those of a vehicle that can drive."""
+def _check_model(vehicle: VehicleModel) -> None:
+    """Check that a vehicle with these numbers can drive."""
     name, numbers = vehicle.name, vehicle.numbers
-    if vehicle.dynamics not in DYNAMICS:
+    if vehicle.dynamics not in DYNAMICS_NAMES:
         raise ConfigError(
-            f"vehicle {name!r}: expected model as one of {', '.join(DYNAMICS)}, got {short_repr(vehicle.dynamics)}"
+            f"vehicle {name!r}: expected model as one of {', '.join(DYNAMICS_NAMES)}, got "
+            f"{short_repr(vehicle.dynamics)}"
         )
     tyres = ("tyres.front", "tyres.rear") if vehicle.dynamics == "single_track" else ()
     trailer = tuple(key for key in KEYS if key.startswith("trailer.")) if vehicle.has_trailer else ()
-    needed = [key for key in KEYS if not key.startswith(OPTIONAL)]
+    needed = [key for key in KEYS if not key.startswith(OPTIONAL_KEYS)]
     missing = [key for key in (*needed, *tyres, *trailer) if key not in numbers]
     if missing:
         raise ConfigError(

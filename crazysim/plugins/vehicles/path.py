@@ -19,25 +19,25 @@ from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.splines import spline
 from crazysim.trajectories.trajectory import Trajectory
 
-SPACING = 0.1
+MAX_PIECE_LENGTH = 0.1
 """Largest length of a piece of a path, m."""
 MAX_PIECES = 100_000
 """Most pieces of a path."""
-SAMPLES = 8193
+N_SAMPLES = 8193
 """Samples of a curve from which its arc length is measured, by the trapezoidal rule."""
 N_TIMES = 257
 """Samples of the arc length over time."""
 NEWTON_STEPS = 2
 """Newton steps of a projection, which begins where the tick before ended."""
-REACH = 0.5
+MAX_NEWTON_STEP = 0.5
 """Largest displacement in one Newton step, m."""
-STOPPING = 0.5
+STOPPING_LENGTH = 0.5
 """Length before the end of an open path in which a reference by arc length slows down, m."""
-SLOWEST = 0.1
+MIN_SPEED_SHARE = 0.1
 """Least speed of a reference by arc length, as a share of the path's largest: one must leave a start at rest."""
 STRAIGHT_RATE = 0.05
 """Rate of a curve, of its largest, below which its path is straight."""
-REPEATED = 12
+N_REPEATED_POINTS = 12
 """Points of a closed path that are repeated on both sides, so that its spline is smooth where it closes."""
 
 Floats = NDArray[np.float64]
@@ -79,7 +79,7 @@ class Path(PyTree):
 
     @staticmethod
     def of_trajectory(trajectory: Trajectory, backwards: bool = False) -> Path:
-        """Return the path and the timing of a trajectory, of which x and y count; closed if the trajectory repeats.
+        """Return the path and the timing of a trajectory's x and y; closed if the trajectory repeats.
 
         Args:
             trajectory: Trajectory of one vehicle.
@@ -90,12 +90,12 @@ class Path(PyTree):
         """
         pieces, curve = _level_curve(trajectory)
 
-        times = np.linspace(0.0, pieces.duration, SAMPLES)
+        times = np.linspace(0.0, pieces.duration, N_SAMPLES)
         speed = np.hypot(*curve(times, 1).T)
         table = np.linspace(0.0, pieces.duration, N_TIMES)
         arc = _arc_length(times, speed)
         progress = np.stack([np.interp(table, times, arc), np.hypot(*curve(table, 1).T)], axis=1)
-        return _of_curve(curve, times, speed, progress, bool(np.asarray(trajectory.repeats)), backwards)
+        return _path_of_curve(curve, times, speed, progress, bool(np.asarray(trajectory.repeats)), backwards)
 
     @staticmethod
     def of_points(points: ArrayLike, speed: float = 1.0, closed: bool = False) -> Path:
@@ -122,7 +122,7 @@ class Path(PyTree):
                 f"expected a speed other than zero, m/s, got {speed!r}. Use speed=1.0, or a negative one to reverse."
             )
         if closed:
-            xy = xy[np.arange(-REPEATED, len(xy) + REPEATED + 1) % len(xy)]
+            xy = xy[np.arange(-N_REPEATED_POINTS, len(xy) + N_REPEATED_POINTS + 1) % len(xy)]
         chords = np.hypot(*np.diff(xy, axis=0).T)
         if not np.all(chords > 0):
             raise ConfigError(
@@ -131,14 +131,14 @@ class Path(PyTree):
             )
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         trajectory = spline(knots, np.pad(xy, ((0, 0), (0, 1))), at_rest=False)
-        begin, end = (knots[REPEATED], knots[-1 - REPEATED]) if closed else (0.0, knots[-1])
+        begin, end = (knots[N_REPEATED_POINTS], knots[-1 - N_REPEATED_POINTS]) if closed else (0.0, knots[-1])
         _, curve = _level_curve(trajectory)
 
-        times = np.linspace(begin, end, SAMPLES)
+        times = np.linspace(begin, end, N_SAMPLES)
         rate = np.hypot(*curve(times, 1).T)
         length = _arc_length(times, rate)[-1]
         progress = np.stack([np.linspace(0.0, length, N_TIMES), np.full(N_TIMES, abs(speed))], axis=1)
-        return _of_curve(curve, times, rate, progress, closed, speed < 0, abs(speed))
+        return _path_of_curve(curve, times, rate, progress, closed, speed < 0, abs(speed))
 
     @staticmethod
     def stack(paths: Sequence[Path]) -> Path:
@@ -182,14 +182,14 @@ class Path(PyTree):
             s: Arc length, m. ()
         """
         piece, u = self._locate(index, s)
-        return _evaluate(_take(self.coefficients, index, piece), u)
+        return _evaluate(_entry_at(self.coefficients, index, piece), u)
 
     def speed_at(self, index: Array | int, s: Array) -> Array:
         """Return the speed at an arc length, m/s; it decreases to zero before the end of an open path. (1,)"""
         piece, _ = self._locate(index, s)
-        rest = safe_clip((_take(self.length, index) - s) / STOPPING, 0.0, 1.0)
-        share = jnp.where(_take(self.closed, index), 1.0, rest)
-        return (share * _take(self.speeds, index, piece))[None]
+        rest = safe_clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
+        share = jnp.where(_entry_at(self.closed, index), 1.0, rest)
+        return (share * _entry_at(self.speeds, index, piece))[None]
 
     def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
         """Return the arc length, m, and the speed, m/s, at a time; before the start and after the end at rest.
@@ -203,26 +203,26 @@ class Path(PyTree):
         Returns:
             (1,) each
         """
-        duration, closed = _take(self.duration, index), _take(self.closed, index)
+        duration, closed = _entry_at(self.duration, index), _entry_at(self.closed, index)
         rounds = jnp.where(closed, lax.floor(t / duration), 0.0)
         local = safe_clip(t - rounds * duration, 0.0, duration)
         step = duration / (N_TIMES - 1)
         node = jnp.minimum(lax.floor(local / step), N_TIMES - 2.0)
         k, u = node.astype(jnp.int32), local / step - node
-        (s0, v0), (s1, v1) = _take(self.progress, index, k), _take(self.progress, index, k + 1)
+        (s0, v0), (s1, v1) = _entry_at(self.progress, index, k), _entry_at(self.progress, index, k + 1)
         rise, v0, v1 = s1 - s0, v0 * step, v1 * step
         c2, c3 = 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise  # cubic of Hermite
         s = s0 + u * (v0 + u * (c2 + u * c3))
         moving = (t >= 0) & (closed | (t <= duration))
         v = jnp.where(moving, (v0 + u * (2 * c2 + 3 * u * c3)) / step, 0.0)
-        sign = jnp.where(_take(self.speeds, index, 0) < 0, -1.0, 1.0)
-        return (s + rounds * _take(self.length, index))[None], (sign * v)[None]
+        sign = jnp.where(_entry_at(self.speeds, index, 0) < 0, -1.0, 1.0)
+        return (s + rounds * _entry_at(self.length, index))[None], (sign * v)[None]
 
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
         """Return the arc length of the point of a path next to a position, from a guess nearby; within a step.
 
-        Newton's method, whose steps ``(p - r) . t / (1 - curvature e)`` are limited to ``REACH``. On a closed path the
-        arc length increases with every round.
+        Newton's method, whose steps ``(p - r) . t / (1 - curvature e)`` are limited to ``MAX_NEWTON_STEP``. On a closed
+        path the arc length increases with every round.
 
         Args:
             index: Number of the path. ()
@@ -232,13 +232,15 @@ class Path(PyTree):
         Returns:
             m. ()
         """
-        s, length, closed = guess, _take(self.length, index), _take(self.closed, index)
+        s, length, closed = guess, _entry_at(self.length, index), _entry_at(self.closed, index)
         for _ in range(NEWTON_STEPS):
             point = self.at(index, s)
             off = pos - point.pos
             along = off[0] * point.tangent[0] + off[1] * point.tangent[1]
             left = point.tangent[0] * off[1] - point.tangent[1] * off[0]
-            s = s + safe_clip(along / jnp.maximum(1 - point.curvature[0] * left, 0.2), -REACH, REACH)
+            s = s + safe_clip(
+                along / jnp.maximum(1 - point.curvature[0] * left, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
+            )
             s = jnp.where(closed, s, safe_clip(s, 0.0, length))
         return s
 
@@ -269,9 +271,9 @@ class Path(PyTree):
 
     def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
         """Return the piece at an arc length, and the share of its length."""
-        length, spacing = _take(self.length, index), _take(self.spacing, index)
+        length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
         wrapped = s - length * lax.floor(s / length)
-        local = jnp.where(_take(self.closed, index), wrapped, safe_clip(s, 0.0, length)) / spacing
+        local = jnp.where(_entry_at(self.closed, index), wrapped, safe_clip(s, 0.0, length)) / spacing
         piece = safe_clip(lax.floor(local), 0.0, lax.floor(length / spacing - 0.5))
         return piece.astype(jnp.int32), local - piece
 
@@ -289,7 +291,7 @@ def _level_curve(trajectory: Trajectory) -> tuple[PieceTable, Callable[[Floats, 
     return pieces, lambda t, order: pieces.at(np.zeros(len(t), int), t, order)[:, :2]
 
 
-def _of_curve(
+def _path_of_curve(
     curve: Callable[[Floats, int], Floats],
     times: Floats,
     rate: Floats,
@@ -315,15 +317,17 @@ def _of_curve(
             "expected a path of some length on the ground, got one that stays where it is. Leave path out, and command "
             "the cars, to let them stand."
         )
-    if not arc[-1] <= MAX_PIECES * SPACING:
-        raise ConfigError(f"expected a path of at most {MAX_PIECES * SPACING:g} m, got {arc[-1]:.4g} m. Split it.")
+    if not arc[-1] <= MAX_PIECES * MAX_PIECE_LENGTH:
+        raise ConfigError(
+            f"expected a path of at most {MAX_PIECES * MAX_PIECE_LENGTH:g} m, got {arc[-1]:.4g} m. Split it."
+        )
     moving = np.flatnonzero(rate > 1e-3 * rate.max())
     if len(moving) != moving[-1] - moving[0] + 1:
         stop = times[moving[0] + np.argmax(np.diff(moving) > 1)]
         raise ConfigError(
             f"expected a path that stops only at its ends, got one without a tangent at {stop:.3g} s. Split it there."
         )
-    n = max(4, int(np.ceil(arc[-1] / SPACING)))
+    n = max(4, int(np.ceil(arc[-1] / MAX_PIECE_LENGTH)))
     nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)
     inner = np.clip(nodes, times[moving[0]], times[moving[-1]])  # at rest there is no tangent
     pos, vel, acc = curve(nodes, 0), curve(inner, 1), curve(inner, 2)
@@ -339,7 +343,7 @@ def _of_curve(
     spacing = arc[-1] / n
     derivatives = np.stack([pos, tangent, bend], axis=1)
     coefficients = interpolation.unit_coefficients(derivatives, np.full(n, spacing))
-    speeds = np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], SLOWEST * rate.max())
+    speeds = np.full(n, speed) if speed is not None else np.maximum(size[:-1, 0], MIN_SPEED_SHARE * rate.max())
     end = progress[-1, 0] / speed if speed is not None else times[-1]
     arrays = (coefficients, arc[-1], spacing, speeds * (-1 if backwards else 1), progress, end)
     coefficients, length, spacing, speeds, progress, duration = (np.asarray(x, float_dtype())[None] for x in arrays)
@@ -362,6 +366,6 @@ def _evaluate(coefficients: Array, u: Array) -> PathPoint:
     return PathPoint(pos, rate * inverse, bend[None])
 
 
-def _take(x: Array, *index: Array | int) -> Array:
+def _entry_at(x: Array, *index: Array | int) -> Array:
     """Return an entry of an array; an index that is too large or too small means the last or first one."""
     return jnp.asarray(x).at[index].get(mode="clip", wrap_negative_indices=False)

@@ -12,22 +12,22 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import ArrayLike
 
-from crazysim.control.lqr import as_weights, solve_on_host
+from crazysim.control.lqr import solve_on_host, weight_matrix
 from crazysim.control.riccati import gain_discrete
 from crazysim.core.settings import setting
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.following import PathController, PathState, motor_reference
 from crazysim.plugins.vehicles.kinematic import kinematic
 from crazysim.plugins.vehicles.model import VehicleModel
-from crazysim.plugins.vehicles.parameters import CarParams
 from crazysim.plugins.vehicles.single_track import single_track
-from crazysim.plugins.vehicles.state import CarState
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import safe_clip
 
 SPEED_STEP, N_SPEEDS = 0.25, 24
 """Distance of the speeds for which there are gains, m/s, and their number: the gains hold up to 6 m/s."""
 
-SQUARINGS = 14
+N_SQUARINGS = 14
 """Squarings of the matrix exponential."""
 
 
@@ -59,14 +59,13 @@ class PathLQR(PathController):
             ConfigError: If no gain stabilises the vehicle, or a weight has another shape.
         """
         speeds = SPEED_STEP * np.arange(1, N_SPEEDS + 1) * np.array([[1.0], [-1.0]])
-        Q, R = as_weights("Q", self.Q, 4), as_weights("R", [self.R], 1)
-        table = solve_on_host(ROWS[vehicle.dynamics], car, speeds.ravel(), 1 / freq, Q, R)
+        Q, R = weight_matrix("Q", self.Q, 4), weight_matrix("R", [self.R], 1)
+        table = solve_on_host(GAIN_FUNCTIONS[vehicle.dynamics], car, speeds.ravel(), 1 / freq, Q, R)
         return PathLQRGains(as_parameter(table.reshape(2, N_SPEEDS, 5)))
 
     def steering(
         self, state: CarState, at: PathState, memory: Any, gains: PathLQRGains, car: CarParams
     ) -> tuple[Array, Any]:
-        """Return the steering angle."""
         cell = safe_clip(jnp.abs(state.body_vel[0]) / SPEED_STEP - 1, 0.0, N_SPEEDS - 1.001)
         k = lax.floor(cell)
         side, node = (at.speed[0] < 0).astype(jnp.int32), k.astype(jnp.int32)
@@ -98,7 +97,7 @@ def lateral_gains(
     """Return the gain of the regulator at a speed and the feed-forward of curvature. (5,)"""
     A, B = lateral_model(model, car, speed)
     block = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
-    held = exponential(block * period)  # the input is held for a period
+    held = matrix_exponential(block * period)  # the input is held for a period
     K = gain_discrete(held[:4, :4], held[:4, 4:], Q, R)[0]
     # Steady cornering of curvature 1: the yaw rate is the speed, and sideways velocity and steering angle balance it.
     # Of vehicles without slip the two equations are multiples of the tangent of the steering angle, and still regular.
@@ -109,22 +108,27 @@ def lateral_gains(
     return jnp.concatenate([K, (steer + K @ steady)[None]])
 
 
-def _rows(model: Callable[..., CarState], car: CarParams, speeds: Array, period: Array, Q: Array, R: Array) -> Array:
+def _gain_rows(
+    model: Callable[..., CarState], car: CarParams, speeds: Array, period: Array, Q: Array, R: Array
+) -> Array:
     """Return ``lateral_gains`` at several speeds. (n, 5)"""
     return jax.vmap(lambda speed: lateral_gains(model, car, speed, period, Q, R))(speeds)
 
 
-ROWS = {"kinematic": functools.partial(_rows, kinematic), "single_track": functools.partial(_rows, single_track)}
+GAIN_FUNCTIONS = {
+    "kinematic": functools.partial(_gain_rows, kinematic),
+    "single_track": functools.partial(_gain_rows, single_track),
+}
 """``lateral_gains`` at several speeds, by the vehicle's dynamics: one function for all vehicles, compiled once."""
 
 
-def exponential(matrix: Array) -> Array:
+def matrix_exponential(matrix: Array) -> Array:
     """Return the exponential of a small matrix, by a Taylor polynomial of order 6 and squaring. (n, n)
 
     In float64 its relative error is below 1e-12 for norms up to 100.
     """
-    eye, small = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**SQUARINGS
+    eye, small = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**N_SQUARINGS
     found = eye
     for k in range(6, 0, -1):
         found = eye + small @ found / k
-    return lax.fori_loop(0, SQUARINGS, lambda _, x: x @ x, found)
+    return lax.fori_loop(0, N_SQUARINGS, lambda _, x: x @ x, found)

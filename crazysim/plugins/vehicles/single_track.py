@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from crazysim.plugins.vehicles.parameters import CarParams
-from crazysim.plugins.vehicles.state import CarState, to_world
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 from crazysim.plugins.vehicles.trailer import trailer_rates
 from crazysim.rotation import safe_clip
 
@@ -92,12 +92,12 @@ def single_track(state: CarState, command: Array, params: CarParams, push: Array
     if push is not None:
         force_x, force_y, torque = force_x + push[..., :1], force_y + push[..., 1:2], torque + push[..., 2:]
     acc = jnp.concatenate([force_x / p.mass + vy * w, force_y / p.mass - vx * w], axis=-1)
-    return rates_of(state, acc, torque / p.yaw_inertia, steer_rate(state, command, p), p)
+    return state_rates(state, acc, torque / p.yaw_inertia, steer_rate(state, command, p), p)
 
 
-def rates_of(state: CarState, acc: Array, yaw_acc: Array, steer: Array, params: CarParams) -> CarState:
+def state_rates(state: CarState, acc: Array, yaw_acc: Array, steer: Array, params: CarParams) -> CarState:
     """Return the derivative of a state from rates of velocities, (..., 2), yaw rate and steering angle. (..., 1)"""
-    vel = to_world(state.yaw, state.body_vel)
+    vel = to_world_frame(state.yaw, state.body_vel)
     return CarState(
         pos=jnp.concatenate([vel, jnp.zeros_like(yaw_acc)], axis=-1),
         yaw=state.yaw_rate,

@@ -11,16 +11,16 @@ from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.path import Path
 from crazysim.pytree import float_dtype
 
-GAP = 1.0
+START_SPACING = 1.0
 """Distance between neighbours that start in a row, m."""
 
 
-def in_a_row(n: int) -> NDArray:
+def row_positions(n: int) -> NDArray:
     """Return positions in a row along y around the origin, m. (n, 2)"""
-    return np.stack([np.zeros(n), GAP * (np.arange(n) - (n - 1) / 2)], axis=1)
+    return np.stack([np.zeros(n), START_SPACING * (np.arange(n) - (n - 1) / 2)], axis=1)
 
 
-def per_member(name: str, value: ArrayLike, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
+def member_array(name: str, value: ArrayLike, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
     """Return positions or headings for all cars, or for each, checked. (..., *core)
 
     Args:
@@ -43,7 +43,7 @@ def per_member(name: str, value: ArrayLike, counts: tuple[int, int], core: tuple
     return array
 
 
-def numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None = None) -> NDArray:
+def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None = None) -> NDArray:
     """Return a number for all cars, (1,), or for each, (n_worlds, n_members, 1).
 
     Args:
@@ -69,7 +69,9 @@ def numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None 
     return array[None] if array.ndim == 0 else np.array(np.broadcast_to(array, counts))[..., None]
 
 
-def on_path(paths: Path, index: NDArray, start: NDArray, counts: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray]:
+def path_poses(
+    paths: Path, index: NDArray, start: NDArray, counts: tuple[int, int]
+) -> tuple[NDArray, NDArray, NDArray]:
     """Return positions, m, headings, rad, and arc lengths, m, of cars on their paths at time zero.
 
     Args:
@@ -92,7 +94,7 @@ def on_path(paths: Path, index: NDArray, start: NDArray, counts: tuple[int, int]
     return pos, yaw, arc
 
 
-def projected(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
+def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
     """Return the arc lengths of the points of paths that are nearest to cars, m. (n_worlds, n_members, 1)
 
     Args:
@@ -110,7 +112,7 @@ def projected(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
     return found
 
 
-def spread(paths: Path, index: NDArray, n: int) -> NDArray:
+def spread_start_times(paths: Path, index: NDArray, n: int) -> NDArray:
     """Return start times of n cars, s: spaced equally over the duration of a closed path, zero on others. (n,)"""
     own = np.broadcast_to(index.reshape(-1)[:n], (n,))
     times = np.zeros(n)

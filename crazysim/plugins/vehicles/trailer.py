@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.errors import ConfigError
-from crazysim.plugins.vehicles.parameters import CarParams
-from crazysim.plugins.vehicles.state import CarState, to_world
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState, to_world_frame
 
 
 def trailer_rates(state: CarState, params: CarParams) -> Array:
-    """Return the rates of the headings of drawbar and deck, both of whose axles roll without slip, rad/s. (..., 2)
+    """Return the rates of the headings of drawbar and deck, whose axles roll without slip, rad/s. (..., 2)
 
     The hitch moves with the vehicle. Its velocity across the drawbar turns the drawbar, that along it moves the front
     axle, and the front axle's velocity across the deck turns the deck.
@@ -36,7 +36,7 @@ def trailer_axles(state: CarState, params: CarParams) -> tuple[Array, Array]:
     """Return the positions of the middles of the trailer's front and rear axle, world frame, m. (..., 2) each"""
     hitch, drawbar, axles = (params.trailer[..., k : k + 1] for k in range(3))  # type: ignore[index]
     zero = jnp.zeros_like(state.yaw)
-    at = state.pos[..., :2] + to_world(state.yaw, jnp.concatenate([zero - hitch, zero], axis=-1))
-    front = at + to_world(state.joints[..., :1], jnp.concatenate([zero - drawbar, zero], axis=-1))  # type: ignore[index]
-    rear = front + to_world(state.joints[..., 1:], jnp.concatenate([zero - axles, zero], axis=-1))  # type: ignore[index]
+    at = state.pos[..., :2] + to_world_frame(state.yaw, jnp.concatenate([zero - hitch, zero], axis=-1))
+    front = at + to_world_frame(state.joints[..., :1], jnp.concatenate([zero - drawbar, zero], axis=-1))  # type: ignore[index]
+    rear = front + to_world_frame(state.joints[..., 1:], jnp.concatenate([zero - axles, zero], axis=-1))  # type: ignore[index]
     return front, rear

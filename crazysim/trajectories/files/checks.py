@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, short_repr
 
-MAX_FILE = 256 * 2**20
+MAX_FILE_BYTES = 256 * 2**20
 """Largest file that is read, bytes."""
 MAX_POINTS = 20_000
 """Most points of a trajectory."""
@@ -49,14 +49,14 @@ def parse_json(content: bytes | str, place: str) -> Any:
         raise ConfigError(f"expected JSON in {place}, got {type(error).__name__}: {str(error)[:100]}") from error
 
 
-def record(value: object, place: str) -> dict[str, Any]:
+def require_object(value: object, place: str) -> dict[str, Any]:
     """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
         refuse("an object {...}", short_repr(value), place)
     return value
 
 
-def sequence(value: object, n_max: int, place: str) -> list[Any]:
+def require_array(value: object, n_max: int, place: str) -> list[Any]:
     """Return a value that must be a JSON array of at most some entries."""
     if not isinstance(value, list):
         refuse("an array [...]", short_repr(value), place)
@@ -65,14 +65,14 @@ def sequence(value: object, n_max: int, place: str) -> list[Any]:
     return value
 
 
-def version_one(value: dict[str, Any], place: str) -> None:
+def require_version_one(value: dict[str, Any], place: str) -> None:
     """Check that an object has version 1."""
     version = value.get("version")
     if version != 1 or isinstance(version, bool):
         refuse("version 1", short_repr(version), place)
 
 
-def number(value: object, place: str, low: float = -np.inf, high: float = np.inf) -> float:
+def require_number(value: object, place: str, low: float = -np.inf, high: float = np.inf) -> float:
     """Return a value that must be a finite number in a range."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or value != value:
         refuse(
@@ -83,23 +83,23 @@ def number(value: object, place: str, low: float = -np.inf, high: float = np.inf
     return float(value)
 
 
-def text(value: object, place: str, n_max: int = 200) -> str:
+def require_text(value: object, place: str, n_max: int = 200) -> str:
     """Return a value that must be a string of at most some characters."""
     if not isinstance(value, str) or len(value) > n_max:
         refuse(f"a text of at most {n_max} characters", short_repr(value), place)
     return value
 
 
-def numbers(value: object, lengths: Sequence[int], bound: float, place: str) -> NDArray:
+def require_numbers(value: object, lengths: Sequence[int], bound: float, place: str) -> NDArray:
     """Return a value that must be an array of finite numbers, of one of some lengths, up to a bound in size."""
     if isinstance(value, tuple):
         value = list(value)
     if not isinstance(value, list) or len(value) not in lengths:
         refuse(f"an array of {' or '.join(map(str, lengths))} numbers", short_repr(value), place)
-    return np.array([number(x, place, -bound, bound) for x in value])
+    return np.array([require_number(x, place, -bound, bound) for x in value])
 
 
-def ascending(times: NDArray, least: float, place: str) -> None:
+def require_ascending(times: NDArray, least: float, place: str) -> None:
     """Check that times ascend by a least difference: there are neither overlaps nor pieces without length."""
     steps = np.diff(times)
     if len(steps) and steps.min() < least * (1 - 1e-6):

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import read_text, write_file
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.polynomials import of_rows, rows_of
-from crazysim.trajectories.splines import of_unit_pieces
+from crazysim.trajectories.files.polynomials import trajectory_of_rows, trajectory_rows
+from crazysim.trajectories.splines import trajectory_of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
-POLYNOMIALS = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
+POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "yaw") for k in range(8))])
 """Header of Crazyswarm's files, as ``uav_trajectories`` writes them."""
 
 
@@ -31,11 +31,11 @@ def load_csv(path: str | Path) -> Trajectory:
     Raises:
         ConfigError: If the file does not exist, or a row is invalid, with its line.
     """
-    rows = _table(read_text(path, checks.MAX_FILE).splitlines(), str(path))
-    return of_rows(rows, str(path)) if rows.shape[1] > 5 else _of_samples(rows, str(path))
+    rows = _parse_table(read_text(path, checks.MAX_FILE_BYTES).splitlines(), str(path))
+    return trajectory_of_rows(rows, str(path)) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
 
 
-def _table(lines: list[str], place: str) -> NDArray:
+def _parse_table(lines: list[str], place: str) -> NDArray:
     """Return the numbers of the lines. (n, n_columns)"""
     rows: list[list[float]] = []
     for i, line in enumerate(lines, start=1):
@@ -59,14 +59,14 @@ def _table(lines: list[str], place: str) -> NDArray:
     return np.array(rows)
 
 
-def _of_samples(rows: NDArray, place: str) -> Trajectory:
+def _fit_samples(rows: NDArray, place: str) -> Trajectory:
     """Return the cubic trajectory through samples of time, position and perhaps yaw."""
     if not np.all(np.isfinite(rows)) or np.abs(rows[:, 1:]).max() > checks.MAX_COORDINATE:
         checks.refuse(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", place)
     if len(rows) < 2:
         checks.refuse("at least two samples", "one", place)
     times = rows[:, 0] - rows[0, 0]
-    checks.ascending(times, checks.MIN_LENGTH, place)
+    checks.require_ascending(times, checks.MIN_LENGTH, place)
     if times[-1] > checks.MAX_TIME:
         checks.refuse(f"at most {checks.MAX_TIME:g} s", f"{times[-1]:g} s", place)
     values = np.zeros((len(rows), 4))
@@ -78,7 +78,7 @@ def _of_samples(rows: NDArray, place: str) -> Trajectory:
     start, end, first, last = values[:-1], values[1:], rates[:-1] * lengths, rates[1:] * lengths
     # Cubic Hermite polynomial of u in [0, 1].
     c = [start, first, 3 * (end - start) - 2 * first - last, 2 * (start - end) + first + last]
-    return of_unit_pieces(np.diff(times), np.stack(c, axis=-1))
+    return trajectory_of_unit_pieces(np.diff(times), np.stack(c, axis=-1))
 
 
 def save_csv(trajectory: Trajectory, path: str | Path) -> None:
@@ -91,12 +91,12 @@ def save_csv(trajectory: Trajectory, path: str | Path) -> None:
     Raises:
         ConfigError: If its degree is higher, or the folder does not exist.
     """
-    lines = [POLYNOMIALS, *(",".join(f"{x:.9g}" for x in row) for row in rows_of(trajectory))]
+    lines = [POLYNOMIAL_HEADER, *(",".join(f"{x:.9g}" for x in row) for row in trajectory_rows(trajectory))]
     write_file(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayLike | None = None) -> None:
-    """Write positions with time stamps, for example those of a flight, as ``load_csv`` reads them.
+    """Write positions with time stamps, for example of a flight, as ``load_csv`` reads them.
 
     Args:
         path: File to write.

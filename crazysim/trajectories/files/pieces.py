@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
-from crazysim.trajectories.bezier import restricted
+from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import Trajectory
 
-CONTINUOUS = np.array([1e-3, 1e-3, 1e-3, np.deg2rad(0.1)])
+MAX_JUMPS = np.array([1e-3, 1e-3, 1e-3, np.deg2rad(0.1)])
 """Largest distance of a piece's beginning from the end of the one before that is no jump: x, y, z, m, and yaw, rad."""
 
 ROUNDING = 1e-5
 """Share of a coordinate that may be rounding of float32."""
 
 
-def pieces_of(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
+def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the ends of a trajectory's pieces and their coefficients, in float64.
 
     Times are the shortest decimals that stand for the trajectory's, so that 0.1 s is written as 0.1.
@@ -54,7 +54,7 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
     """
     ends_at = coefficients[:-1].sum(axis=-1)
     jumps = np.abs(coefficients[1:, :, 0] - ends_at)
-    too_far = np.argwhere(jumps > CONTINUOUS[: jumps.shape[1]] + ROUNDING * np.abs(ends_at))
+    too_far = np.argwhere(jumps > MAX_JUMPS[: jumps.shape[1]] + ROUNDING * np.abs(ends_at))
     if len(too_far):
         piece, axis = too_far[0]
         size = jumps[piece, axis]
@@ -65,7 +65,7 @@ def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
         )
 
 
-def split(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
+def split_pieces(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray, NDArray]:
     """Return the same pieces, split at further times.
 
     Args:
@@ -81,7 +81,7 @@ def split(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[NDArray
     starts, lengths = np.concatenate([[0.0], ends[:-1]]), np.diff(ends, prepend=0.0)
     piece = np.minimum(np.searchsorted(ends, 0.5 * (from_cuts + cuts)), len(ends) - 1)
     parts = [
-        restricted(coefficients[k], (start - starts[k]) / lengths[k], (end - starts[k]) / lengths[k])
+        restrict_interval(coefficients[k], (start - starts[k]) / lengths[k], (end - starts[k]) / lengths[k])
         for k, start, end in zip(piece, from_cuts, cuts, strict=True)
     ]
     return cuts, np.stack(parts)

@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError
 from crazysim.storage import read_bytes, write_file
-from crazysim.trajectories.bezier import control_points, power_of, significant_degree
+from crazysim.trajectories.bezier import control_points, power_coefficients, significant_degree
 from crazysim.trajectories.files import checks
-from crazysim.trajectories.files.pieces import pieces_of, require_no_jumps, split
-from crazysim.trajectories.splines import of_unit_pieces
+from crazysim.trajectories.files.pieces import require_no_jumps, split_pieces, trajectory_pieces
+from crazysim.trajectories.splines import trajectory_of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLY4D_FLOATS = 33
 """Numbers of a Poly4D: eight coefficients for each of x, y, z and yaw, and the duration."""
-DISTANCE = 1e-3
+DISTANCE_UNIT = 1e-3
 """Unit of compressed coordinates, m."""
-ANGLE = np.deg2rad(0.1)
+ANGLE_UNIT = np.deg2rad(0.1)
 """Unit of compressed yaw, rad: a tenth of a degree."""
-MILLISECOND = 1e-3
+DURATION_UNIT = 1e-3
 """Unit of compressed durations, s."""
-MAX_PIECE = 65.0
+MAX_PIECE_DURATION = 65.0
 """Longest compressed piece, s: durations have 16 bits."""
-STORED = (0, 1, 3, 7)
+STORED_DEGREES = (0, 1, 3, 7)
 """Degree of an axis for each code of two bits; as many control points are stored, all but the first."""
-UNITS = np.array([DISTANCE, DISTANCE, DISTANCE, ANGLE])
+AXIS_UNITS = np.array([DISTANCE_UNIT, DISTANCE_UNIT, DISTANCE_UNIT, ANGLE_UNIT])
 
 
 def pack_poly4d(trajectory: Trajectory) -> bytes:
@@ -44,7 +44,7 @@ def pack_poly4d(trajectory: Trajectory) -> bytes:
     Raises:
         ConfigError: If its degree is higher.
     """
-    return rows_of(trajectory).astype("<f4")[:, [*range(1, POLY4D_FLOATS), 0]].tobytes()
+    return trajectory_rows(trajectory).astype("<f4")[:, [*range(1, POLY4D_FLOATS), 0]].tobytes()
 
 
 def unpack_poly4d(content: bytes, place: str = "a trajectory memory") -> Trajectory:
@@ -61,10 +61,10 @@ def unpack_poly4d(content: bytes, place: str = "a trajectory memory") -> Traject
     if not content or len(content) % size or len(content) // size > checks.MAX_POINTS:
         checks.refuse(f"1 to {checks.MAX_POINTS} pieces of {size} bytes", f"{len(content)} bytes", place)
     rows = np.frombuffer(content, "<f4").reshape(-1, POLY4D_FLOATS).astype(float)
-    return of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], place)
+    return trajectory_of_rows(rows[:, [POLY4D_FLOATS - 1, *range(POLY4D_FLOATS - 1)]], place)
 
 
-def of_rows(rows: NDArray, place: str) -> Trajectory:
+def trajectory_of_rows(rows: NDArray, place: str) -> Trajectory:
     """Return the trajectory of rows of duration, s, and coefficients of x, y, z, m, and yaw, rad, per second.
 
     Args:
@@ -93,7 +93,7 @@ def of_rows(rows: NDArray, place: str) -> Trajectory:
 
 def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the pieces of a trajectory, checked to be of a degree that the Crazyflie flies."""
-    ends, c = pieces_of(trajectory)
+    ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
             f"expected polynomials of degree 7 at most, as the Crazyflie flies, got degree {c.shape[2] - 1}"
@@ -101,7 +101,7 @@ def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     return ends, c
 
 
-def rows_of(trajectory: Trajectory) -> NDArray:
+def trajectory_rows(trajectory: Trajectory) -> NDArray:
     """Return duration and coefficients per second of each piece. (n_pieces, 33)"""
     ends, c = _pieces(trajectory)
     lengths = np.diff(ends, prepend=0.0)
@@ -124,23 +124,23 @@ def pack_compressed(trajectory: Trajectory) -> bytes:
     """
     ends, c = _pieces(trajectory)
     require_no_jumps(ends, c)
-    ends, c = split(ends, c, np.arange(MAX_PIECE, ends[-1], MAX_PIECE))
-    c = c / UNITS[:, None]
-    stamps = np.round(ends / MILLISECOND).astype(int)
+    ends, c = split_pieces(ends, c, np.arange(MAX_PIECE_DURATION, ends[-1], MAX_PIECE_DURATION))
+    c = c / AXIS_UNITS[:, None]
+    stamps = np.round(ends / DURATION_UNIT).astype(int)
     durations = np.diff(stamps, prepend=0)
     if not np.all(durations > 0):
         raise ConfigError(f"expected pieces of at least 1 ms, got {int(durations.min())} ms. Merge shorter pieces.")
-    content = bytearray(_short(c[0, :, 0]))
+    content = bytearray(_pack_shorts(c[0, :, 0]))
     for duration, axes in zip(durations, c, strict=True):
-        degrees = [min(d for d in STORED if d >= significant_degree(axis[None], 0.1)) for axis in axes]
-        header = sum(STORED.index(degree) << 2 * k for k, degree in enumerate(degrees))
+        degrees = [min(d for d in STORED_DEGREES if d >= significant_degree(axis[None], 0.1)) for axis in axes]
+        header = sum(STORED_DEGREES.index(degree) << 2 * k for k, degree in enumerate(degrees))
         content += struct.pack("<BH", header, duration)
         for axis, degree in zip(axes, degrees, strict=True):
-            content += _short(control_points(axis[None, : degree + 1], degree)[1:, 0])
+            content += _pack_shorts(control_points(axis[None, : degree + 1], degree)[1:, 0])
     return bytes(content) + struct.pack("<BH", 0, 0)  # a piece of no duration ends the trajectory
 
 
-def _short(values: NDArray) -> bytes:
+def _pack_shorts(values: NDArray) -> bytes:
     rounded = np.round(values)
     if rounded.size and np.abs(rounded).max() > 32767:
         raise ConfigError(
@@ -170,11 +170,11 @@ def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Tra
                 break
             piece, last = np.zeros((4, 8)), points.copy()
             for axis in range(4):
-                degree = STORED[header >> 2 * axis & 3]
+                degree = STORED_DEGREES[header >> 2 * axis & 3]
                 stored = struct.unpack_from(f"<{degree}h", content, at)
                 at += 2 * degree
                 curve = np.array([points[axis], *stored], float)
-                piece[axis, : degree + 1] = power_of(curve[:, None])[0]
+                piece[axis, : degree + 1] = power_coefficients(curve[:, None])[0]
                 last[axis] = curve[-1]
             points = last
             durations.append(duration)
@@ -183,10 +183,10 @@ def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Tra
                 checks.refuse(f"at most {checks.MAX_POINTS} pieces", "more", place)
     except struct.error:
         checks.refuse("complete pieces", f"{len(content)} bytes that end within one", place)
-    ends = MILLISECOND * np.cumsum(durations)
+    ends = DURATION_UNIT * np.cumsum(durations)
     if not pieces or ends[-1] > checks.MAX_TIME:
         checks.refuse(f"pieces of up to {checks.MAX_TIME:g} s in all", "none" if not pieces else "longer ones", place)
-    return of_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * UNITS[:, None])
+    return trajectory_of_unit_pieces(np.diff(ends, prepend=0.0), np.stack(pieces) * AXIS_UNITS[:, None])
 
 
 def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:
@@ -213,5 +213,5 @@ def load_memory(path: str | Path, compressed: bool = False) -> Trajectory:
     Raises:
         ConfigError: If the file does not exist or is not of that format.
     """
-    content = read_bytes(path, checks.MAX_FILE)
+    content = read_bytes(path, checks.MAX_FILE_BYTES)
     return (unpack_compressed if compressed else unpack_poly4d)(content, str(path))

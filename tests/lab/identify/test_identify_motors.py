@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crazysim.drones import load_airframe
-from crazysim.dynamics.utils.identification import lagged
+from crazysim.dynamics.utils.identification import lag_signal
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Log, motor_lag, with_speeds
 
@@ -70,7 +70,7 @@ def test_lag_is_found_behind_noise_and_delay(rate):
     """Speeds that are 12 ms late and noisy by a tenth of their deviation; their scatter is below 2%."""
     rng = np.random.default_rng(0)
     command = np.repeat(rng.uniform(0.4, 0.9, (N // 20, 4)), 20, axis=0)
-    t, response = DT * np.arange(N), lagged(command, DT, rate)
+    t, response = DT * np.arange(N), lag_signal(command, DT, rate)
     speeds = np.stack([np.interp(t - 0.012, t, x) for x in (8000 + 9000 * response + 6000 * response**2).T], axis=-1)
     speeds += rng.normal(scale=0.1 * speeds.std(), size=speeds.shape)
     found = motor_lag([log(command, rotor_vel=speeds), log(command)])

@@ -17,12 +17,12 @@ from crazysim.errors import ConfigError
 from crazysim.lab.show_files import Show, load_show, save_show
 from crazysim.lab.show_files.archive import Archive
 from crazysim.lab.show_files.skyc import parse_show
-from crazysim.trajectories.files.pieces import pieces_of
+from crazysim.trajectories.files.pieces import trajectory_pieces
 
 
 def positions(trajectory, t):
     """Position, m, and yaw, rad, from the coefficients in float64. (n, 4)"""
-    ends, c = pieces_of(trajectory)
+    ends, c = trajectory_pieces(trajectory)
     begins = np.concatenate([[0.0], ends[:-1]])
     t = np.clip(t, 0, ends[-1])
     k = np.minimum(np.searchsorted(ends, t, side="right"), len(ends) - 1)

@@ -83,7 +83,7 @@ def screen(tmp_path_factory):
 PLAYED = """
 import sys
 from crazysim.__main__ import main
-from crazysim.scene.window import Window
+from crazysim.scene.scene_window import Window
 from crazysim.lab.shows import fly, view
 from crazysim.lab.show_files import load_show
 

@@ -9,7 +9,7 @@ from cases import with_states
 
 from crazysim import ContactResponse, FreeBodies, Sim
 from crazysim.core.stage import vmap_drones, vmap_worlds
-from crazysim.plugins.contacts.contact_points import contact_points, surfaces_of
+from crazysim.plugins.contacts.contact_points import contact_points, find_surfaces
 from crazysim.plugins.vehicles import Cars
 
 
@@ -67,7 +67,7 @@ def test_the_deck_of_a_turning_car_moves_with_its_points():
     car = cars.read(sim.data)
     sim.data = cars.write(sim.data, car.with_vel(np.float32([[[0.5, 0, 0]]]), np.float32([[[0, 0, 2.0]]])))
     sim.data = with_states(sim.data, pos=[0.1, 0.2, 0.3], quat=[0, 0, 0, 1])
-    surfaces = [surface for surface in surfaces_of(sim, None) if surface.population == "cars"]
+    surfaces = [surface for surface in find_surfaces(sim, None) if surface.population == "cars"]
     box = np.asarray(sim.airframe.value("shape.collision_box"))
     vel = jax.jit(vmap_worlds(vmap_drones(lambda one: contact_points(one, surfaces[:1], box).vel)))(sim.data)
     corners = box[:3] + box[3:] * np.array(list(itertools.product((-1, 1), repeat=3)))

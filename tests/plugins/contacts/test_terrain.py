@@ -172,7 +172,7 @@ def test_range_finders_and_depth_measure_it():
 def test_large_tables_of_heights_are_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
     ends = []
     for largest in (10**6, 1):
-        monkeypatch.setattr(terrain_module, "LARGEST_FUSED", largest)
+        monkeypatch.setattr(terrain_module, "MAX_FUSED_VALUES", largest)
         sim, _ = build(n_worlds=3, pos=(0.3, 0.2, 0.62))
         assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (largest == 1)
         sim.data = with_states(sim.data, vel=[0.5, 0.2, -0.5])

@@ -41,7 +41,9 @@ def test_voltage_and_current_under_load_by_hand():
     """4 V, 0.5 ohm: 6 W at 3 V and 2 A. 8 W is the most there is, at half the voltage; 100 W get no more."""
     one = lambda *x: [np.float32([v]) for v in x]  # noqa: E731
     for power, expected in ((0, (4, 0)), (6, (3, 2)), (8, (2, 4)), (100, (2, 4))):
-        np.testing.assert_allclose(np.ravel(jax.jit(battery.under_load)(*one(power, 4.0, 0.5))), expected, rtol=1e-6)
+        np.testing.assert_allclose(
+            np.ravel(jax.jit(battery.voltage_under_load)(*one(power, 4.0, 0.5))), expected, rtol=1e-6
+        )
     np.testing.assert_allclose(battery.open_circuit_voltage(np.ones(1, np.float32), 2), [2 * 4.1029], rtol=1e-6)
     np.testing.assert_allclose(battery.open_circuit_voltage(np.zeros(1, np.float32), 1), [2.654], rtol=1e-6)
 
@@ -167,7 +169,7 @@ def test_law_07_gradients_are_finite_from_full_to_empty_and_at_the_most_power():
     @jax.jit
     @functools.partial(jax.grad, argnums=(0, 1))
     def slopes(charge, power):
-        v, i = battery.under_load(power, battery.open_circuit_voltage(charge, 1), jnp.array([0.5]))
+        v, i = battery.voltage_under_load(power, battery.open_circuit_voltage(charge, 1), jnp.array([0.5]))
         return jnp.sum(v + i)
 
     for charge in (0.0, 0.1, 1.0):

@@ -80,7 +80,7 @@ def test_the_jet_carries_the_momentum_that_the_thrust_needs():
     one = [np.float32([x]) for x in (0.426, 0.0778, 1.225)]
     for depth in (0.3, 1.0, 2.0):
         apart = np.concatenate([r, 0 * r, 0 * r - np.float32(depth)], axis=-1)
-        u = np.asarray(jax.jit(downwash.jet)(apart, np.float32([0, 0, 1.0]), *one), np.float64)[:, 0]
+        u = np.asarray(jax.jit(downwash.hover_jet_speed)(apart, np.float32([0, 0, 1.0]), *one), np.float64)[:, 0]
         flux = 1.225 * 2 * np.pi * np.trapezoid(u**2 * r[:, 0], r[:, 0])
         assert 0.95 < flux / 0.426 < 0.965
 
@@ -133,7 +133,9 @@ def test_law_07_above_the_drone_the_virtual_origin_does_no_harm():
     """Where the distance to the virtual origin is exactly zero, a formula of the far field would divide by it."""
     one = [jnp.array([x]) for x in (0.4, 0.125, 1.225)]
     apart = np.float32([0.1, 0.0, downwash.DECAY * 0.125])  # a power of two: the product is exact
-    value, gradient = jax.jit(jax.value_and_grad(lambda x: downwash.jet(x, jnp.array([0, 0, 1.0]), *one)[0]))(apart)
+    value, gradient = jax.jit(
+        jax.value_and_grad(lambda x: downwash.hover_jet_speed(x, jnp.array([0, 0, 1.0]), *one)[0])
+    )(apart)
     assert value == 0
     np.testing.assert_array_equal(gradient, 0.0)
 

@@ -96,7 +96,7 @@ def test_the_air_at_loads_counts_for_loads():
 def test_a_large_table_is_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch, rng):
     grid, ends = Grid(rng.normal(size=(6, 5, 4, 3)), (-1, -1, 0), 1.0), []
     for largest, unfused in ((10**6, []), (1, ["wind_field"])):
-        monkeypatch.setattr(wind_field, "LARGEST_FUSED", largest)
+        monkeypatch.setattr(wind_field, "MAX_FUSED_VALUES", largest)
         sim = build(grid, n_worlds=3, engine="auto", spread=(0.5, 0.5, 0.5))
         assert [stage.name for stage in sim.step_fn.plan(sim.data).program.unfused_stages] == unfused
         sim.step(20)

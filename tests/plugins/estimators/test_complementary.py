@@ -60,7 +60,7 @@ def test_gradients_of_the_estimate_are_central_differences(x64):
     quat = quat / jnp.linalg.norm(quat)
 
     def loss(x):
-        turned, integral = complementary.mahony(quat, jnp.zeros(3), x[:3], x[3:], 0.004, 0.4, 0.001)
+        turned, integral = complementary.update_mahony(quat, jnp.zeros(3), x[:3], x[3:], 0.004, 0.4, 0.001)
         climb = complementary.inertial_climb(jnp.zeros(1), turned, x[3:], 0.004)
         return jnp.sum(turned * jnp.arange(4.0)) + 1e3 * jnp.sum(integral) + climb[0]
 

@@ -8,7 +8,7 @@ from consistency import assert_chi_squared, errors, normalised
 
 from crazysim import ConfigError, Sim, rotation
 from crazysim.plugins.estimators import ESKF, error_state, updates
-from crazysim.plugins.estimators.inertial_path import START, Path, carried
+from crazysim.plugins.estimators.inertial_path import EMPTY_PATH_ROW, InertialPath, propagate_along
 from crazysim.plugins.sensors import (
     GPS,
     IMU,
@@ -52,7 +52,7 @@ def estimate(x64):
     """Return an estimate in motion, with a full covariance."""
     quat = jnp.array([0.3, -0.2, 0.4, 0.8])
     pos, vel, small = jnp.array([0.3, -0.2, 1.0]), jnp.array([2.0, -1.0, 0.5]), jnp.array([0.1, -0.2, 0.3])
-    found = error_state.start(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, small, 0.1 * small)
+    found = error_state.initial_estimate(pos, vel, quat / jnp.sqrt(quat @ quat), [1.0] * 15, small, 0.1 * small)
     root = np.random.default_rng(1).normal(size=(15, 15))
     return found.replace(cov=jnp.asarray(0.01 * root @ root.T)[np.triu_indices(15)])
 
@@ -127,8 +127,8 @@ def test_a_move_back_undoes_a_move(estimate):
     """With which late measurements are used where they were taken."""
     inputs = jnp.array([0.5, 1.0, 9.0]), jnp.array([3.0, -2.0, 1.0])
     gravity = jnp.array([0, 0, -9.81])
-    there = error_state.moved(estimate, *inputs, 0.2, gravity)
-    back = error_state.moved(there, *inputs, -0.2, gravity)
+    there = error_state.propagate(estimate, *inputs, 0.2, gravity)
+    back = error_state.propagate(there, *inputs, -0.2, gravity)
     assert np.abs(there.pos - estimate.pos).max() > 0.1
     for name in ("pos", "vel", "quat"):  # the 1e-6 that the firmware adds to norms, in the direction of 9 m/s^2
         np.testing.assert_allclose(getattr(back, name), getattr(estimate, name), rtol=0, atol=2e-5)
@@ -139,12 +139,12 @@ def test_a_path_carries_covariance_and_state(estimate):
 
     Derivatives with respect to the biases are those of a force that does not turn.
     """
-    gravity, path = jnp.array([0, 0, -9.81]), Path.unpacked(jnp.asarray(START, float), jnp.zeros(()))
+    gravity, path = jnp.array([0, 0, -9.81]), InertialPath.from_row(jnp.asarray(EMPTY_PATH_ROW, float), jnp.zeros(()))
     for k in range(20):
-        path = path.extended(jnp.array([0.5, 1.0, 9.0 + 0.1 * k]), jnp.array([1.0, -0.8, 0.5 - 0.02 * k]), 0.01)
+        path = path.extend(jnp.array([0.5, 1.0, 9.0 + 0.1 * k]), jnp.array([1.0, -0.8, 0.5 - 0.02 * k]), 0.01)
 
     def carry(at):
-        return carried(at, path.without_biases(at), gravity)
+        return propagate_along(at, path.without_biases(at), gravity)
 
     there = jax.jit(carry)(estimate)
     f = jax.jit(jax.jacfwd(lambda error: difference(carry(moved(estimate, error)), there)))(jnp.zeros(15))
@@ -152,7 +152,7 @@ def test_a_path_carries_covariance_and_state(estimate):
     np.testing.assert_allclose(error_state.covariance(there.cov), f @ p @ f.T, rtol=0, atol=2e-3 * float(p.max()))
     assert np.abs(f @ p @ f.T - p).max() > 0.1 * float(p.max()), "the path shows nothing"
 
-    back = jax.jit(carried)(there, path.without_biases(there).reversed(), gravity)
+    back = jax.jit(propagate_along)(there, path.without_biases(there).reverse(), gravity)
     assert np.abs(there.pos - estimate.pos).max() > 0.1
     for name, atol in (("pos", 5e-5), ("vel", 5e-5), ("quat", 5e-5), ("cov", 2e-3 * float(p.max()))):
         np.testing.assert_allclose(getattr(back, name), getattr(estimate, name), rtol=0, atol=atol, err_msg=name)

@@ -31,7 +31,7 @@ def test_flow_is_two_updates_from_one_prediction(x64):
     rng = np.random.default_rng(1)
     root = 0.3 * rng.normal(size=(9, 9))
     level, vel = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([3.0, -2.0, 0.5])
-    before = error_state.start(jnp.array([0.3, -0.2, 0.8]), vel, level, [1.0] * 9)
+    before = error_state.initial_estimate(jnp.array([0.3, -0.2, 0.8]), vel, level, [1.0] * 9)
     before = before.replace(cov=jnp.asarray(root @ root.T)[np.triu_indices(9)])
     rot, flow, gyro = np.diag([1.0, 1.0, 0.9]), np.array([2.5, -3.0]), np.array([0.7, -0.4, 0.1])
     scale, variance = 0.49, 0.2**2

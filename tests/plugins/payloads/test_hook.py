@@ -118,7 +118,7 @@ def test_a_load_on_the_floor_waits(x64):
 def test_hook_and_load_are_drawn_where_they_meet(size):
     """The wires of the load end in its ring, and the bend of the hook is there while it carries."""
     sim, _ = hooked(2.0, in_scene=True, size=size)
-    sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), 0)
+    sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), 0)
     model, data = sim.mj_model, sim.mj_data
 
     def ends(body):

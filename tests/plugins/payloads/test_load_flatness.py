@@ -7,7 +7,7 @@ import pytest
 
 from crazysim import Sim, rotation
 from crazysim.plugins.payloads import SlungLoad
-from crazysim.plugins.payloads.flatness import load_flat_state
+from crazysim.plugins.payloads.load_flatness import load_flat_state
 
 LENGTH, LOAD = 0.4, 0.2
 DT = 1e-5

@@ -8,9 +8,9 @@ from cases import with_states
 
 from crazysim import ConfigError, RotorJet, SharedLoad, Sim, SlungLoad
 from crazysim.geometry import Shape
-from crazysim.plugins.effects.downwash import jet
+from crazysim.plugins.effects.downwash import hover_jet_speed
 from crazysim.plugins.payloads import Hook, JetTable, load_jet_table, rotor_jet
-from crazysim.plugins.payloads.panels import panels_of
+from crazysim.plugins.payloads.panels import shape_panels
 
 RPM = 60 / (2 * np.pi)
 SIZE = (0.2, 0.1, 0.04)
@@ -20,7 +20,7 @@ DEPTH = 0.5
 @pytest.mark.parametrize("shape, area", [(Shape("box", (0.1, 0.05, 0.02)), 0.064), (Shape("sphere", (0.1,)), 0.12566)])
 def test_panels_close_a_surface(shape, area):
     """The areas add up, area times normal adds up to nothing, and position times normal to three volumes."""
-    panels = panels_of(shape, 0.03)
+    panels = shape_panels(shape, 0.03)
     assert panels.pos.shape == panels.normal.shape
     assert len(panels.area) == len(panels.pos) >= 24
     np.testing.assert_allclose(panels.area.sum(), area, rtol=1e-4)
@@ -97,7 +97,9 @@ def test_the_analytic_jet_is_that_of_downwash():
     radius = float(sim.airframe.value("shape.propeller_radius", ()))
     thrust = 4 * 9.3945e-7 * 1000**2  # N, of the lab's coefficient
     below, one = np.array([[0.0, 0.0, -(DEPTH - 0.02)]]), np.ones((1, 1))
-    speed = jax.jit(jet)(below, np.array([[0, 0, 1.0]]), thrust * one, np.sqrt(8) * radius * one, 1.225 * one)
+    speed = jax.jit(hover_jet_speed)(
+        below, np.array([[0, 0, 1.0]]), thrust * one, np.sqrt(8) * radius * one, 1.225 * one
+    )
     speed = np.asarray(speed)[0, 0]
     assert 3 < speed < 30
     np.testing.assert_allclose(force[0, 0], [0, 0, -1.225 * speed**2 * 0.2 * 0.1], rtol=1e-5, atol=1e-6)
@@ -150,7 +152,7 @@ def test_jets_of_all_drones():
 def test_a_large_table_is_read_outside_of_the_kernel_with_the_same_numbers(monkeypatch):
     ends = []
     for largest in (10**6, 1):
-        monkeypatch.setattr(rotor_jet, "LARGEST_FUSED", largest)
+        monkeypatch.setattr(rotor_jet, "MAX_FUSED_VALUES", largest)
         sim, _ = build(table=pressure_table(), n_drones=2, engine="auto")
         assert bool(sim.step_fn.plan(sim.data).program.unfused_stages) == (largest == 1)
         sim.step(20)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from crazysim import ConfigError, Downwash, Sim, Wind
 from crazysim.plugins.payloads import SlungLoad, direction
-from crazysim.plugins.payloads.link import Link, end_relative_motion
+from crazysim.plugins.payloads.link import LinkParams, end_relative_motion
 
 MASS, LOAD = 0.605, 0.2
 OFFSET = (0.02, 0.01, -0.03)
@@ -138,7 +138,7 @@ def test_impulse_by_hand():
 
     @jax.jit
     def end(s, pos, vel):
-        link = Link(None, jnp.full(1, 0.4), jnp.full(1, LOAD))
+        link = LinkParams(None, jnp.full(1, 0.4), jnp.full(1, LOAD))
         return end_relative_motion(s, p.mass, p.J_inv, link, pos, vel)
 
     after, vel = jax.tree.map(np.asarray, end(s, s.pos + 0.4 * q, u))

@@ -9,7 +9,7 @@ from cases import hover_rotor_state, with_states
 
 from crazysim import IMU, ConfigError, Sim, rotation
 from crazysim.plugins.sensors import Triad
-from crazysim.plugins.sensors.imu import G, specific_force
+from crazysim.plugins.sensors.imu import STANDARD_GRAVITY, specific_force
 
 DEGREE = np.pi / 180
 
@@ -223,13 +223,13 @@ def test_presets_have_the_numbers_of_their_data_sheets():
     assert abs(IMU.bmi088().gyro.noise * np.sqrt(47) / DEGREE - 0.1) < 0.005
     assert abs(IMU.mpu9250().gyro.noise * np.sqrt(92) / DEGREE - 0.1) < 0.005
     assert abs(IMU.mpu6050().gyro.noise * np.sqrt(100) / DEGREE - 0.05) < 0.005
-    np.testing.assert_allclose(IMU.bmi088().accel.noise / G, [160e-6, 160e-6, 190e-6])
+    np.testing.assert_allclose(IMU.bmi088().accel.noise / STANDARD_GRAVITY, [160e-6, 160e-6, 190e-6])
     sim, _ = build(IMU.bmi088(gyro=Triad(), pos=(0.01, 0, 0)), 400)
     sim.data = with_states(sim.data, pos=[0, 0, -0.001])
     sim.step()
     spread = (read(sim)[:, 0] - [0, 0, 9.81]).std(axis=0)
-    np.testing.assert_allclose(spread, 20e-3 * G, rtol=4 / np.sqrt(2 * 400) + 0.01)
-    lsb = read(sim) / (24 * G / 32768)
+    np.testing.assert_allclose(spread, 20e-3 * STANDARD_GRAVITY, rtol=4 / np.sqrt(2 * 400) + 0.01)
+    lsb = read(sim) / (24 * STANDARD_GRAVITY / 32768)
     np.testing.assert_allclose(lsb, np.round(lsb), atol=1e-3)
     assert read(sim, "gyro").max() == 0
 

@@ -10,10 +10,10 @@ from cases import by_stages, with_states
 
 from crazysim import ConfigError, Sim, Terrain
 from crazysim.plugins.vehicles import LPV, Bicycles, Cars, Path, PathLQR, PurePursuit, Stanley, ackermann
+from crazysim.plugins.vehicles.car_params import CarParams
+from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.following import PathState, motor_reference
 from crazysim.plugins.vehicles.model import load_vehicle
-from crazysim.plugins.vehicles.parameters import CarParams
-from crazysim.plugins.vehicles.state import CarState
 from crazysim.trajectories import circle, figure_eight
 
 EIGHT = figure_eight(5, 1.5, period=14.0, height=0.0)
@@ -198,7 +198,7 @@ def test_wheels_roll_and_steer_in_the_scene():
     sim, cars = build(1, members=2, trailer=True, vehicle="aiml_head", pos=[(1, 0), (-1, 0)], yaw=[0.0, np.pi / 2])
     sim.data = cars.commanded(sim.data, np.tile([0.05, 0.3], (1, 2, 1)))
     sim.step(100)
-    sim.scene.sync_one(sim.plugins.with_placed_objects(sim.data), 0)
+    sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), 0)
     model, data, record = sim.mj_model, sim.mj_data, jax.tree.map(np.asarray, cars.read(sim.data))
     left, right = np.asarray(jax.jit(ackermann)(record.steer[0, 0], 0.32226, 0.24477))
     for k, angle in ((0, left), (1, right), (2, 0.0), (3, 0.0)):

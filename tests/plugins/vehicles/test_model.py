@@ -9,12 +9,12 @@ import pytest
 from crazysim import ConfigError
 from crazysim.errors import UnknownNameError
 from crazysim.plugins.vehicles import CarParams, load_vehicle, vehicle_names
-from crazysim.plugins.vehicles.model import FOLDER, KEYS
+from crazysim.plugins.vehicles.model import KEYS, VEHICLE_FOLDER
 
 
 @pytest.mark.parametrize("name", vehicle_names())
 def test_every_number_has_a_unit_and_a_source(name):
-    tables = tomllib.loads((FOLDER / f"{name}.toml").read_text())
+    tables = tomllib.loads((VEHICLE_FOLDER / f"{name}.toml").read_text())
     entries = {f"{t}.{k}": x for t, table in tables.items() if t not in ("sources", "base", "model", "name")
                for k, x in table.items()}  # fmt: skip
     assert entries

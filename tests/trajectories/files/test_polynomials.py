@@ -22,8 +22,8 @@ from crazysim.trajectories.files import (
     unpack_compressed,
     unpack_poly4d,
 )
-from crazysim.trajectories.files.csv import POLYNOMIALS
-from crazysim.trajectories.files.pieces import pieces_of
+from crazysim.trajectories.files.csv import POLYNOMIAL_HEADER
+from crazysim.trajectories.files.pieces import trajectory_pieces
 
 FIGURE_EIGHT = (
     "1.050000,0.0,-0.0,0.0,-0.0,0.830443,-0.276140,-0.384219,0.180493,-0.0,0.0,-0.0,0.0,-1.356107,0.688430,0.587426,"
@@ -42,7 +42,7 @@ def trajectory(seed=0, n=4, degree=7, size=0.5):
 
 
 def check_same(a, b, atol):
-    (ends, c), (again, d) = pieces_of(a), pieces_of(b)
+    (ends, c), (again, d) = trajectory_pieces(a), trajectory_pieces(b)
     np.testing.assert_allclose(ends, again, atol=1e-6)
     u = np.linspace(0, 1, 11)
     at = u[:, None, None, None]
@@ -65,7 +65,7 @@ def test_poly4d_and_csv_and_back(tmp_path):
     save_memory(t, tmp_path / "a.bin")
     check_same(load_memory(tmp_path / "a.bin"), t, 1e-5)
     save_csv(t, tmp_path / "a.csv")
-    assert (tmp_path / "a.csv").read_text().splitlines()[0] == POLYNOMIALS
+    assert (tmp_path / "a.csv").read_text().splitlines()[0] == POLYNOMIAL_HEADER
     check_same(load_csv(tmp_path / "a.csv"), t, 1e-5)
 
 
@@ -100,13 +100,18 @@ def test_long_pieces_are_split():
     c[0, 0, 1] = 0.1
     t = Trajectory.of_pieces([150.0], c)
     again = unpack_compressed(pack_compressed(t))
-    np.testing.assert_allclose(pieces_of(again)[0], [65.0, 130.0, 150.0])
-    np.testing.assert_allclose(pieces_of(again)[1][:, 0].sum(-1), [6.5, 13.0, 15.0], atol=1e-5)
+    np.testing.assert_allclose(trajectory_pieces(again)[0], [65.0, 130.0, 150.0])
+    np.testing.assert_allclose(trajectory_pieces(again)[1][:, 0].sum(-1), [6.5, 13.0, 15.0], atol=1e-5)
 
 
 def test_crazyswarm_csv(tmp_path):
     path = tmp_path / "figure8.csv"
-    for header in (POLYNOMIALS, "# " + POLYNOMIALS, POLYNOMIALS.replace("duration", "Duration") + ",", ""):
+    for header in (
+        POLYNOMIAL_HEADER,
+        "# " + POLYNOMIAL_HEADER,
+        POLYNOMIAL_HEADER.replace("duration", "Duration") + ",",
+        "",
+    ):
         path.write_text(f"{header}\n{FIGURE_EIGHT}\n{FIGURE_EIGHT},\n\n")
         t = load_csv(path)
         assert t.n_pieces == 2
@@ -125,7 +130,7 @@ def test_samples(tmp_path):
     pos = np.array([[0, 0, 0], [0, 0, 1], [1, 2, 1], [1, 2, 0.5]], float)
     yaw = np.array([3.0, 3.1, -3.1, -3.0])  # through the half turn
     save_samples(tmp_path / "a.csv", times, pos, yaw)
-    ends, c = pieces_of(load_csv(tmp_path / "a.csv"))
+    ends, c = trajectory_pieces(load_csv(tmp_path / "a.csv"))
     np.testing.assert_allclose(ends, times[1:] - 5, rtol=1e-6)
     values = np.column_stack([pos, np.unwrap(yaw)])
     rates = np.zeros_like(values)
@@ -138,7 +143,7 @@ def test_samples(tmp_path):
 
 WRONG = {
     "empty": ("", "at least one row"),
-    "header alone": (POLYNOMIALS, "at least one row"),
+    "header alone": (POLYNOMIAL_HEADER, "at least one row"),
     "words": ("0,0,0,0\n1,2,x,4", "line 2"),
     "columns": ("1,2,3", "4, 5, 25 or 33 columns"),
     "other columns": ("0,0,0,0\n1,1,1,1,1", "4 columns, as before"),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from crazysim.errors import ConfigError
 from crazysim.lab.live.host_trajectory import HostTrajectory
 from crazysim.lab.live.swarm.commander import Commander
-from crazysim.trajectories.bezier import power_of
+from crazysim.trajectories.bezier import power_coefficients
 
 PIECE_SIZE = 132
 """Size of an uncompressed piece, bytes: 8 coefficients each of x, y, z and yaw, and the duration."""
@@ -135,7 +135,7 @@ def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
                 n_points = N_POINTS[kinds >> (2 * axis) & 3]
                 points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, at)) * units[axis]]
                 at += 2 * n_points
-                c = power_of(np.array(points)[:, None])[0]
+                c = power_coefficients(np.array(points)[:, None])[0]
                 rows.append(np.pad(c, (0, 8 - len(c))))
                 last[axis] = points[-1]
             durations.append(ms / 1000)

@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData
-from crazysim.core.plugin import Placement, Plugin, Simulation
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.errors import ConfigError
@@ -75,10 +75,10 @@ class Playback(Plugin):
             start=device_array(np.broadcast_to(start, sim.n_worlds)[:, None], dtype),
         )
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stage that moves the objects."""
         del sim
-        return [Placement(stage("world")(self.move))]
+        return [StagePlacement(stage("world")(self.move))]
 
     def move(self, data: SimData) -> SimData:
         """Return the data of one world with the objects at their poses."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from crazysim.plugins.effects import Battery
 from crazysim.plugins.sensors import MultiRanger
-from crazysim.plugins.sensors.range_finder import MULTI_RANGER, RangeFinder
+from crazysim.plugins.sensors.range_finder import MULTI_RANGER_DIRECTIONS, RangeFinder
 from crazysim.sim.sim import Sim
 
 ON_BATTERY, LOW_POWER = 0, 3
@@ -61,7 +61,9 @@ def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
             distances = np.asarray(samples.value)[0, drone].tolist()
     found = {}
     for direction, distance in zip(np.asarray(record.direction), distances, strict=True):
-        name = next((name for name, axis in MULTI_RANGER.items() if np.allclose(axis, direction, atol=1e-6)), None)
+        name = next(
+            (name for name, axis in MULTI_RANGER_DIRECTIONS.items() if np.allclose(axis, direction, atol=1e-6)), None
+        )
         if name is not None:
             found[name] = distance if distance < far else math.inf
     return found

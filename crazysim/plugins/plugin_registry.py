@@ -16,7 +16,7 @@ from jax import Array
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integration
 from crazysim.core.pipeline import Pipeline, append_fn, insert_fn_before
-from crazysim.core.plugin import Placement, Plugin, Simulation, with_measured_states
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, with_measured_states
 from crazysim.core.population import Population
 from crazysim.core.settings import settings_of
 from crazysim.core.stage import Axes, Stage, is_first_step, vmap_drones, vmap_worlds
@@ -27,7 +27,7 @@ from crazysim.pytree import PyTree, n_batch_axes
 
 P = TypeVar("P", bound=Plugin)
 
-_CONFIGURATION = ("parameter", "shared")
+_SETTING_SCOPES = ("parameter", "shared")
 """Scopes of leaves that hold settings; the others hold states."""
 
 
@@ -45,10 +45,9 @@ class PluginRegistry(Mapping[str, Plugin]):
     """The plugins of one simulation by name, in the order in which they were added."""
 
     def __init__(self, sim: Simulation):
-        """Start without plugins."""
         self._sim = sim
         self._installed: dict[str, _Installed] = {}
-        self._placing: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
+        self._move_objects: dict[str, tuple[Plugin, Callable[..., Any]]] = {}
         self._observing: tuple[tuple[Plugin, ...], Callable[..., Any]] = (), _no_observations
         self._checked = True
 
@@ -65,15 +64,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         return self._installed[name].plugin
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
         return iter(self._installed)
 
     def __len__(self) -> int:
-        """Return the number of plugins."""
         return len(self._installed)
 
     def __contains__(self, name: object) -> bool:
-        """Return True if there is a plugin of that name."""
         return name in self._installed
 
     def add(self, plugin: P, name: str | None = None) -> P:
@@ -95,12 +91,12 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_terms(plugin, self.values())
         with self._unchanged_on_error():
             record, default = plugin.record(self._sim), plugin.default_record(self._sim)
-            pipeline, installed = _with(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
+            pipeline, installed = _add_stages(dict(self._sim.step_pipeline), plugin, _placements(plugin, self._sim))
             pipeline = _with_influences(pipeline, [*self.values(), plugin], plugin)
             resets = dict(self._sim.reset_pipeline)
-            if _begins_at_resets(plugin):
-                append_fn(resets, Stage(plugin.begin_episode, "drone"), name)
-            self._put(name, record, default)
+            if _in_reset_pipeline(plugin):
+                append_fn(resets, Stage(plugin.reset_episode, "drone"), name)
+            self._put_records(name, record, default)
             self._installed[name] = installed
             self._build(pipeline, resets)
         return plugin
@@ -109,21 +105,21 @@ class PluginRegistry(Mapping[str, Plugin]):
         """Remove a plugin; see ``Sim.remove``."""
         name = plugin.name if isinstance(plugin, Plugin) else plugin
         self[name]
-        pipeline = _without(dict(self._sim.step_pipeline), self._installed[name])
+        pipeline = _remove_stages(dict(self._sim.step_pipeline), self._installed[name])
         pipeline = _with_influences(pipeline, [p for p in self.values() if p.name != name])
         resets = dict(self._sim.reset_pipeline)
-        if _begins_at_resets(self[name]):
+        if _in_reset_pipeline(self[name]):
             resets.pop(name, None)
-        self._put(name, None, None)
+        self._put_records(name, None, None)
         del self._installed[name]
         self._build(pipeline, resets)
 
     def replace(self, plugin: P) -> P:
         """Replace the settings of a plugin; see ``Sim.replace``."""
         with self._unchanged_on_error():
-            return self._replaced(plugin)
+            return self._replace_plugin(plugin)
 
-    def _replaced(self, plugin: P) -> P:
+    def _replace_plugin(self, plugin: P) -> P:
         before = self[plugin.name]
         if type(before) is not type(plugin):
             raise ConfigError(
@@ -134,21 +130,21 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._require_names(plugin, [other for other in sim.names if other not in self.members_of(before)])
         self._require_terms(plugin, [other for other in self.values() if other is not before])
         present, record, default = sim.data.plugins.get(name), plugin.record(sim), plugin.default_record(sim)
-        if _same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
-            self._put(name, _continued(record, present), default)
+        if _have_same_code(before, plugin) and jax.tree.structure(present) == jax.tree.structure(record):
+            self._put_records(name, _continue_states(record, present), default)
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
             self._checked = False
             return plugin
         # The stages are made for a pipeline without the plugin.
-        sim.step_pipeline = _without(dict(sim.step_pipeline), self._installed[name])
-        pipeline, installed = _with(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
+        sim.step_pipeline = _remove_stages(dict(sim.step_pipeline), self._installed[name])
+        pipeline, installed = _add_stages(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
         resets = dict(self._sim.reset_pipeline)
-        if _begins_at_resets(plugin) and (name in resets or not _begins_at_resets(before)):
-            resets[name] = Stage(plugin.begin_episode, "drone")
-        elif _begins_at_resets(before):
+        if _in_reset_pipeline(plugin) and (name in resets or not _in_reset_pipeline(before)):
+            resets[name] = Stage(plugin.reset_episode, "drone")
+        elif _in_reset_pipeline(before):
             resets.pop(name, None)
-        self._put(name, _continued(record, present), default)
+        self._put_records(name, _continue_states(record, present), default)
         self._installed[name] = installed
         self._build(pipeline, resets)
         return plugin
@@ -176,7 +172,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def reset_stages(self) -> tuple[str, ...]:
         """Names of stages that do in the first step of an episode what resets have done."""
         resets = self._sim.reset_pipeline
-        return tuple([_begin_name(p) for p in self.values() if _begins_at_resets(p) and p.name in resets])
+        return tuple([_reset_stage_name(p) for p in self.values() if _in_reset_pipeline(p) and p.name in resets])
 
     @property
     def members(self) -> tuple[str, ...]:
@@ -226,7 +222,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def build_records(self) -> None:
         """Put a new record of every plugin into the simulation's data."""
         for name, plugin in self.items():
-            self._set(name, plugin.record(self._sim))
+            self._set_record(name, plugin.record(self._sim))
 
     def observations(self, data: SimData, measured: bool = False) -> dict[str, Array]:
         """Return the observations of all plugins, as ``"plugin.name"``. (n_worlds, n_drones, k) each
@@ -245,15 +241,15 @@ class PluginRegistry(Mapping[str, Plugin]):
         plugins = tuple(self.values())
         return data.replace(states=vmap_drones(lambda one: with_measured_states(plugins, one).states)(data))
 
-    def with_placed_objects(self, data: SimData) -> SimData:
-        """Return the data with the plugins' objects of the scene at their poses, unless these are recorded ones."""
+    def with_moved_objects(self, data: SimData) -> SimData:
+        """Return the data with the objects of plugins at their poses, unless recorded poses are shown."""
         if data.objects is None or data.objects.recorded:
             return data
         for name, plugin in self.items():
-            if plugin.places:
-                if self._placing.get(name, (None, None))[0] is not plugin:
-                    self._placing[name] = plugin, jax.jit(vmap_worlds(plugin.place))
-                data = data.replace(objects=self._placing[name][1](data))
+            if plugin.moves_objects:
+                if self._move_objects.get(name, (None, None))[0] is not plugin:
+                    self._move_objects[name] = plugin, jax.jit(vmap_worlds(plugin.move_objects))
+                data = data.replace(objects=self._move_objects[name][1](data))
         return data
 
     def draw(self, world: int) -> None:
@@ -261,17 +257,17 @@ class PluginRegistry(Mapping[str, Plugin]):
         for plugin in self.values():
             plugin.draw(self._sim, world)
 
-    def _put(self, name: str, record: PyTree | None, default: PyTree | None) -> None:
+    def _put_records(self, name: str, record: PyTree | None, default: PyTree | None) -> None:
         """Put a record into the data and the default data, or remove it; nothing else of either changes.
 
-        Both records go through ``sim.data``, which places them on the simulation's devices.
+        Both records go through ``sim.data``, which puts them on the simulation's devices.
         """
-        self._set(name, default)
-        placed = self._sim.data.plugins.get(name)
-        self._sim.default_data = _with_record(self._sim.default_data, name, placed)
-        self._set(name, record)
+        self._set_record(name, default)
+        current = self._sim.data.plugins.get(name)
+        self._sim.default_data = _with_record(self._sim.default_data, name, current)
+        self._set_record(name, record)
 
-    def _set(self, name: str, record: PyTree | None) -> None:
+    def _set_record(self, name: str, record: PyTree | None) -> None:
         if record is not None and not isinstance(record, PyTree):
             raise ConfigError(
                 f"expected record of plugin {name!r} to return a PyTree or None, got {type(record).__name__}. Use a "
@@ -293,44 +289,44 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
 
 
 def _placements(plugin: Plugin, sim: Simulation) -> object:
-    """Return the stages of a plugin with their places, after the one that begins an episode in its first step."""
+    """Return the placements of the stages of a plugin, after the one that resets the episode in its first step."""
     placements = plugin.stages(sim)
-    if not plugin.begins_episodes or not isinstance(placements, (list, tuple)):
+    if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
-    begins = Stage(plugin.begin_episode, "drone", is_first_step)
-    before = plugin.begins_before
+    begins = Stage(plugin.reset_episode, "drone", is_first_step)
+    before = plugin.reset_before
     if before is None:  # in front of all stages that do not begin an episode
         before = next(name for name, fn in sim.step_pipeline.items() if getattr(fn, "when", None) is not is_first_step)
-    return [Placement(begins, before=before, name=_begin_name(plugin)), *placements]
+    return [StagePlacement(begins, before=before, name=_reset_stage_name(plugin)), *placements]
 
 
-def _begins_at_resets(plugin: Plugin) -> bool:
-    return plugin.begins_episodes and plugin.begins_before is None
+def _in_reset_pipeline(plugin: Plugin) -> bool:
+    return plugin.resets_episode and plugin.reset_before is None
 
 
-def _begin_name(plugin: Plugin) -> str:
+def _reset_stage_name(plugin: Plugin) -> str:
     return f"{plugin.name}_begin"
 
 
-def _with(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _Installed]:
+def _add_stages(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _Installed]:
     """Return the pipeline with the stages of a plugin, and the plugin with what it changed.
 
     Raises:
-        ConfigError: If ``placements`` is no list of ``Placement``, or the name of a stage is taken.
+        ConfigError: If ``placements`` is no list of ``StagePlacement``, or the name of a stage is taken.
         UnknownNameError: If there is no stage to go in front of.
     """
-    if not isinstance(placements, (list, tuple)) or not all(isinstance(x, Placement) for x in placements):
+    if not isinstance(placements, (list, tuple)) or not all(isinstance(x, StagePlacement) for x in placements):
         raise ConfigError(
-            f"expected stages of plugin {plugin.name!r} to return a list of Placement, got {placements!r}. Use "
-            f"[Placement(stage, before='increment_steps')]."
+            f"expected stages of plugin {plugin.name!r} to return a list of StagePlacement, got {placements!r}. Use "
+            f"[StagePlacement(stage, before='increment_steps')]."
         )
     installed = _Installed(plugin, {}, {})
     for placement in placements:
-        pipeline = _with_stage(pipeline, placement, placement.name or plugin.name, installed)
+        pipeline = _add_stage(pipeline, placement, placement.name or plugin.name, installed)
     return pipeline, installed
 
 
-def _with_stage(pipeline: Pipeline, placement: Placement, name: str, installed: _Installed) -> Pipeline:
+def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, installed: _Installed) -> Pipeline:
     replaced = placement.replaces if placement.replaces in pipeline else None
     if name in pipeline and name != replaced:
         raise ConfigError(f"the step pipeline already has a stage {name!r}. Use sim.add(..., name=...).")
@@ -344,8 +340,8 @@ def _with_stage(pipeline: Pipeline, placement: Placement, name: str, installed: 
     }
 
 
-def _without(pipeline: Pipeline, installed: _Installed) -> Pipeline:
-    """Return the pipeline without the stages of a plugin, and with those that it had replaced.
+def _remove_stages(pipeline: Pipeline, installed: _Installed) -> Pipeline:
+    """Return the pipeline without the stages of a plugin, and with the stages that it had replaced.
 
     Raises:
         ConfigError: If one of its stages has been replaced since.
@@ -385,13 +381,13 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
     return pipeline
 
 
-def _same_code(before: Plugin, after: Plugin) -> bool:
+def _have_same_code(before: Plugin, after: Plugin) -> bool:
     """Return True if two plugins of one class differ in numbers of their records at most."""
     fixed = [name for name, setting in settings_of(type(before)).items() if not setting.is_parameter]
-    return all(_equal(getattr(before, name), getattr(after, name)) for name in fixed)
+    return all(_are_equal(getattr(before, name), getattr(after, name)) for name in fixed)
 
 
-def _equal(a: Any, b: Any) -> bool:
+def _are_equal(a: Any, b: Any) -> bool:
     if a is b:
         return True
     if isinstance(a, (np.ndarray, jax.Array)) or isinstance(b, (np.ndarray, jax.Array)):
@@ -402,16 +398,16 @@ def _equal(a: Any, b: Any) -> bool:
         return False
 
 
-def _continued(record: PyTree | None, before: PyTree | None) -> PyTree | None:
-    """Return a record whose states are those of the record before, as far as these have the same shapes."""
+def _continue_states(record: PyTree | None, before: PyTree | None) -> PyTree | None:
+    """Return a record with the states of the record before, as far as the shapes agree."""
     if record is None or type(record) is not type(before):
         return record
     kept = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
         new, old = getattr(record, f.name), getattr(before, f.name)
         if isinstance(new, PyTree):
-            kept[f.name] = _continued(new, old)
-        elif not f.metadata.get("static") and f.metadata.get("scope") not in _CONFIGURATION:
+            kept[f.name] = _continue_states(new, old)
+        elif not f.metadata.get("static") and f.metadata.get("scope") not in _SETTING_SCOPES:
             kept[f.name] = old if _signature(old) == _signature(new) else new
     return record.replace(**kept)
 

@@ -27,7 +27,7 @@ class RigidBodyParams(PyTree):
     """Limits of the rotors."""
 
 
-def rigid_body(airframe: Airframe) -> dict[str, Any]:
+def rigid_body_params(airframe: Airframe) -> dict[str, Any]:
     """Return the fields of ``RigidBodyParams`` for an airframe.
 
     Raises:

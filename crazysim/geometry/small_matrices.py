@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 
-def solve(matrix: Array, b: Array) -> Array:
+def solve_symmetric(matrix: Array, b: Array) -> Array:
     """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
 
     Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
@@ -29,7 +29,7 @@ def solve(matrix: Array, b: Array) -> Array:
     return jnp.stack([y[k] * scale[k] for k in range(n)], axis=-1)
 
 
-def apply(matrix: Array, vector: Array) -> Array:
+def matvec(matrix: Array, vector: Array) -> Array:
     """Return ``matrix @ vector`` in three operations, which compile sooner than the unrolled form.
 
     Sums of products are as exact on a GPU as elsewhere, where a product of matrices may be rounded to 10 bits.
@@ -45,5 +45,5 @@ def apply(matrix: Array, vector: Array) -> Array:
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` as ``apply`` does. (..., m, k)"""
+    """Return ``a @ b`` as ``matvec`` does. (..., m, k)"""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from crazysim.errors import RenderError
 from crazysim.scene.overlays import Overlays
 
-KEYS = {
+KEY_NAMES = {
     "UP": "up", "DOWN": "down", "LEFT": "left", "RIGHT": "right", "SPACE": "space", "TAB": "tab", "ENTER": "enter",
     "BACKSPACE": "backspace", "ESCAPE": "escape", "EQUAL": "+", "KP_ADD": "+", "MINUS": "-", "KP_SUBTRACT": "-",
 }  # fmt: skip
@@ -25,7 +25,7 @@ Tile = tuple[mujoco.MjData, Overlays]
 """State of one world, with its kinematics up to date, and what is drawn over it."""
 
 
-class Window:
+class SceneWindow:
     """A window that shows one model, in one or several states.
 
     MuJoCo's passive viewer draws in a thread of its own, and sometimes crashes the process when it is closed.
@@ -62,7 +62,7 @@ class Window:
         """Function that is called with the name of a key, and True when it is pressed, False when it is released."""
         self.on_drawn: Callable[[mujoco.MjrRect, mujoco.MjrContext], None] | None = None
         """Function that draws over the finished image, with its rectangle, pixels."""
-        self._names = {getattr(glfw, f"KEY_{key}"): name for key, name in KEYS.items()}
+        self._names = {getattr(glfw, f"KEY_{key}"): name for key, name in KEY_NAMES.items()}
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_cursor_pos_callback(self._window, self._on_move)
         glfw.set_scroll_callback(self._window, self._on_scroll)
@@ -93,7 +93,7 @@ class Window:
             self.close()
         if self._window is None:
             return
-        settings = _settings(camera)
+        settings = _camera_settings(camera)
         if settings != self._settings:
             self._settings, self._camera = settings, camera
         if (width, height) != self._size:
@@ -222,6 +222,6 @@ def _glfw() -> Any:
     return glfw
 
 
-def _settings(camera: mujoco.MjvCamera) -> tuple:
+def _camera_settings(camera: mujoco.MjvCamera) -> tuple:
     names = ("type", "fixedcamid", "trackbodyid", "distance", "azimuth", "elevation", "orthographic")
     return (*(getattr(camera, name) for name in names), *camera.lookat)

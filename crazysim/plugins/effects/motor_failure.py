@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from crazysim.core.data import SimData, controls_of
-from crazysim.core.plugin import Placement, Plugin, Simulation, check_parameter, drone_array, parameter
+from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, drone_array, parameter
 from crazysim.core.random import drone_key, uniform
 from crazysim.core.settings import as_mask
 from crazysim.core.stage import stage
@@ -49,19 +49,16 @@ class MotorFailure(Plugin):
     name: str = "motors"
 
     def record(self, sim: Simulation) -> MotorFailureData:
-        """Return the rotors at their initial effectiveness."""
         require_rotors(sim, "motor failure")
         n = sim.data.states.rotor_vel.shape[-1]
         effectiveness = check_parameter(sim, "effectiveness", self.effectiveness, (n,))
         return self.filled(sim, MotorFailureData, effectiveness=drone_array(sim, effectiveness, n))
 
-    def stages(self, sim: Simulation) -> Sequence[Placement]:
-        """Return the stage that makes rotors fail, if any can."""
+    def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         can_fail = self.fail_step is not None or self.rate is not None
-        return [Placement(stage("drone")(self.fail_in_flight))] if can_fail else []
+        return [StagePlacement(stage("drone")(self.fail_in_flight))] if can_fail else []
 
     def influence(self, data: SimData) -> SimData:
-        """Return the data with the curves and commands of weak and failed rotors."""
         effectiveness = self.read(data).effectiveness
         p, scale, controls = data.params, effectiveness[..., None], controls_of(data)
         params = p.replace(rpm2thrust=scale * p.rpm2thrust, rpm2torque=scale * p.rpm2torque)

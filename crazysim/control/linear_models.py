@@ -30,7 +30,7 @@ def drone_derivative(x: Array, u: Array, mass: Array, J: Array, gravity_vec: Arr
     """
     vel, rpy, ang_vel = x[3:6], x[6:9], x[9:12]
     acc = u[0] * _z_axis(rpy) / mass + gravity_vec
-    return jnp.concatenate([vel, acc, *_rotational(rpy, ang_vel, u[1:], J)])
+    return jnp.concatenate([vel, acc, *_rotational_derivatives(rpy, ang_vel, u[1:], J)])
 
 
 def load_derivative(
@@ -76,7 +76,7 @@ def load_derivative(
     vel, rpy, ang_vel, angles, rates = x[3:6], x[6:9], x[9:12], x[12:14], x[14:16]
     force = u[0] * _z_axis(rpy)
     q, q_rate = jax.jvp(rod_direction, (angles,), (rates,))
-    rpy_rate, ang_acc = _rotational(rpy, ang_vel, u[1:], J)
+    rpy_rate, ang_acc = _rotational_derivatives(rpy, ang_vel, u[1:], J)
     if attach is None:
         q_acc = cross(q, cross(q, force)) / (mass * length) - dot(q_rate, q_rate) * q
         acc = (force - load_mass * length * q_acc) / (mass + load_mass) + gravity_vec
@@ -137,7 +137,7 @@ def _z_axis(rpy: Array) -> Array:
     return rotation.z_axis(rotation.from_rpy(rpy))
 
 
-def _rotational(rpy: Array, ang_vel: Array, torque: Array, J: Array) -> tuple[Array, Array]:
+def _rotational_derivatives(rpy: Array, ang_vel: Array, torque: Array, J: Array) -> tuple[Array, Array]:
     """Return the derivatives of roll, pitch, yaw and of the body rates."""
     roll, pitch = rpy[0], rpy[1]
     turning = jnp.sin(roll) * ang_vel[1] + jnp.cos(roll) * ang_vel[2]

@@ -14,39 +14,39 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.drones.checks import MAX_ROTORS
+from crazysim.drones.airframe_checks import MAX_ROTORS
 from crazysim.errors import ConfigError, short_repr
 from crazysim.storage import is_file
 from crazysim.tables import POSITIVE, read_number
 
 AIR_DENSITY = 1.225
 """Density of air at sea level in the standard atmosphere, kg/m^3."""
-PITCH = 0.5
+PITCH_RATIO = 0.5
 """Pitch over diameter of a propeller whose pitch is not given, 1."""
-OUTER_MASS = 0.4
+OUTER_MASS_SHARE = 0.4
 """Part of the mass that sits at the rotors, 1; the built-in airframes have 0.31 to 0.52."""
 MERIT_DIAMETERS, MERITS = (0.127, 0.254), (0.44, 0.68)
 """Figures of merit in hover of a propeller of 5 and one of 10 inches, and their diameters, m."""
 DRAG_RATE = 0.45
 """Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.35 to 0.58."""
-ROTOR_TIME = 0.05
+ROTOR_TIME_CONSTANT = 0.05
 """Time constant of rotors up to 10 inches, s."""
-TABLE_ERROR = 0.05
+MAX_TABLE_ERROR = 0.05
 """Part of the largest thrust or torque of a motor table by which it may fall where the speed rises, or by which two
 columns of one quantity may differ: an assumption about the errors of data sheets."""
-IDLE = 0.05
+IDLE_THRUST_RATIO = 0.05
 """Smallest over largest thrust of a rotor that is on, 1."""
 MOTOR_EFFICIENCY = 0.75
 """Mechanical power over electric power of a motor with its speed controller, 1."""
 BATTERY_SHARE = 0.22
-"""Mass of the battery over that of the drone, 1; that of a Crazyflie 2.1 Brushless is 0.21."""
+"""Mass of the battery over the drone's mass, 1; a Crazyflie 2.1 Brushless has 0.21."""
 BATTERY_ENERGY = 153.0
 """Energy per mass of lithium-polymer batteries, W h/kg."""
 CELL_VOLTAGE = 3.7
 """Nominal voltage of a lithium-polymer cell, V."""
 CELL_RESISTANCE = 0.015
 """Resistance of a cell times its capacity, ohm A h."""
-DISC_LOADING = 1e4
+MAX_DISC_LOADING = 1e4
 """Thrust over disc area that only wrong units exceed, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
 MotorTable = str | Path | Mapping[str, ArrayLike]
 """Path of a CSV file, or its columns."""
@@ -64,10 +64,10 @@ SOURCES = {
     "layout": "{n} rotors at equal angles, {arm:g} m from the centre, numbered clockwise from the one at or right "
     "of the nose; rotors 1, 3, ... turn counter-clockwise seen from above",
     "spins": "Rotors that turn counter-clockwise seen from above have -1: their drag turns the body clockwise",
-    "inertia": f"estimate: {OUTER_MASS:g} of the mass as points at the rotors, the rest at the centre; inertias of the "
-    "built-in airframes correspond to 0.31 to 0.52",
+    "inertia": f"estimate: {OUTER_MASS_SHARE:g} of the mass as points at the rotors, the rest at the centre; inertias "
+    "of the built-in airframes correspond to 0.31 to 0.52",
     "thrust_to_weight": "Thrust over weight of {ratio:g}: ratio mass g / number of rotors",
-    "thrust_min": f"estimate: {IDLE:g} thrust_max, rotors that idle",
+    "thrust_min": f"estimate: {IDLE_THRUST_RATIO:g} thrust_max, rotors that idle",
     "thrust_curve": "estimate: T = C_T rho n^2 D^4 with n in 1/s, rho = 1.225 kg/m^3, C_T = 0.0427 + 0.144 pitch / D = "
     "{ct:.4f}, a fit to APC multirotor propellers in SizingLab/FAST-UAV, surrogate_models.py; {pitch}",
     "torque_curve": "estimate: ideal power T^1.5 / sqrt(2 rho A) over a figure of merit of {merit:.2f}, interpolated "
@@ -75,8 +75,8 @@ SOURCES = {
     "C_P 0.048), averages of static tests in the UIUC Propeller Database",
     "rotor_inertia": "estimate: thin rod, m D^2 / 12, of the propeller's mass m = 0.015 kg (D / 0.279 m)^2 (0.53 oz at "
     "11 inch, scaled as in SizingLab/FAST-UAV); the motor's bell is neglected",
-    "lag": f"estimate: first order with {ROTOR_TIME:g} s, longer in proportion to the diameter beyond 0.254 m; thrust "
-    "of cf21B_500 has 0.06 s around hover, that of hb_x500 (10 inch) 0.045 to 0.071 s",
+    "lag": f"estimate: first order with {ROTOR_TIME_CONSTANT:g} s, longer in proportion to the diameter beyond 0.254 "
+    "m; thrust of cf21B_500 has 0.06 s around hover, that of hb_x500 (10 inch) 0.045 to 0.071 s",
     "drag": f"estimate: {DRAG_RATE:g} 1/s times the mass; airframes identified from flights (cf21B_500, cf2x_L250, "
     "hb_x500) have 0.35 to 0.58 1/s",
     "cells": "estimate: 1 cell below 0.1 kg, 3 below 0.5 kg, 4 below 3 kg, else 6",
@@ -137,7 +137,7 @@ def estimate_airframe(
         name: Name of the airframe.
 
     Raises:
-        ConfigError: If a number is missing or cannot be that of a drone.
+        ConfigError: If a number is missing or cannot belong to a drone.
     """
     for key, value in (
         ("mass", mass),
@@ -167,16 +167,16 @@ def estimate_airframe(
         "layout" if positions is None else "given",
     )
     file.add("rotors", "yaw_torque_sign", signs, "1", "spins" if positions is not None or spins else "layout")
-    thrust = _thrusts(file, mass, len(places), propeller, thrust_to_weight, motor_table, pitch)
-    _plausible(mass, propeller, places, thrust)
-    file.add("rotors", "thrust_min", IDLE * thrust, "N", "thrust_min")
+    thrust = _add_thrust(file, mass, len(places), propeller, thrust_to_weight, motor_table, pitch)
+    _check_units(mass, propeller, places, thrust)
+    file.add("rotors", "thrust_min", IDLE_THRUST_RATIO * thrust, "N", "thrust_min")
     blade = 0.015 * (propeller / 0.279) ** 2
     file.add("rotors", "inertia", blade * propeller**2 / 12, "kg m^2", "rotor_inertia")
-    tau = ROTOR_TIME * max(1.0, propeller / 0.254) if time_constant is None else time_constant
+    tau = ROTOR_TIME_CONSTANT * max(1.0, propeller / 0.254) if time_constant is None else time_constant
     lag_unit = "1/s, 1/(s rpm) on spin-up; 1/s, 1/(s rpm) on spin-down"
     file.add("rotors", "lag", np.array([1 / tau, 0, 1 / tau, 0]), lag_unit, "given" if time_constant else "lag")
     file.add("drag", "coefficients", -DRAG_RATE * mass * np.ones(3), "N s/m", "drag")
-    _battery(file, mass, cells, capacity, resistance)
+    _add_battery(file, mass, cells, capacity, resistance)
     file.add("shape", "propeller_radius", propeller / 2, "m", "propeller")
     return file.text()
 
@@ -185,7 +185,6 @@ class _File:
     """Text of an airframe: tables of numbers with units and sources."""
 
     def __init__(self, name: str) -> None:
-        """Start an empty airframe."""
         self.name = name
         self.tables: dict[str, list[str]] = {}
         self.sources: dict[str, str] = {}
@@ -194,7 +193,7 @@ class _File:
         """Add a number with its unit and a source of ``SOURCES``, which ``numbers`` are filled into."""
         if source not in self.sources:
             self.describe(source, SOURCES[source].format(**numbers) if numbers else SOURCES[source])
-        line = f'{key} = {{ value = {_toml(value)}, unit = "{unit}", source = "{source}" }}'
+        line = f'{key} = {{ value = {_toml_value(value)}, unit = "{unit}", source = "{source}" }}'
         self.tables.setdefault(table, []).append(line)
 
     def describe(self, source: str, text: str) -> None:
@@ -207,17 +206,17 @@ class _File:
             f"# {self.name}, written by crazysim airframe new. Every number is {{ value, unit, source }}; [sources]",
             "# has the formula and the origin of each. Replace estimates by what you measure.",
             "",
-            f"name = {_string(self.name)}",
+            f"name = {_toml_string(self.name)}",
             "",
             "[sources]",
-            *(f"{key} = {_string(text)}" for key, text in self.sources.items()),
+            *(f"{key} = {_toml_string(text)}" for key, text in self.sources.items()),
         ]
         for table, entries in self.tables.items():
             lines += ["", f"[{table}]", *entries]
         return "\n".join(lines) + "\n"
 
 
-def _string(text: str) -> str:
+def _toml_string(text: str) -> str:
     """Return a TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     if not escaped.isprintable():
@@ -225,10 +224,10 @@ def _string(text: str) -> str:
     return f'"{escaped}"'
 
 
-def _toml(value: Any) -> str:
+def _toml_value(value: Any) -> str:
     """Return a number or an array with six digits, as TOML."""
     if np.ndim(value):
-        return f"[{', '.join(_toml(each) for each in value)}]"
+        return f"[{', '.join(_toml_value(each) for each in value)}]"
     return f"{float(value):.6g}" if isinstance(value, (float, np.floating)) else str(int(value))
 
 
@@ -285,14 +284,14 @@ def _rotors(
 
 
 def _inertia(mass: float, places: NDArray) -> NDArray:
-    """Return the inertia of points at the rotors: moments, or a matrix where its axes are not those of the body."""
+    """Return the inertia of points at the rotors: moments, or a matrix where its axes are not the body's."""
     squares = np.einsum("ni,nj->ij", places, places) / len(places)
-    matrix = OUTER_MASS * mass * (np.trace(squares) * np.eye(3) - squares)
+    matrix = OUTER_MASS_SHARE * mass * (np.trace(squares) * np.eye(3) - squares)
     off = matrix - np.diag(np.diag(matrix))
     return np.diag(matrix) if np.max(np.abs(off)) < 1e-6 * np.max(matrix) else matrix
 
 
-def _thrusts(
+def _add_thrust(
     file: _File,
     mass: float,
     n: int,
@@ -316,10 +315,10 @@ def _thrusts(
         thrust = float(np.max(rows["thrust"]))
         file.describe("motor_thrust", f"Largest thrust of the {named}")
         file.add("rotors", "thrust_max", thrust, "N", "motor_thrust")
-    beta = PITCH if pitch is None else pitch / diameter
+    beta = PITCH_RATIO if pitch is None else pitch / diameter
     ct = 0.0427 + 0.144 * beta
     if "rpm" in rows:
-        k, error = _quadratic(rows["rpm"], rows["thrust"])
+        k, error = _fit_quadratic(rows["rpm"], rows["thrust"])
         file.describe("motor_curve", f"Least squares T = k rpm^2 to the {named}, off by at most {error:.2g} N")
         source = "motor_curve"
     else:
@@ -331,12 +330,12 @@ def _thrusts(
     merit = float(np.interp(diameter, MERIT_DIAMETERS, MERITS))
     torque, source = k**1.5 / np.sqrt(2 * AIR_DENSITY * area) / merit / to_rad, "torque_curve"
     if "rpm" in rows and "torque" in rows:
-        torque, error = _quadratic(rows["rpm"], rows["torque"])
+        torque, error = _fit_quadratic(rows["rpm"], rows["torque"])
         file.describe("motor_torque", f"Least squares Q = k rpm^2 to the {named}, off by at most {error:.2g} N m")
         source = "motor_torque"
     elif "rpm" in rows and "power" in rows:
         shaft = MOTOR_EFFICIENCY * rows["power"] / (rows["rpm"] * to_rad)
-        torque, error = _quadratic(rows["rpm"], shaft)
+        torque, error = _fit_quadratic(rows["rpm"], shaft)
         file.describe(
             "motor_power",
             f"estimate: least squares Q = k rpm^2 to the {named}, with {MOTOR_EFFICIENCY:g} of the electric power at "
@@ -347,10 +346,10 @@ def _thrusts(
     return thrust
 
 
-def _plausible(mass: float, propeller: float, places: NDArray, thrust: float) -> None:
+def _check_units(mass: float, propeller: float, places: NDArray, thrust: float) -> None:
     """Refuse numbers in other units, such as grams or inches."""
     pressure, reach = thrust / (np.pi * propeller**2 / 4), float(np.max(np.linalg.norm(places, axis=-1)))
-    if pressure > DISC_LOADING or reach > 20 * propeller:
+    if pressure > MAX_DISC_LOADING or reach > 20 * propeller:
         raise ConfigError(
             f"expected mass in kg and lengths in m, got {mass:g} kg, propellers of {propeller:g} m, rotors up to "
             f"{reach:.3g} m from the centre, and {thrust:.3g} N of thrust each: {pressure:.3g} N/m^2 of propeller. "
@@ -358,7 +357,7 @@ def _plausible(mass: float, propeller: float, places: NDArray, thrust: float) ->
         )
 
 
-def _quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
+def _fit_quadratic(rpm: NDArray, values: NDArray) -> tuple[float, float]:
     """Return the factor k of values = k rpm^2 by least squares, and the largest error."""
     squares = rpm**2
     k = float(squares @ values / (squares @ squares))
@@ -383,7 +382,7 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
                 f"expected finite numbers of at least 0 in column {key!r}, got {short_repr(array.tolist())}"
             )
         same = found.setdefault(quantity, array)
-        if same.shape == array.shape and np.any(np.abs(same - array) > TABLE_ERROR * np.max(same)):
+        if same.shape == array.shape and np.any(np.abs(same - array) > MAX_TABLE_ERROR * np.max(same)):
             k = int(np.argmax(np.abs(same - array)))
             raise ConfigError(
                 f"expected columns of the motor table that agree on the {quantity}, got {same[k]:.4g} and "
@@ -402,7 +401,7 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
         for quantity in ("thrust", "torque"):
             values = found.get(quantity, np.zeros(1))
             fall = np.maximum.accumulate(values) - values
-            if np.max(fall) > TABLE_ERROR * np.max(values):
+            if np.max(fall) > MAX_TABLE_ERROR * np.max(values):
                 k = int(np.argmax(fall))
                 raise ConfigError(
                     f"expected a motor table whose {quantity} grows with the speed, got {values[k]:.4g} at "
@@ -422,7 +421,7 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
     return {key: [row[i] for row in rows] for i, key in enumerate(header)}
 
 
-def _battery(file: _File, mass: float, cells: int | None, capacity: float | None, resistance: float | None) -> None:
+def _add_battery(file: _File, mass: float, cells: int | None, capacity: float | None, resistance: float | None) -> None:
     """Add the battery."""
     n = cells or next(n for n, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
     charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n * CELL_VOLTAGE)

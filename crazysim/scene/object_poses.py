@@ -9,39 +9,39 @@ from crazysim.core.plugin import Plugin
 from crazysim.core.stage import vmap_worlds
 from crazysim.errors import ConfigError
 
-Placing = Callable[[], Iterable[Plugin]]
-"""Returns plugins, of which those that place objects count."""
+ListPlugins = Callable[[], Iterable[Plugin]]
+"""Function that returns the plugins of the simulation."""
 
 
-def placed_by(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str, Plugin]:
-    """Return the plugin that places each of some objects, by the object's name, for objects that a plugin places."""
-    found = {}
+def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str, Plugin]:
+    """Return the plugin that moves each object, by the name of the object, without objects that no plugin moves."""
+    owners = {}
     for plugin in plugins:
-        kinds = plugin.placed_kinds
-        for name in names if plugin.places else ():
+        kinds = plugin.moved_kinds
+        for name in names if plugin.moves_objects else ():
             if kinds is None or name.rpartition(":")[0] in kinds:
-                found[name] = plugin
-    return found
+                owners[name] = plugin
+    return owners
 
 
-def place(data: SimData, placed: Mapping[str, Plugin]) -> SimData:
-    """Return the data of all worlds, or of one world, with objects at the poses of their plugins.
+def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
+    """Return the data of all worlds, or of one world, with the objects of plugins at their poses.
 
     Recorded poses stay.
 
     Raises:
         ConfigError: If the data are of one drone, which do not contain the other drones' objects.
     """
-    if not placed or data.objects is None or data.objects.recorded:
+    if not plugins or data.objects is None or data.objects.recorded:
         return data
     if data.states.pos.ndim == 1:
-        name, plugin = next(iter(placed.items()))
+        name, plugin = next(iter(plugins.items()))
         raise ConfigError(
             f"expected the data of a world, got those of one drone, from which the pose of {name!r}, an object of "
             f"plugin {plugin.name!r}, does not follow. Declare the stage @stage('world'), or leave the object out with "
             f"objects=."
         )
-    for plugin in dict.fromkeys(placed.values()):
-        where = vmap_worlds(plugin.place) if data.states.pos.ndim == 3 else plugin.place
-        data = data.replace(objects=where(data))
+    for plugin in dict.fromkeys(plugins.values()):
+        move = vmap_worlds(plugin.move_objects) if data.states.pos.ndim == 3 else plugin.move_objects
+        data = data.replace(objects=move(data))
     return data

@@ -22,9 +22,9 @@ MAX_PIECES = 20_000
 """Most pieces of a fitted curve."""
 MAX_SIZE = 1e6
 """Largest length, m, number of oscillations, or phase, rad."""
-TIMES = (1e-3, 1e6)
+PERIOD_RANGE = (1e-3, 1e6)
 """Shortest and longest period, s."""
-PERIOD = 5.0
+DEFAULT_PERIOD = 5.0
 """Default period, s."""
 
 Curve = Callable[[np.ndarray, int], np.ndarray]
@@ -65,13 +65,13 @@ def lissajous(
         frequencies: Oscillations along each axis in one period, whole numbers. (3,)
         phases: Phase of each oscillation, rad. (3,)
         period: Period, s; None for 5 s, or for what the speed needs.
-        speed: Upper bound of the speed instead, m/s: that of a curve whose axes are fastest at the same time.
+        speed: Upper bound of the speed instead, m/s, as if all axes were fastest at the same time.
         center: Centre, world frame, m. (3,)
 
     Raises:
         ConfigError: If a setting is invalid.
     """
-    a, k, phi, c = (as_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
+    a, k, phi, c = (require_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
                                                   (amplitudes, frequencies, phases, center), strict=True))  # fmt: skip
     if np.any(k != np.round(k)):
         raise ConfigError(f"expected frequencies as whole numbers, got {frequencies!r}")
@@ -81,7 +81,7 @@ def lissajous(
         pos = a * (k * w) ** order * np.sin(k * w * t[:, None] + phi + order * np.pi / 2)
         return np.pad(pos + (c if order == 0 else 0.0), ((0, 0), (0, 1)))
 
-    return fitted(curve, 2 * np.pi / w, float(np.max(np.abs(a) * np.abs(k * w) ** 8)) * 3**0.5, repeats=True)
+    return fit_curve(curve, 2 * np.pi / w, float(np.max(np.abs(a) * np.abs(k * w) ** 8)) * 3**0.5, repeats=True)
 
 
 def circle(
@@ -126,9 +126,9 @@ def helix(
     Raises:
         ConfigError: If a setting is invalid.
     """
-    as_positive("turns", turns)
+    require_positive("turns", turns)
     given = {"radius": radius, "climb": climb, "height": height}
-    radius, climb, height = (float(as_vector(name, x, ())) for name, x in given.items())
+    radius, climb, height = (float(require_vector(name, x, ())) for name, x in given.items())
     w = 2 * np.pi / _period(period, speed, math.hypot(2 * np.pi * radius, climb))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:
@@ -138,7 +138,7 @@ def helix(
         yaw = yaw + np.pi / 2 * (along and order == 0)
         return np.stack([radius * w**order * np.cos(angle), radius * w**order * np.sin(angle), z, yaw], axis=-1)
 
-    return fitted(curve, 2 * np.pi / w * turns, abs(float(radius)) * w**8)
+    return fit_curve(curve, 2 * np.pi / w * turns, abs(float(radius)) * w**8)
 
 
 def line(
@@ -156,13 +156,13 @@ def line(
     Raises:
         ConfigError: If a setting is invalid.
     """
-    a, b = as_vector("start", start), as_vector("end", end)
+    a, b = require_vector("start", start), require_vector("end", end)
     # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1 with three derivatives of zero at both; its slope is at most
     # 140 (1/2)^6 = 35/16.
     time = _period(duration, speed, 35 / 16 * float(np.linalg.norm(b - a)), "duration")
     c = np.zeros((1, 4, 8))
     c[0, :3] = np.outer(b - a, [0, 0, 0, 0, 35, -84, 70, -20]) / time ** np.arange(8)
-    c[0, :, 0] = [*a, as_vector("yaw", yaw, ())]
+    c[0, :, 0] = [*a, require_vector("yaw", yaw, ())]
     return Trajectory.of_pieces([time], c)
 
 
@@ -178,10 +178,12 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
         ConfigError: If a setting is invalid.
     """
     _period(duration, None, 0.0, "duration")
-    return Trajectory.of_pieces([duration], np.append(as_vector("pos", pos), as_vector("yaw", yaw, ()))[None, :, None])
+    return Trajectory.of_pieces(
+        [duration], np.append(require_vector("pos", pos), require_vector("yaw", yaw, ()))[None, :, None]
+    )
 
 
-def fitted(curve: Curve, duration: float, eighth: float, repeats: bool = False) -> Trajectory:
+def fit_curve(curve: Curve, duration: float, eighth: float, repeats: bool = False) -> Trajectory:
     """Return a smooth curve as a trajectory of pieces of equal length, each within ``TOLERANCE``.
 
     Args:
@@ -212,18 +214,18 @@ def _period(period: float | None, speed: float | None, length: float, name: str 
     if period is not None and speed is not None:
         raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
     if speed is None:
-        time = as_positive(name, PERIOD if period is None else period)
+        time = require_positive(name, DEFAULT_PERIOD if period is None else period)
     else:
-        as_positive("speed", speed)
+        require_positive("speed", speed)
         if length == 0:
             raise ConfigError(f"expected a curve of some size for a speed of {speed!r} m/s, got a point. Use {name}=.")
         time = length / speed
-    if not TIMES[0] <= time <= TIMES[1]:
-        raise ConfigError(f"expected a {name} from {TIMES[0]:g} to {TIMES[1]:g} s, got {time:g} s")
+    if not PERIOD_RANGE[0] <= time <= PERIOD_RANGE[1]:
+        raise ConfigError(f"expected a {name} from {PERIOD_RANGE[0]:g} to {PERIOD_RANGE[1]:g} s, got {time:g} s")
     return time
 
 
-def as_positive(name: str, value: float) -> float:
+def require_positive(name: str, value: float) -> float:
     """Return a setting as a positive number.
 
     Raises:
@@ -235,7 +237,7 @@ def as_positive(name: str, value: float) -> float:
     return float(value)
 
 
-def as_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
+def require_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
     """Return a setting as numbers of some shape.
 
     Raises:

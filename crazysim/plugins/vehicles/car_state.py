@@ -37,7 +37,7 @@ def heading_quat(yaw: Array) -> Array:
 
 
 @jit_unless_traced()
-def tilted(yaw: Array, normal: Array) -> Array:
+def tilted_quat(yaw: Array, normal: Array) -> Array:
     """Return the attitude of a vehicle on a slope: turned by its heading, then by the tilt of the ground. (..., 4)
 
     Args:
@@ -50,16 +50,16 @@ def tilted(yaw: Array, normal: Array) -> Array:
     return rotation.multiply(tilt, heading_quat(yaw))
 
 
-def to_world(yaw: Array, vector: Array) -> Array:
+def to_world_frame(yaw: Array, vector: Array) -> Array:
     """Return a level vector of the body frame, (..., 2), in the world frame. (..., 2)"""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = vector[..., :1], vector[..., 1:]
     return jnp.concatenate([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def to_body(yaw: Array, vector: Array) -> Array:
+def to_body_frame(yaw: Array, vector: Array) -> Array:
     """Return a level vector of the world frame, (..., 2), in the body frame. (..., 2)"""
-    return to_world(-yaw, vector)
+    return to_world_frame(-yaw, vector)
 
 
 def ackermann(steer: Array, wheelbase: float, track: float) -> Array:

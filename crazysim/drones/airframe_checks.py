@@ -1,4 +1,4 @@
-"""Check that the numbers of an airframe are those of a drone that can fly."""
+"""Check that a drone with the numbers of an airframe can fly."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from crazysim.tables import INERTIA, check_numbers
 MAX_ROTORS = 64
 """Most rotors; the VoloCity, an air taxi, has 18."""
 MAX_THRUST_TO_WEIGHT = 1000
-"""Largest ratio of thrust to weight; that of racers is about 20."""
+"""Largest ratio of thrust to weight; racers have about 20."""
 MAX_ANG_ACC = 1e6
-"""Largest angular acceleration by the rotors, rad/s^2; that of the built-in airframes is up to 14,000."""
+"""Largest angular acceleration by the rotors, rad/s^2; built-in airframes have up to 14,000."""
 MAX_ROTOR_VEL = 1e6
-"""Largest rotor speed, rpm; that of the built-in airframes is up to 40,000."""
+"""Largest rotor speed, rpm; built-in airframes have up to 40,000."""
 MIN_LEVERAGE = 1e-3
-"""Smallest singular value of the mixing matrix; that of a quadrotor in X is 2."""
+"""Smallest singular value of the mixing matrix; a quadrotor in X has 2."""
 EXCESS, ROUNDING = 0.05, 1e-5
 """Relative excess of the largest moment of inertia over the sum of the others that is a warning at most, as in moments
 that were measured one by one, and that counts as rounding. RotorPy's Crazyflie has 1%."""
@@ -28,7 +28,7 @@ def check_airframe(airframe: Airframe) -> None:
     """Check shapes, ranges and the consistency of an airframe's numbers.
 
     Raises:
-        ConfigError: If they cannot be those of a drone that flies.
+        ConfigError: If no drone with these numbers flies.
 
     Warns:
         AirframeWarning: If the largest moment of inertia exceeds the sum of the others by up to 5%.
@@ -47,13 +47,13 @@ def check_airframe(airframe: Airframe) -> None:
         check_numbers(owner, path, value, LAYOUT.keys[path], n)
     for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):
         airframe.value(path)
-    for problem in (_inertia, _rotors, _curves, _forces, _controller, _camera):
+    for problem in (_check_inertia, _check_rotors, _check_curves, _check_forces, _check_controller, _check_camera):
         found = problem(airframe)
         if found:
             raise ConfigError(f"{owner}: {found}. Check the number; {GUIDE} has the units.")
 
 
-def _inertia(airframe: Airframe) -> str | None:
+def _check_inertia(airframe: Airframe) -> str | None:
     inertia = airframe.inertia
     moments = np.sort(np.linalg.eigvalsh(inertia))
     if not np.allclose(inertia, inertia.T, atol=0) or not np.all((moments >= INERTIA.low) & (moments <= INERTIA.high)):
@@ -63,7 +63,7 @@ def _inertia(airframe: Airframe) -> str | None:
         )
     excess = moments[2] / (moments[0] + moments[1]) - 1
     found = (
-        f"expected an inertia whose largest moment is at most the sum of the others, as that of every body is, got "
+        f"expected an inertia whose largest moment is at most the sum of the others, as for every body, got "
         f"moments of {', '.join(f'{m:.4g}' for m in moments)} kg m^2"
     )
     if excess > EXCESS:
@@ -75,7 +75,7 @@ def _inertia(airframe: Airframe) -> str | None:
     return None
 
 
-def _rotors(airframe: Airframe) -> str | None:
+def _check_rotors(airframe: Airframe) -> str | None:
     value = airframe.value
     n, mass = airframe.n_rotors, float(value("rigid_body.mass"))
     low, high, signs = value("rotors.thrust_min"), value("rotors.thrust_max"), value("rotors.yaw_torque_sign")
@@ -121,7 +121,7 @@ def _rotors(airframe: Airframe) -> str | None:
     return None
 
 
-def _curves(airframe: Airframe) -> str | None:
+def _check_curves(airframe: Airframe) -> str | None:
     """Check the curves of the rotors: thrust that rises over the speed, drag torque, lag."""
     numbers = airframe.values
     if "rotors.thrust_curve" in numbers:
@@ -158,7 +158,7 @@ def _curves(airframe: Airframe) -> str | None:
     return None
 
 
-def _forces(airframe: Airframe) -> str | None:
+def _check_forces(airframe: Airframe) -> str | None:
     """Check drag, and the forces of the fitted models and the battery."""
     numbers, n = airframe.values, airframe.n_rotors
     weight, most = numbers["rigid_body.mass"] * GRAVITY_MAGNITUDE, n * numbers["rotors.thrust_max"]
@@ -184,14 +184,14 @@ def _forces(airframe: Airframe) -> str | None:
     return None
 
 
-def _controller(airframe: Airframe) -> str | None:
+def _check_controller(airframe: Airframe) -> str | None:
     low, high = (airframe.values.get(f"controller.pwm_{end}") for end in ("min", "max"))
     if low is not None and high is not None and not low < high:
         return f"expected pwm_min below pwm_max, got {low} and {high}"
     return None
 
 
-def _camera(airframe: Airframe) -> str | None:
+def _check_camera(airframe: Airframe) -> str | None:
     camera = airframe.values.get("shape.track_camera")
     if camera is not None and not abs(camera[0]) > 0:
         return f"expected track_camera behind or ahead of the drone, with x other than 0, got {camera.tolist()}"

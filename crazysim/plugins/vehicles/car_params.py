@@ -6,7 +6,7 @@ import math
 
 from jax import Array
 
-from crazysim.dynamics.models import GRAVITY, RINGING
+from crazysim.dynamics.models import GRAVITY, MAX_LAG_RATE
 from crazysim.errors import ConfigError
 from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.pytree import PyTree, as_parameter, leaf
@@ -86,10 +86,10 @@ class CarParams(PyTree):
         rolling = [n * number("wheels.damping") / radius**2, n * number("wheels.friction_loss") / radius]
         towed_mass = n * spin / radius**2 + (number("trailer.mass") if trailer else 0.0)
         damping = (drive[1] + rolling[0]) / (mass + towed_mass)
-        if damping > RINGING * freq:
+        if damping > MAX_LAG_RATE * freq:
             raise ConfigError(
                 f"expected damping of vehicle {vehicle.name!r} to be slow for steps of 1/{freq} s, got {damping:.4g} "
-                f"1/s. Use freq={math.ceil(damping / RINGING)} or more, or less damping of the drive and the wheels."
+                f"1/s. Use freq={math.ceil(damping / MAX_LAG_RATE)} or more, or less damping of drive and wheels."
             )
         return CarParams(
             mass=as_parameter(mass),
@@ -116,7 +116,7 @@ class CarParams(PyTree):
 def drive_constants(vehicle: VehicleModel) -> tuple[list[float], float]:
     """Return gain, N, damping, N s/m, and friction, N, of the force of the whole drive, and its limit, N.
 
-    Published forces are those of one axle, of two; published torques are those of one driven wheel.
+    Published forces are for one axle of two; published torques are for one driven wheel.
     """
     share = vehicle.number("drive.front_share")
     if "drive.force" in vehicle.numbers:

@@ -42,12 +42,12 @@ class Collider(NamedTuple):
     """Returns their state."""
     with_vel: Callable[[SimData, Array], SimData]
     """Returns the data with other velocities of them. (..., 3)"""
-    joined: Callable[[SimData], Array]
+    joined_mask: Callable[[SimData], Array]
     """Returns True where a rigid rod joins a body to a drone, and the two cannot touch; of one world.
     (n_loads, n_drones)"""
 
 
-class Colliding:
+class CollidingPlugin:
     """Interface of plugins whose loads collide; mixed into a ``Plugin``."""
 
     coupling: Any
@@ -63,17 +63,17 @@ class Colliding:
         return (self.name,)
 
     @property
-    def placed_kinds(self) -> tuple[str, ...]:
+    def moved_kinds(self) -> tuple[str, ...]:
         """Names of the loads and their links in the scene."""
         return (*self.solid_kinds, f"{self.name}_link")
 
     def colliders(self) -> tuple[Collider, ...]:
         """Return all bodies that collide: the loads."""
-        return (Collider(self.shape(), self.body, self.with_vel, self.joined),)
+        return (Collider(self.shape(), self.body, self.with_vel, self.joined_mask),)
 
     def shape(self) -> Shape:
         """Return the shape of a load."""
-        return shape_of(self.size)
+        return load_shape(self.size)
 
     def body(self, data: SimData) -> LoadBody:
         """Return the loads; of one drone or of one world."""
@@ -83,12 +83,12 @@ class Colliding:
         """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
         raise NotImplementedError
 
-    def joined(self, data: SimData) -> Array:
+    def joined_mask(self, data: SimData) -> Array:
         """Return True where a rigid rod joins a load to a drone, and the two cannot touch. (n_loads, n_drones)"""
         raise NotImplementedError
 
 
-def shape_of(size: ArrayLike) -> Shape:
+def load_shape(size: ArrayLike) -> Shape:
     """Return a ball of a radius, or a box of three full lengths, m.
 
     Raises:
@@ -110,4 +110,4 @@ def rest_height(size: ArrayLike) -> float:
     Raises:
         ConfigError: If the size is neither a radius nor three lengths.
     """
-    return shape_of(size).size[-1]
+    return load_shape(size).size[-1]

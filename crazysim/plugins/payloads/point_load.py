@@ -17,11 +17,11 @@ from crazysim.core.plugin import Simulation
 from crazysim.core.settings import as_mask, as_rgba
 from crazysim.eager import jit_unless_traced
 from crazysim.plugins.effects.ground import ground_height
-from crazysim.plugins.effects.moving_air import Exposed
+from crazysim.plugins.effects.moving_air import BodiesInAir
 from crazysim.plugins.effects.wind import wind_at
 from crazysim.plugins.effects.wind_field import WindFieldData
-from crazysim.plugins.payloads.body import Colliding
-from crazysim.plugins.payloads.link import decay, relative
+from crazysim.plugins.payloads.colliders import CollidingPlugin
+from crazysim.plugins.payloads.link import drag_rate, link_geometry
 from crazysim.plugins.payloads.rotor_jet import jet_force
 from crazysim.pytree import leaf, select_worlds
 
@@ -37,11 +37,11 @@ HEAD_RADIUS, HEAD_HEIGHT = 0.0245, 0.021
 """Radius of the ball around that outline, with which a hook collides, and its height above the hook's position, m."""
 DARK, STEEL, YELLOW = (0.15, 0.15, 0.15, 1.0), (0.35, 0.35, 0.4, 1.0), (0.95, 0.75, 0.1, 1.0)
 """Colours of rods, wires and hooks."""
-SOLID = 'contype="0" conaffinity="2"'
+DRONE_TOUCH_ATTRIBUTES = 'contype="0" conaffinity="2"'
 """MJCF attributes of a geom that drones touch."""
 
 
-class LoadData(Exposed):
+class LoadData(BodiesInAir):
     """State and parameters of the load of each drone."""
 
     vel: Array = leaf("drone", 1, (3,))
@@ -66,7 +66,7 @@ class LoadData(Exposed):
     """Height of the load's position above the floor where it rests, m. (1,)"""
 
 
-class PointLoad(Colliding):
+class PointLoad(CollidingPlugin):
     """A load that is one point mass on links that can be cut; mixed into a ``Plugin``."""
 
     read: Any
@@ -78,7 +78,7 @@ class PointLoad(Colliding):
         """Stop the load at the floor; of one drone or of one world."""
         load = self.read(data)
         clearance = load.clearance + ground_height(data, load.pos)
-        pos, vel = on_floor(load.pos, load.vel, clearance, load.friction)
+        pos, vel = clip_to_floor(load.pos, load.vel, clearance, load.friction)
         return self.write(data, load.replace(pos=pos, vel=vel))
 
     def release(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
@@ -100,15 +100,15 @@ class PointLoad(Colliding):
         )
 
 
-def integrator_of(sim: Simulation) -> Callable[..., SimData] | None:
+def find_integrator(sim: Simulation) -> Callable[..., SimData] | None:
     """Return the function of the integrator, such as ``core.integration.rk4``, or None if the stage is not built in."""
     return getattr(getattr(sim.step_pipeline.get("integration"), "fn", None), "method", None)
 
 
-def air_and_gravity(data: SimData, load: LoadData, name: str, dt: float | None) -> Array:
+def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None) -> Array:
     """Return the acceleration of a free load under gravity, drag and jets of rotors, m/s^2; of one drone. (3,)
 
-    Drag cannot reverse a motion (``decay``), and a load without mass moves with the air.
+    Drag cannot reverse a motion (``drag_rate``), and a load without mass moves with the air.
 
     Args:
         data: Simulation.
@@ -125,10 +125,10 @@ def air_and_gravity(data: SimData, load: LoadData, name: str, dt: float | None) 
     air = wind_at(data, load.pos) + load.air_vel
     if any(isinstance(record, WindFieldData) for record in data.plugins.values()):
         air = air + load.wind_vel  # type: ignore[operator]  # there are fields, so it is set
-    return acc + decay(load.drag, load.mass, dt, data.core.freq) * (air - load.vel)
+    return acc + drag_rate(load.drag, load.mass, dt, data.core.freq) * (air - load.vel)
 
 
-def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:
+def clip_to_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple[Array, Array]:
     """Return position and velocity of a body that does not fall through the floor.
 
     Friction brakes it there, along x and y separately.
@@ -148,7 +148,9 @@ def on_floor(pos: Array, vel: Array, clearance: Array, friction: Array) -> tuple
 
 
 @jit_unless_traced("is_cable")
-def hanging(s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool) -> tuple[Array, Array]:
+def hanging_state(
+    s: SimState, attach: Array | None, length: Array, clearance: Array, is_cable: bool
+) -> tuple[Array, Array]:
     """Return position and velocity of a load that hangs at rest below its drone, or rests on the floor.
 
     Args:
@@ -179,7 +181,7 @@ def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
     """
     load: Any = data.plugins[name]
     pos, vel = (load.tip_pos, load.tip_vel) if hasattr(load, "tip_pos") else (load.pos, load.vel)
-    r = relative(data.states, pos, vel, load.attach)
+    r = link_geometry(data.states, pos, vel, load.attach)
     across = r.vel - rotation.dot(r.direction, r.vel) * r.direction
     is_zero = r.distance == 0
     return r.direction, jnp.where(is_zero, 0.0, across / jnp.where(is_zero, 1.0, r.distance))
@@ -223,33 +225,33 @@ def add_to_scene(
     rgba = as_rgba((0.85, 0.55, 0.2, 1.0) if rgba is None else rgba)
     half = np.full(3, size, float) if np.ndim(size) == 0 else np.asarray(size, float) / 2
     kind = "sphere" if np.ndim(size) == 0 else "box"
-    body = f'<geom type="{kind}" size="{_numbers(half)}" {SOLID} rgba="{_numbers(rgba)}"/>'
+    body = f'<geom type="{kind}" size="{_join_numbers(half)}" {DRONE_TOUCH_ATTRIBUTES} rgba="{_join_numbers(rgba)}"/>'
     shank = 0.0 if ring is None else HOOK_OUTLINE[0][1]
-    link = _rod((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
+    link = _rod_xml((0, 0, -length / n_pieces / 2), (0, 0, length / n_pieces / 2 + shank), LINK_RADIUS, DARK)
     kinds = [(body, name, n_loads), (link, f"{name}_link", sim.n_drones * n_pieces)]
     if ring is not None:
         ends = [(side * half[0], 0, 0 if kind == "sphere" else half[2]) for side in (-1, 1)]
-        body += "".join(_rod(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
-        head = f'<geom type="sphere" pos="0 0 {HEAD_HEIGHT}" size="{HEAD_RADIUS}" group="3" {SOLID}/>'
+        body += "".join(_rod_xml(end, (0, 0, ring), WIRE_RADIUS, STEEL) for end in ends)
+        head = f'<geom type="sphere" pos="0 0 {HEAD_HEIGHT}" size="{HEAD_RADIUS}" group="3" {DRONE_TOUCH_ATTRIBUTES}/>'
         head += "".join(
-            _rod((x, 0, -z), (x_2, 0, -z_2), HOOK_RADIUS, YELLOW) for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
+            _rod_xml((x, 0, -z), (x_2, 0, -z_2), HOOK_RADIUS, YELLOW) for (x, z), (x_2, z_2) in pairwise(HOOK_OUTLINE)
         )
         kinds = [(body, name, n_loads), kinds[1], (head, f"{name}_hook", n_loads)]
     for text, kind, count in kinds:
         sim.scene.add_once(f"<mujoco><worldbody>{text}</worldbody></mujoco>", kind, count)
 
 
-def _rod(start: Iterable[float], end: Iterable[float], radius: float, rgba: Iterable[float]) -> str:
+def _rod_xml(start: Iterable[float], end: Iterable[float], radius: float, rgba: Iterable[float]) -> str:
     """Return MJCF of a rod that touches nothing."""
-    ends = f"{_numbers(start)} {_numbers(end)}"
-    return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{_numbers(rgba)}"/>'
+    ends, color = f"{_join_numbers(start)} {_join_numbers(end)}", _join_numbers(rgba)
+    return f'<geom type="capsule" fromto="{ends}" size="{radius}" contype="0" conaffinity="0" rgba="{color}"/>'
 
 
-def _numbers(values: Iterable[float]) -> str:
+def _join_numbers(values: Iterable[float]) -> str:
     return " ".join(f"{float(value):.9g}" for value in values)
 
 
-def pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array, Array]:
+def link_pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array, Array]:
     """Return centres and attitudes of the straight pieces of links; a slack cable sags like a parabola.
 
     Args:
@@ -270,10 +272,10 @@ def pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array, Arr
     down = jnp.asarray([0.0, 0.0, -1.0], top.dtype)
     nodes = top + share * offset + 4 * share * (1 - share) * sag * down
     centre, along = (nodes[1:] + nodes[:-1]) / 2, nodes[1:] - nodes[:-1]
-    return tuple(jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]) for x in (centre, turned_z(along)))  # type: ignore[return-value]
+    return tuple(jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]) for x in (centre, rotation_from_z(along)))  # type: ignore[return-value]
 
 
-def turned_z(axis: Array) -> Array:
+def rotation_from_z(axis: Array) -> Array:
     """Return the smallest rotation of the z axis to a vector, as a quaternion, xyzw. (..., 4)"""
     z = rotation.safe_normalize(axis, jnp.asarray([0.0, 0.0, 1.0], axis.dtype))
     quat = jnp.stack([-z[..., 1], z[..., 0], jnp.zeros_like(z[..., 0]), 1 + z[..., 2]], axis=-1)

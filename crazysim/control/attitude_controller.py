@@ -7,7 +7,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.gains import require_gains
-from crazysim.control.levels import allocation_matrix, number_of, where_present
+from crazysim.control.levels import allocation_matrix, count_rotors, mask_rotors
 from crazysim.drones import Airframe
 from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import matvec
@@ -121,11 +121,11 @@ def attitude2force_torque(
     torque_pwm = rotation.safe_clip(torque_pwm, -p.torque_pwm_max, p.torque_pwm_max)
 
     thrust = cmd[..., 3:4]
-    n_rotors = number_of(p.rotors, p.mixing_matrix.shape[-1])
+    n_rotors = count_rotors(p.rotors, p.mixing_matrix.shape[-1])
     newton_per_pwm = p.thrust_max / p.pwm_max
     pwm = thrust / (n_rotors * newton_per_pwm) + matvec(p.torque_allocation, torque_pwm)
     thrusts = rotation.safe_clip(pwm, p.pwm_min, p.pwm_max) * jnp.where(thrust <= 0, 0.0, newton_per_pwm)
-    thrusts = where_present(p.rotors, thrusts, 0.0)
+    thrusts = mask_rotors(p.rotors, thrusts, 0.0)
     torque = p.arms * matvec(p.mixing_matrix, thrusts)
     return jnp.concatenate([jnp.sum(thrusts, axis=-1, keepdims=True), torque], axis=-1), r_int_error
 

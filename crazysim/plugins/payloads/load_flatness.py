@@ -23,7 +23,7 @@ ORDER = 6
 
 
 class LoadedState(NamedTuple):
-    """States and inputs of a drone that carries a load along a path. Leading axes are those of the path."""
+    """States and inputs of a drone that carries a load along a path, with the leading axes of the path."""
 
     pos: Array
     """Position of the drone, world frame, m. (..., 3)"""

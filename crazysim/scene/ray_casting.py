@@ -24,16 +24,16 @@ from crazysim.geometry.points import components
 from crazysim.geometry.rays import hit_distance, hit_normal
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionGeom, CollisionModel
-from crazysim.scene.first_hit import NOBODY, Ray, Surface, Targets, first_fixed, first_hit, in_frame, shape_of
+from crazysim.scene.first_hit import NOBODY, Ray, Surface, Targets, first_fixed_hit, first_hit, geom_shape, ray_in_frame
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
-MAX_UNROLLED = 16
+MAX_UNROLLED_GEOMS = 16
 """Movable geoms of one world up to which a stage of one world or drone should cast rays: its program is unrolled."""
 MAX_PAIRS = 36
 """Rays times fixed geoms of one world or drone up to which the program is unrolled: it is two to three times as fast as
 a hierarchy then, and compiles in about the same time."""
-MAX_LOOPED = 64
-"""Rays of a loop within a step; an index that is computed at run time selects among at most 64 places."""
+MAX_LOOP_RAYS = 64
+"""Rays of a loop within a step; an index that is computed at run time selects among at most 64 entries."""
 
 
 class Hits(PyTree):
@@ -44,17 +44,17 @@ class Hits(PyTree):
     normal: Array
     """Unit normal of the surface, world frame; zero where the ray meets nothing. (..., 3)"""
     number: Array
-    """Index in ``names`` of the body; -1 where the ray meets nothing."""
+    """Index in ``body_names`` of the body; -1 where the ray meets nothing."""
     names: tuple[str, ...] = static()
     """Floor, objects and drones, in that order."""
 
 
-def names(model: CollisionModel, n_drones: int) -> tuple[str, ...]:
+def body_names(model: CollisionModel, n_drones: int) -> tuple[str, ...]:
     """Return the names of everything that rays can meet, in the order of ``Hits.number``."""
     return ("floor", *(body.name for body in model.objects), *(f"drone:{i}" for i in range(n_drones)))
 
 
-def cast(
+def cast_rays(
     model: CollisionModel,
     data: SimData,
     origin: Array,
@@ -90,19 +90,19 @@ def cast(
         ahead = np.zeros((origin.shape[1], 1, 4))
         ahead[..., 0], ahead[:, 0, 3] = 1.0, passes
         eyes = jnp.concatenate([origin, axes], axis=-1)
-        return cast_in_worlds(model, data, eyes, ahead, drones, kernels or RayKernels())
+        return cast_rays_in_worlds(model, data, eyes, ahead, drones, kernels or RayKernels())
     best = Hits(
         distance=jnp.full(origin.shape[:-1], jnp.inf, origin.dtype),
         normal=jnp.zeros_like(origin),
         number=jnp.full(origin.shape[:-1], -1, jnp.int32),
-        names=names(model, data.core.n_drones if drones else 0),
+        names=body_names(model, data.core.n_drones if drones else 0),
     )
     targets = Targets(model, 0, drones=False)
     if len(targets.fixed) * len(origin) <= MAX_PAIRS:
         for target in targets.fixed:
-            best = _nearer(best, *_meet(target.geom, origin, direction), target.number)
+            best = _nearer_hits(best, *_hit_geom(target.geom, origin, direction), target.number)
     else:
-        best = _nearer(best, *_meet_fixed(targets, origin, direction, limit))
+        best = _nearer_hits(best, *_hit_fixed_geoms(targets, origin, direction, limit))
     groups: dict[tuple[CollisionGeom, ...], list[tuple[int, int]]] = {}
     for number, body in enumerate(model.objects, start=1):
         if body.row is not None:
@@ -110,17 +110,17 @@ def cast(
     if data.objects is not None:
         pos, quat = data.objects.pos, data.objects.quat
         for geoms, group in groups.items():
-            best = _met_by(best, geoms, pos, quat, np.array(group), origin, direction, None)
+            best = _hit_bodies(best, geoms, pos, quat, np.array(group), origin, direction, None)
     if drones:
         pos, quat = data.states.pos, data.states.quat
         for kind in model.drones:
             rows = np.arange(data.core.n_drones) if kind.drones is None else np.asarray(kind.drones)
             group = np.stack([rows, rows + 1 + len(model.objects)], axis=-1)
-            best = _met_by(best, kind.geoms, pos, quat, group, origin, direction, own)
+            best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, own)
     return best
 
 
-def _met_by(
+def _hit_bodies(
     best: Hits,
     geoms: tuple[CollisionGeom, ...],
     pos: Array,
@@ -130,7 +130,7 @@ def _met_by(
     direction: Array,
     own: np.ndarray | None,
 ) -> Hits:
-    """Return the nearer of earlier hits and those of movable bodies with equal geoms.
+    """Return earlier hits, or nearer hits of movable bodies with equal geoms.
 
     Args:
         best: Earlier hits.
@@ -147,9 +147,9 @@ def _met_by(
         p, q = (jnp.take(x, row, axis=-2)[..., None, :] for x in (pos, quat))
         start, along = rotation.rotate_inverse(q, origin - p), rotation.rotate_inverse(q, direction)
         for geom in geoms:
-            far, normal = _meet(geom, start, along)
+            far, normal = _hit_geom(geom, start, along)
             far = far if own is None else jnp.where(own == row, jnp.inf, far)
-            best = _nearer(best, far, rotation.rotate(q, normal), number)
+            best = _nearer_hits(best, far, rotation.rotate(q, normal), number)
         return best
 
     for row, number in group:
@@ -157,24 +157,24 @@ def _met_by(
     return best
 
 
-def _meet(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:
+def _hit_geom(geom: CollisionGeom, origin: Array, direction: Array) -> tuple[Array, Array]:
     """Return the length of rays to a geom, and its normal, in the frame in which the geom is given."""
     start = origin - jnp.asarray(geom.pos, origin.dtype)
     if geom.rot is None:
         return ray_distance(geom.shape, start, direction)
     rows = np.array(geom.rot)
-    far, normal = ray_distance(geom.shape, _times(rows.T, start), _times(rows.T, direction))
-    return far, _times(rows, normal)
+    far, normal = ray_distance(geom.shape, _constant_product(rows.T, start), _constant_product(rows.T, direction))
+    return far, _constant_product(rows, normal)
 
 
-def _times(matrix: np.ndarray, vectors: Array) -> Array:
+def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
     """Return a constant matrix times vectors, without products by zero. (..., 3)"""
     x = [vectors[..., k] for k in range(3)]
     terms = [[float(m) * v for m, v in zip(row, x, strict=True) if m] for row in matrix]
     return jnp.stack([functools.reduce(jnp.add, row) for row in terms], axis=-1)
 
 
-def _nearer(best: Hits, far: Array, normal: Array, number: Array | int) -> Hits:
+def _nearer_hits(best: Hits, far: Array, normal: Array, number: Array | int) -> Hits:
     closer = far < best.distance
     return best.replace(
         distance=jnp.where(closer, far, best.distance),
@@ -183,7 +183,9 @@ def _nearer(best: Hits, far: Array, normal: Array, number: Array | int) -> Hits:
     )
 
 
-def _meet_fixed(targets: Targets, origin: Array, direction: Array, limit: Array | float) -> tuple[Array, Array, Array]:
+def _hit_fixed_geoms(
+    targets: Targets, origin: Array, direction: Array, limit: Array | float
+) -> tuple[Array, Array, Array]:
     """Return the first fixed geoms that rays of one world or drone meet, in a hierarchy.
 
     A loop over the rays finds the geoms without a derivative. The distance is that to the one geom that was found, with
@@ -209,20 +211,20 @@ def _meet_fixed(targets: Targets, origin: Array, direction: Array, limit: Array 
         def turn(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             k, which = carry
             ray = Ray(components(starts[k]), components(ways[k]), jnp.int32(NOBODY))
-            return (k + 1, which.at[k].set(first_fixed(surfaces, tables, ray, begin)[1])), None
+            return (k + 1, which.at[k].set(first_fixed_hit(surfaces, tables, ray, begin)[1])), None
 
         none = jnp.int32(0), jnp.full(len(starts), -1, jnp.int32)
         return jax.lax.scan(turn, none, length=len(starts))[0][1]
 
-    chunks = [slice(k, k + MAX_LOOPED) for k in range(0, len(starts), MAX_LOOPED)]
+    chunks = [slice(k, k + MAX_LOOP_RAYS) for k in range(0, len(starts), MAX_LOOP_RAYS)]
     which = jnp.concatenate([of_some(starts[chunk], ways[chunk]) for chunk in chunks])
     rows = jnp.take(tables.geoms, jnp.maximum(which, 0), axis=0)
-    distance, normal_at = _meet_rows(surfaces, targets.codes, which, rows, origin, direction)
+    distance, normal_at = _hit_rows(surfaces, targets.codes, which, rows, origin, direction)
     numbers = jnp.asarray([target.number for target in targets.fixed], jnp.int32)
     return distance, normal_at(distance), jnp.take(numbers, jnp.maximum(which, 0))
 
 
-def _meet_rows(
+def _hit_rows(
     surfaces: Sequence[Surface], codes: np.ndarray, which: Array, rows: Array, origin: Array, direction: Array
 ) -> tuple[Array, Callable[[Array], Array]]:
     """Return the distance along rays to a geom each, and a function from distances to unit normals, world frame.
@@ -236,7 +238,7 @@ def _meet_rows(
         direction: Unit directions, world frame. (..., 3)
     """
     row = [rows[..., k] for k in range(16)]
-    start, along = in_frame(row, components(origin), components(direction))
+    start, along = ray_in_frame(row, components(origin), components(direction))
     begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
     code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(which, 0))
     found = []
@@ -244,7 +246,7 @@ def _meet_rows(
     for number, surface in enumerate(surfaces):
         mine = (which >= 0) & (code == number)
         # A size for geoms of other kinds, so that their slopes are finite.
-        shape = shape_of(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
+        shape = geom_shape(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
         if isinstance(shape, Shape) and shape.kind == "hfield":
             far, normal = ray_distance(shape, begin, way)
         else:
@@ -265,13 +267,13 @@ def _meet_rows(
 # Rays of all worlds -------------------------------------------------------------------------------------------------
 
 
-def cast_in_worlds(
+def cast_rays_in_worlds(
     model: CollisionModel, data: SimData, eyes: Array, pixels: np.ndarray, drones: bool, kernels: RayKernels
 ) -> Hits:
     """Return the first surfaces that the rays of cameras meet, in all worlds. (n_worlds, n_cameras * n_pixels)
 
     A function of one ray finds the distance and the nearest geom, without a derivative, in a kernel of the engine where
-    that is possible. The normal and the derivative of the distance are those of that geom alone; XLA computes them
+    that is possible. The normal and the derivative of the distance depend on that geom alone; XLA computes them
     where they are used.
 
     Args:
@@ -296,15 +298,15 @@ def cast_in_worlds(
     direction = sum(axes[..., k] * look[..., k, None] for k in range(3)).reshape(n_worlds, -1, 3)
     origin = jnp.repeat(eyes[..., :3], n_pixels, axis=1)
     if not targets.all:
-        return Hits(distance, jnp.zeros_like(origin), which, names(model, data.core.n_drones if drones else 0))
+        return Hits(distance, jnp.zeros_like(origin), which, body_names(model, data.core.n_drones if drones else 0))
     fixed = jnp.broadcast_to(tables.fixed[: len(targets.fixed)], (n_worlds, len(targets.fixed), 16))
     rows = jnp.concatenate([fixed, movable], axis=1)
     rows = jnp.take_along_axis(rows, jnp.maximum(which, 0)[..., None], axis=1)
-    exact, normal_at = _meet_rows(targets.surfaces, targets.codes, which, rows, origin, direction)
-    distance = _with_derivative_of(distance, exact)
+    exact, normal_at = _hit_rows(targets.surfaces, targets.codes, which, rows, origin, direction)
+    distance = _replace_derivative(distance, exact)
     normal = normal_at(distance)
     numbers = jnp.asarray([*(target.number for target in targets.all), -1], jnp.int32)
-    return Hits(distance, normal, numbers[which], names(model, data.core.n_drones if drones else 0))
+    return Hits(distance, normal, numbers[which], body_names(model, data.core.n_drones if drones else 0))
 
 
 @dataclasses.dataclass
@@ -349,12 +351,12 @@ class RayKernels:
 
 
 @jax.custom_jvp
-def _with_derivative_of(value: Array, other: Array) -> Array:
-    """Return a value whose derivative is that of another."""
+def _replace_derivative(value: Array, other: Array) -> Array:
+    """Return a value with the derivative of another one."""
     del other
     return value
 
 
-@_with_derivative_of.defjvp
+@_replace_derivative.defjvp
 def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     return primals[0], tangents[1]

@@ -10,7 +10,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.control.levels import Control
-from crazysim.control.position import PositionMemory, PositionParams, specific_force, upright
+from crazysim.control.position import PositionMemory, PositionParams, keep_upright, specific_force
 from crazysim.control.protocol import Controller, DroneData
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -26,7 +26,7 @@ class FittedParams(PyTree):
     model: Params
     """Parameters of the fitted model that the controller assumes."""
     angles: Array = leaf("parameter", 1)
-    """Commanded roll, pitch and yaw over those that the model settles at, 1. (3,)"""
+    """Ratio of commanded roll, pitch and yaw to the angles that the model settles at, 1. (3,)"""
     ahead: Array = leaf("parameter", 1)
     """Parts of jerk, s, and snap, s^2, by which commands precede the setpoint, as attitudes follow late. (2,)"""
     position: PositionParams
@@ -72,11 +72,9 @@ class FittedAuto(Controller):
     """Rate, Hz."""
 
     def params(self, airframe: Airframe) -> FittedParams:
-        """Return gains and constants for an airframe."""
         return FittedParams.create(airframe, self.dynamics, self.freq)
 
     def memory(self, airframe: Airframe) -> PositionMemory:
-        """Return the memory before the first tick."""
         return PositionMemory.at_rest()
 
     def update(
@@ -92,7 +90,7 @@ class FittedAuto(Controller):
             drag = matvec(model.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), s.vel))
         known = matvec(matrix, force + drag) / model.mass
         specific, memory = specific_force(s.pos, s.vel, known, command, memory, self.freq, p.position)  # type: ignore
-        specific = upright(specific - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
+        specific = keep_upright(specific - matvec(matrix, drag) / model.mass, command, p.position)  # type: ignore
 
         ahead, left = rotation.heading(data.controls.state.cmd[..., 9:13])
         later = specific + p.ahead[..., :1] * command.jerk + p.ahead[..., 1:] * command.snap
