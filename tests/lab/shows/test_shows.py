@@ -83,17 +83,17 @@ def screen(tmp_path_factory):
 PLAYED = """
 import sys
 from crazysim.__main__ import main
-from crazysim.scene.scene_window import Window
+from crazysim.scene.scene_window import SceneWindow
 from crazysim.lab.shows import fly, view
 from crazysim.lab.show_files import load_show
 
-opened, frames = Window.__init__, []
+opened, frames = SceneWindow.__init__, []
 
 def open_coarse(self, model, *settings):
     model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
     opened(self, model, *settings)
 
-Window.__init__ = open_coarse
+SceneWindow.__init__ = open_coarse
 view.MAX_FPS = 10.0
 
 def close(sim, world):

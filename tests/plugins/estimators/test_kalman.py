@@ -199,7 +199,7 @@ def test_a_task_flies_and_observes_with_one_argument():
     state = env.step(state, jnp.zeros_like(state.action))
     found = np.asarray(state.data.plugins["kalman"].estimate.pos - state.data.states.pos)
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 0.1, rtol=0, atol=0.01)
-    assert env.measured is not None
+    assert env.measure_states is not None
 
 
 def test_unknown_estimators_are_refused():
