@@ -13,8 +13,11 @@ from jax import Array
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
 from crazysim import jaxcompat
-from crazysim.engine.backends import cuda, map_kernel, native
+from crazysim.engine.backends import cuda, native
+from crazysim.engine.backends.frame import Kernel, make_kernel
+from crazysim.engine.backends.kernel import write_results
 from crazysim.engine.backends.native import Launch
+from crazysim.engine.backends.source import Writer, require_block_source, type_name
 from crazysim.engine.ir.blocks import Block, prune
 from crazysim.engine.lowering.jaxprs import Lowering, TableRows, as_elements
 
@@ -40,9 +43,9 @@ class MapKernels:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             if platform == "gpu":
-                self._launches[platform] = cuda.compile_kernel(map_kernel.write_map(self._block, "cuda"))
+                self._launches[platform] = cuda.compile_kernel(write_map(self._block, "cuda"))
             else:
-                self._launches[platform] = native.HostLaunch(map_kernel.write_map(self._block, "host"))
+                self._launches[platform] = native.HostLaunch(write_map(self._block, "host"))
         return self._launches[platform]
 
     def results(self, n: int) -> list[jax.ShapeDtypeStruct]:
@@ -107,3 +110,22 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
     rows: list[Any] = [TableRows(lowering.builder, x) for x in avals]
     traced = jax.make_jaxpr(lambda i, *tables: list(fn(i, *tables)))(jax.ShapeDtypeStruct((), np.int32), *avals)
     return prune(lowering.finish(lowering.lower(traced, [index, *rows])))
+
+
+def write_map(block: Block, target: str) -> Kernel:
+    """Return the source of a function of an index and tables for ``cuda`` or ``host``; each lane has an index.
+
+    Args:
+        block: The function: its inputs are the index and the tables, its outputs single numbers.
+        target: ``"cuda"`` or ``"host"``.
+    """
+    require_block_source(block)
+    writer, tables = Writer(), block.inputs[1:]
+    inputs, outputs = ([type_name(x.dtype) for x in some] for some in (tables, block.outputs))
+    pointers = [f"const {kind}* __restrict__ p{k}" for k, kind in enumerate(inputs)]
+    pointers += [f"{kind}* __restrict__ q{k}" for k, kind in enumerate(outputs)]
+    values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)
+    for k, (kind, x) in enumerate(zip(outputs, values, strict=True)):
+        write_results(writer, f"q{k}", kind, 1, [x], 2)
+    read, written = tuple(range(len(inputs))), tuple(range(len(outputs)))
+    return make_kernel(target, pointers, [], writer.lines, [block], writer.tables, inputs=read, outputs=written)

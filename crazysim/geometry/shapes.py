@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +15,8 @@ N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "elli
 """Number of entries of the size of each kind."""
 MAX_HULL_VERTICES = 64
 """Largest number of vertices whose convex hull is computed, by trying every triangle."""
+UNBOUNDED_LENGTH = 1e18
+"""Half length that stands for an unbounded one, m; its square fits into float32."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -155,6 +158,44 @@ def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
     if not np.all(np.isfinite(h)) or h.min() < 0 or h.max() > shape.size[2] * (1 + 1e-6):
         raise ConfigError(f"expected heights between 0 and {shape.size[2]} m, got {h.min()} to {h.max()}")
     return shape
+
+
+def bounding_box(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and half lengths of the box around a shape, along the axes of its frame, m. (3,) each"""
+    size = shape.size
+    match shape.kind:
+        case "mesh" | "hfield":
+            if shape.kind == "mesh":
+                low, high = shape.array("vertices").min(axis=0), shape.array("vertices").max(axis=0)
+            else:
+                x, y, _, base = size
+                low, high = np.array([-x, -y, -base]), np.array([x, y, max(0.0, float(shape.array("heights").max()))])
+            return (low + high) / 2, (high - low) / 2
+        case "plane":
+            half = [UNBOUNDED_LENGTH] * 3
+        case "sphere":
+            half = [size[0]] * 3
+        case "capsule":
+            half = [size[0], size[0], size[0] + size[1]]
+        case "cylinder":
+            half = [size[0], size[0], size[1]]
+        case _:
+            half = list(size)
+    return np.zeros(3), np.array(half)
+
+
+def bounding_radius(shape: Shape) -> float:
+    """Return the radius of a ball around a shape, centred at its bounding box, m."""
+    match shape.kind:
+        case "plane":
+            return UNBOUNDED_LENGTH
+        case "sphere" | "ellipsoid":
+            return max(shape.size)
+        case "capsule":
+            return sum(shape.size)
+        case "cylinder":
+            return math.hypot(*shape.size)
+    return float(np.linalg.norm(bounding_box(shape)[1]))
 
 
 def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:

@@ -19,11 +19,10 @@ from crazysim import rotation
 from crazysim.core.branches import any_lane, compute_where, table_rows
 from crazysim.core.data import SimData
 from crazysim.geometry import Shape
-from crazysim.geometry.bounds import bounding_box, bounding_radius
 from crazysim.geometry.fieldrays import MIN_COMPONENT, field_ray
 from crazysim.geometry.points import Components
 from crazysim.geometry.rays import Interval, SizedShapes, first_distance, hit_distance
-from crazysim.geometry.shapes import N_SIZES
+from crazysim.geometry.shapes import N_SIZES, bounding_box, bounding_radius
 from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 

@@ -10,7 +10,7 @@ import dataclasses
 
 import numpy as np
 
-from crazysim.geometry.bounds import UNBOUNDED_LENGTH
+from crazysim.geometry.shapes import UNBOUNDED_LENGTH
 
 N_ORDERS = 8
 """Orders of the nodes: one for each octant of directions."""

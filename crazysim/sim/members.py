@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -16,7 +17,6 @@ from crazysim import jaxcompat
 from crazysim.control import Control
 from crazysim.core import functional as F
 from crazysim.core.data import command_shape
-from crazysim.core.locking import locked
 from crazysim.core.plugin import Simulation
 from crazysim.core.population import Population
 from crazysim.eager import is_on_host, jit_unless_traced
@@ -24,11 +24,23 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.plugins.plugin_registry import PluginRegistry
 from crazysim.pytree import PyTree
 
+Method = TypeVar("Method", bound=Callable[..., Any])
 StageCommand = Callable[[Array | NDArray, Array | NDArray | None], None]
 """Stages a command of all drones, and its feedforward."""
 
 DRONE_POPULATION = "drone"
 """Population of the drones."""
+
+
+def locked(method: Method) -> Method:
+    """Return a method that holds ``self.lock`` while it runs; the lock must be one that a thread may take twice."""
+
+    @functools.wraps(method)
+    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self.lock:
+            return method(self, *args, **kwargs)
+
+    return call  # type: ignore[return-value]
 
 
 class Member:

@@ -21,8 +21,7 @@ from crazysim.core import functional as F
 from crazysim.core.airframes import AirframeSource, airframe_of, drone_names
 from crazysim.core.data import SimData, as_key
 from crazysim.core.integration import Integrator
-from crazysim.core.locking import locked
-from crazysim.core.pipeline import Pipeline
+from crazysim.core.pipeline import BuiltPipeline, Pipeline
 from crazysim.core.plugin import Plugin, plugin_list
 from crazysim.core.random import seed_sim
 from crazysim.core.settings import check_flag, positive_integer
@@ -49,9 +48,8 @@ from crazysim.scene.render import ModelRenderer
 from crazysim.scene.scene import Scene
 from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.adopt import VehicleKind, read_vehicles, vehicle_poses
-from crazysim.sim.built_pipeline import BuiltPipeline
 from crazysim.sim.configuration import Configuration, initial_plugins
-from crazysim.sim.members import Member, find_member
+from crazysim.sim.members import Member, find_member, locked
 
 __all__ = [
     "Sim",

@@ -10,10 +10,9 @@ from crazysim.trajectories.files import (
     save_samples,
 )
 from crazysim.trajectories.limits import Limits, Report, Violation, check
-from crazysim.trajectories.smoothest import smoothest
 from crazysim.trajectories.splines import of_bezier, spline
 from crazysim.trajectories.trajectory import Trajectory
-from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap
+from crazysim.trajectories.waypoints import minimum_jerk, minimum_snap, smoothest
 
 __all__ = [
     "Approach",

@@ -135,7 +135,7 @@ def test_grad_is_finite_and_points_up(start):
     assert not others.any()
 
 
-SHELL = ("sim", "built_pipeline", "configuration")
+SHELL = ("sim", "configuration")
 ARRAY_MODULES = {"jnp", "np", "numpy", "jax", "lax", "rotation", "math"}
 ALLOWED_CALLS = {"jnp.asarray", "jax.ensure_compile_time_eval"}
 """Making an array of what is known on the host, also inside a trace; everything else belongs into a pure function."""

@@ -10,8 +10,8 @@ import pytest
 from cases import with_params, with_states
 
 from crazysim import Sim
+from crazysim.core.pipeline import BuiltPipeline
 from crazysim.engine import Step
-from crazysim.sim.built_pipeline import BuiltPipeline
 
 N_CALLS = 200
 
