@@ -38,9 +38,6 @@ class AllocationParams(PyTree):
         """Return the shared parameters of an airframe.
 
         For the drag torque over thrust see ``torque_arms``.
-
-        Raises:
-            ConfigError: If the airframe lacks one.
         """
         curve = airframe.value("rotors.thrust_curve")
         return AllocationParams(
@@ -53,11 +50,7 @@ class AllocationParams(PyTree):
 
 
 def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
-    """Return the speed at which each rotor lifts its share of the weight, rpm. (1,), or (n_rotors,) if rotors differ.
-
-    Raises:
-        ConfigError: If the airframe has no thrust curve.
-    """
+    """Return the speed at which each rotor lifts its share of the weight, rpm. (1,), or (n_rotors,) if they differ."""
     thrust = float(airframe.value("rigid_body.mass", ())) * GRAVITY_MAGNITUDE / airframe.n_rotors
     return airframe.rotor_vel([thrust])
 
@@ -68,21 +61,13 @@ def level_thrust(airframe: Airframe) -> float:
 
 
 def torque_arms(airframe: Airframe) -> np.ndarray:
-    """Return torque per thrust about x, y and z, m: the third is the airframe's number, or else ``yaw_arm``. (3,)
-
-    Raises:
-        ConfigError: If the airframe has neither that number nor the curves of its rotors.
-    """
+    """Return torque per thrust about x, y and z, m: the third is the airframe's number, or else ``yaw_arm``. (3,)"""
     known = airframe.values.get("controller.thrust2torque")
     return np.array([airframe.arm, airframe.arm, yaw_arm(airframe) if known is None else float(known)])
 
 
 def yaw_arm(airframe: Airframe) -> float:
-    """Return the ratio of the changes of a rotor's drag torque and thrust around hover, m.
-
-    Raises:
-        ConfigError: If the airframe has no thrust curve or no torque curve.
-    """
+    """Return the ratio of the changes of a rotor's drag torque and thrust around hover, m."""
     hover = hover_rotor_vel(airframe)
     slopes = []
     for key in ("torque_curve", "thrust_curve"):

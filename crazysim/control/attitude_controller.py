@@ -53,11 +53,7 @@ class AttitudeParams(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> AttitudeParams:
-        """Return the shared parameters of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no table for this controller.
-        """
+        """Return the shared parameters of an airframe."""
         require_gains(airframe, KEYS, "crazyflow")
         yaw_arm = airframe.value("controller.thrust2torque", ())
         # The firmware adds roll/2, pitch/2 and yaw with each rotor's sign: twice, twice and four times the

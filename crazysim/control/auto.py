@@ -109,9 +109,6 @@ class AutoParams(RigidBodyParams):
             airframe: The airframe.
             freq: Rate of the controller, Hz.
             outer_freq: Rate of its position loop, Hz, whose command is half a period old on average; None without one.
-
-        Raises:
-            ConfigError: If the airframe lacks a value.
         """
         lag, turns = rotor_rate(airframe), DAMPING_RATIO / STIFFNESS_RATIO * turn_rates(airframe)
         wanted = 1 / max(1 / np.max(turns[:2]) - 1.5 / freq, 1 / ROTOR_RATE)
@@ -220,14 +217,6 @@ class Auto(Controller):
     """True if the third entry of an attitude command is a yaw rate, rad/s, instead of a yaw."""
 
     def adapted(self, control: Control, fitted: str | None) -> Controller | None:
-        """Return this controller, without its position loop below the level ``state``; for fitted dynamics that loop.
-
-        None where the command is passed through.
-
-        Args:
-            control: Command level.
-            fitted: Name of the fitted model, which contains the response to attitudes; None for dynamics with rotors.
-        """
         if fitted is None and control in self.levels:
             return self if control == Control.state else dataclasses.replace(self, outer_freq=None)
         if fitted is None:
@@ -235,11 +224,8 @@ class Auto(Controller):
         return FittedAuto(Dynamics(fitted), cast(int, self.outer_freq)) if control == Control.state else None
 
     def outer(self, data: DroneData, command: Setpoint, memory: AutoMemory, params: AutoParams) -> AutoMemory:
-        """Return the memory with attitude, body rates and thrust that lead to a setpoint.
-
-        The z axis of the body is to point along the specific force, its x axis closest to the heading, and their rates
-        are fed forward from jerk and yaw rate, as in ``attitude_of_thrust``.
-        """
+        # The z axis of the body is to point along the specific force, its x axis closest to the heading, and their
+        # rates are fed forward from jerk and yaw rate, as in ``attitude_of_thrust``.
         s, p, sp = data.states, params, command
         matrix = rotation.matrix(s.quat)
         to_body = jnp.swapaxes(matrix, -1, -2)

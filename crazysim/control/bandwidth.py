@@ -57,9 +57,6 @@ def rotor_rate(airframe: Airframe) -> float:
     """Return the rate of the lag of the rotors around hover, in the slower direction, 1/s.
 
     The lag is ``a (cmd - r) + b (cmd^2 - r^2)``; its slope at the hover speed is ``a + 2 b r``.
-
-    Raises:
-        ConfigError: If the airframe has no rotor constants.
     """
     return float(np.min(_slopes(airframe, hover_rotor_vel(airframe))))
 
@@ -76,11 +73,7 @@ def _slopes(airframe: Airframe, rotor_vel: np.ndarray) -> np.ndarray:
 
 
 def reaction_time(airframe: Airframe) -> float:
-    """Return the ratio of the changes of a rotor's angular momentum and drag torque around hover, s.
-
-    Raises:
-        ConfigError: If the airframe has no rotor constants.
-    """
+    """Return the ratio of the changes of a rotor's angular momentum and drag torque around hover, s."""
     hover = hover_rotor_vel(airframe)
     _, k1, k2 = np.atleast_2d(airframe.value("rotors.torque_curve")).T
     return float(np.mean(airframe.value("rotors.inertia") * RPM_TO_RAD_S / (k1 + 2 * k2 * hover)))
@@ -100,9 +93,6 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
     """Return the angular acceleration that the rotors can give about each axis, either way, rad/s^2. (3,)
 
     Roll and pitch may lower the collective thrust below hover, as ``prioritized_thrusts`` does, yaw may not.
-
-    Raises:
-        ConfigError: If the airframe has no rotor constants.
     """
     shares = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
     low, high = (float(airframe.value(f"rotors.thrust_{end}", ())) for end in ("min", "max"))
@@ -132,9 +122,6 @@ def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, reacts: 
         freq: Rate of the controller, Hz.
         rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
         reacts: True for a controller that leaves the reaction to accelerating rotors out of account.
-
-    Raises:
-        ConfigError: If the airframe has no rotor constants.
     """
     rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
     axes = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)

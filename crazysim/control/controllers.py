@@ -31,10 +31,6 @@ def find_controller(controller: Any, switch: Any = None) -> Controller:
     Args:
         controller: Name, ``Controller``, or a list of them, which ``switch`` chooses from.
         switch: Function or indices, as for ``Switch``; None for a single controller.
-
-    Raises:
-        UnknownNameError: If there is no controller of that name.
-        ConfigError: If it is neither a name nor a controller, or the switch does not fit.
     """
     if isinstance(controller, (list, tuple)):
         return make_switch([find_controller(each) for each in controller], switch)

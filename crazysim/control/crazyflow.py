@@ -50,11 +50,6 @@ class CrazyflowState(Controller):
     """Controller that follows the attitudes; None with fitted dynamics, which do."""
 
     def params(self, airframe: Airframe) -> StateParams:
-        """Return the gains of an airframe.
-
-        Raises:
-            ConfigError: If the airframe lacks gains, also of the attitude controller.
-        """
         keys = (*state_controller.KEYS, *(() if self.inner is None else attitude_controller.KEYS))
         require_gains(airframe, keys, self.name)
         return StateParams.create(airframe)
@@ -65,7 +60,6 @@ class CrazyflowState(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: StateMemory, params: StateParams
     ) -> tuple[Array, StateMemory]:
-        """Return roll, pitch, yaw, rad, and collective thrust, N (4,), and the memory."""
         s, cmd = data.states, data.controls.state.cmd
         commanded, pos_err_i = state2attitude(s.pos, s.quat, s.vel, cmd, memory.pos_err_i, self.freq, params=params)
         return commanded, StateMemory(pos_err_i)
@@ -86,17 +80,11 @@ class Crazyflow(Controller):
     """Rate, Hz."""
 
     def adapted(self, control: Control, fitted: str | None) -> Controller | None:
-        """Return the state controller for the level ``state``, this one where it is followed, and otherwise None."""
         if control == Control.state:
             return CrazyflowState(inner=None if fitted else self)
         return self if fitted is None and control in self.levels else None
 
     def params(self, airframe: Airframe) -> AttitudeParams:
-        """Return the gains of an airframe.
-
-        Raises:
-            ConfigError: If the airframe lacks gains.
-        """
         return AttitudeParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> AttitudeMemory:
@@ -105,7 +93,6 @@ class Crazyflow(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: AttitudeMemory, params: AttitudeParams
     ) -> tuple[Array, AttitudeMemory]:
-        """Return collective thrust, N, and body torque, N m (4,), and the memory."""
         s, m = data.states, memory
         cmd: Array = command  # type: ignore[assignment]  # it follows no setpoints
         if data.controls.mode == Control.body_rate:

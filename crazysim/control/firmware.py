@@ -74,7 +74,7 @@ class CFirmware(Controller):
         """Load the library.
 
         Raises:
-            ConfigError: If it cannot be loaded or lacks a function, or the unit does not exist.
+            ConfigError: If the library cannot be loaded or lacks a function.
         """
         if self.motors not in MOTOR_UNITS:
             raise ConfigError(f"expected motors as one of {', '.join(MOTOR_UNITS)}, got {self.motors!r}")

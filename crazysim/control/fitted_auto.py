@@ -43,9 +43,6 @@ class FittedParams(PyTree):
             airframe: The airframe.
             dynamics: Fitted model.
             freq: Rate of the controller, Hz.
-
-        Raises:
-            ConfigError: If the airframe has no fit of that model.
         """
         model = Params.create(airframe, dynamics)
         attitude = float(np.max(np.asarray(model.rpy_rates_coef / model.rpy_coef)[:2]))
@@ -80,7 +77,6 @@ class FittedAuto(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: PositionMemory, params: FittedParams
     ) -> tuple[Array, PositionMemory]:
-        """Return roll, pitch, yaw, rad, and collective thrust, N (4,), and the memory."""
         s, p, model = data.states, params, params.model
         present = data.controls.attitude.cmd[..., 3:] if model.thrust_dyn_coef is None else s.rotor_vel[..., :1]
         matrix = rotation.matrix(s.quat)

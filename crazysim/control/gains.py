@@ -16,9 +16,6 @@ def require_gains(airframe: Airframe, paths: Iterable[str], controller: str) -> 
         airframe: The airframe.
         paths: Tables and keys of the values.
         controller: Name of the controller, for the message.
-
-    Raises:
-        ConfigError: If it lacks values; all of them are named, by table.
     """
     missing = [path for path in dict.fromkeys(paths) if path not in airframe.values]
     if not missing:

@@ -59,9 +59,6 @@ class GeometricParams(RigidBodyParams):
             gains: ``"bandwidth"``: by the rule of ``crazysim.control.bandwidth``, times mass and inertia.
                 ``"airframe"``: the table ``[geometric]`` of the airframe, in the lab's airframes the gains
                 of AIMotionLab.
-
-        Raises:
-            ConfigError: If the airframe lacks a value.
         """
         if gains == "airframe":
             table = {key: airframe.value(f"geometric.{key}", ()) for key in ("kr", "kv", "kR", "kw")}
@@ -202,11 +199,6 @@ class Geometric(Controller):
     mass. Errors that alone would require more than ``MAX_INTEGRAL_RATIO`` are left out."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
-        """Return gains and constants for an airframe.
-
-        Raises:
-            ConfigError: If the airframe lacks a value, or the integral is negative or not finite.
-        """
         if not (np.isfinite(self.integral) and self.integral >= 0):
             raise ConfigError(f"expected a finite integral of at least 0, 1/s, got {self.integral!r}. Use 0 for none.")
         return GeometricParams.create(airframe, self.freq, self.gains)

@@ -62,9 +62,6 @@ class INDIParams(PyTree):
             airframe: The airframe.
             freq: Rate of the controller, Hz.
             cutoff: Cutoff frequency of the filter, Hz; at most 0.45 of the rate is used.
-
-        Raises:
-            ConfigError: If the airframe lacks a value, or the cutoff is not positive.
         """
         if not 0 < cutoff < math.inf:
             raise ConfigError(f"expected a positive, finite cutoff, Hz, got {cutoff!r}. Use INDI(cutoff=12.0).")
@@ -217,7 +214,7 @@ class INDI(Controller):
     def take_over(
         self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams, rotor_vel: Array
     ) -> INDIMemory:
-        """Return the memory before the first tick, since the remembered velocities are older than the last tick."""
+        # the remembered velocities are older than the last tick
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(self, data: DroneData, command: Any, memory: INDIMemory, params: INDIParams) -> tuple[Array, INDIMemory]:

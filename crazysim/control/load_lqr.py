@@ -68,8 +68,7 @@ class LoadLQRParams(RigidBodyParams):
             attach: Joint of the rod, from the centre of mass, body frame, m. (3,)
 
         Raises:
-            ConfigError: If the airframe lacks a value, mass or length is negative or not finite, a joint or a weight
-                has another shape, or no gain stabilises the drone.
+            ConfigError: If no gain stabilises the drone.
         """
         if not (0 <= load_mass < np.inf and 0 < length < np.inf):
             raise ConfigError(
@@ -292,17 +291,12 @@ class LoadLQR(Controller):
     def take_over(
         self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams, rotor_vel: Array
     ) -> LoadLQRMemory:
-        """Return the memory before the first tick, since the remembered derivative is older than the last tick."""
+        # the remembered derivative is older than the last tick
         return memory.replace(started=jnp.zeros_like(memory.started))
 
     def update(
         self, data: DroneData, command: Any, memory: LoadLQRMemory, params: LoadLQRParams
     ) -> tuple[Array, LoadLQRMemory]:
-        """Return the wrench.
-
-        Raises:
-            ConfigError: If the simulation has no such load.
-        """
         if self.load not in data.plugins:
             raise ConfigError(
                 f"expected a load {self.load!r} for controller {self.name!r}, got plugins {list(data.plugins)}. Use "

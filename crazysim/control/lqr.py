@@ -47,7 +47,7 @@ class LQRParams(RigidBodyParams):
             R: Weights of collective thrust and torque (4,) or (4, 4); None for ``lqr_weights``.
 
         Raises:
-            ConfigError: If the airframe lacks a value, a weight has another shape, or no gain stabilises the drone.
+            ConfigError: If no gain stabilises the drone.
         """
         Q, R = lqr_weights(airframe, freq, Q, R)
         return LQRParams(
@@ -79,9 +79,6 @@ def lqr_weights(
         R: Weights of the inputs: a diagonal or a matrix; None for the rule.
         load_mass: Mass of the load, kg.
         length: Length of its rod, m; None without a load.
-
-    Raises:
-        ConfigError: If a weight has another shape.
     """
     rates, g = bandwidth(airframe, freq), -GRAVITY[2]
     w, mass, moments = rates.position, float(airframe.value("rigid_body.mass", ())), np.diag(airframe.inertia)
@@ -100,9 +97,6 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
         name: ``"Q"`` for weights of states, which may be zero, or ``"R"`` for weights of inputs, which may not.
         weights: A diagonal (n,) or a symmetric matrix (n, n).
         n: Number of states or inputs.
-
-    Raises:
-        ConfigError: If they are neither n numbers nor a symmetric matrix, not finite, or negative in any direction.
     """
     array = read_numbers(f"weights {name}", weights, shapes=((n,), (n, n)), remedy=f"Give a diagonal of {n} numbers.")
     array = np.diag(array) if array.ndim == 1 else array

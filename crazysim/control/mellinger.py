@@ -65,11 +65,7 @@ class MellingerParams(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> MellingerParams:
-        """Return the shared parameters of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no table for this controller.
-        """
+        """Return the shared parameters of an airframe."""
         require_gains(airframe, KEYS, "mellinger")
         gains = {key: as_parameter(airframe.value(f"mellinger.{key}", (3,))) for key in _GAINS}
         return MellingerParams(
@@ -170,11 +166,6 @@ class Mellinger(Controller):
     """True to truncate torque and PWM to integers where the firmware does; gradients are those without."""
 
     def params(self, airframe: Airframe) -> MellingerParams:
-        """Return the gains of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no table for this controller.
-        """
         return MellingerParams.create(airframe)
 
     def memory(self, airframe: Airframe) -> MellingerMemory:
@@ -183,7 +174,6 @@ class Mellinger(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: MellingerMemory, params: MellingerParams
     ) -> tuple[Array, MellingerMemory]:
-        """Return the rotor speeds, rpm, and the memory. (n_rotors,)"""
         p = params
         thrust, torque, memory, _ = self._command(data, command, memory, p)
         off = thrust <= 0
@@ -201,7 +191,7 @@ class Mellinger(Controller):
         params: MellingerParams,
         rotor_vel: Array,
     ) -> MellingerMemory:
-        """Return a memory with integrals that continue the present force and torque as far as their limits allow."""
+        # The integrals continue the present force and torque as far as their limits allow.
         p, s = params, data.states
         rates = _desired_rates(data, command)
         zero = jnp.zeros_like(s.ang_vel)

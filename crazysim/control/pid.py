@@ -55,11 +55,6 @@ class PID(Controller):
     """True to truncate torque and PWM to integers where the firmware does; gradients are those without."""
 
     def params(self, airframe: Airframe) -> PIDParams:
-        """Return the gains of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no tables for this controller.
-        """
         return PIDParams.create(airframe, self.outer_freq, self.freq)
 
     def memory(self, airframe: Airframe) -> PIDMemory:
@@ -81,7 +76,6 @@ class PID(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams
     ) -> tuple[Array, PIDMemory]:
-        """Return the rotor speeds, rpm, and the memory after the attitude and rate loops. (n_rotors,)"""
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(data.states.quat), DEGREES_PER_RADIAN * data.states.ang_vel
         thrust = memory.thrust if isinstance(command, Setpoint) else pwm_of_thrust(command[3:], params=params.motors)
         rpy_des, attitude, ang_vel_des = self._desired_rates(data, command, memory, params, rpy)
@@ -96,11 +90,8 @@ class PID(Controller):
     def take_over(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
     ) -> PIDMemory:
-        """Return a memory with integrals that continue the present thrust, roll, pitch and torque.
-
-        At the level ``state`` the integrals of the velocity loop take up the difference of thrust, roll and pitch, and
-        those of the rate loop at every level the difference of torque.
-        """
+        # At the level ``state`` the integrals of the velocity loop take up the difference of thrust, roll and pitch,
+        # and the integrals of the rate loop at every level the difference of torque.
         s, p, rest = data.states, params, jax.tree.map(jnp.zeros_like, memory)
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)

@@ -53,11 +53,7 @@ class PIDParams(PyTree):
 
     @staticmethod
     def create(airframe: Airframe, outer_freq: int, freq: int) -> PIDParams:
-        """Return the shared parameters of an airframe for the rates of the loops, Hz.
-
-        Raises:
-            ConfigError: If the airframe has no tables for this controller.
-        """
+        """Return the shared parameters of an airframe for the rates of the loops, Hz."""
         require_gains(airframe, KEYS, "pid")
         return PIDParams(
             position=PIDLoop.create(airframe, "pid.position", outer_freq),

@@ -39,11 +39,7 @@ class PIDLoop(PyTree):
 
     @staticmethod
     def create(airframe: Airframe, path: str, freq: float) -> PIDLoop:
-        """Return the loops of a table of an airframe, run at a rate, Hz.
-
-        Raises:
-            ConfigError: If the airframe has no such table, or it lacks the gains.
-        """
+        """Return the loops of a table of an airframe, run at a rate, Hz."""
         table = airframe.table(path)
         gains = {key: airframe.value(f"{path}.{key}", (3,)) for key in ("kp", "ki", "kd")}
         ki, kd = (as_parameter(gains[key]) if np.any(gains[key]) else None for key in ("ki", "kd"))

@@ -59,9 +59,6 @@ class PositionParams(PyTree):
             airframe: The airframe.
             delay: Delay of the loop that follows the specific force, s.
             freq: Rate of the controller, Hz.
-
-        Raises:
-            ConfigError: If the airframe lacks a value.
         """
         g = -GRAVITY[2]
         most = MAX_THRUST_SHARE * level_thrust(airframe) / float(airframe.value("rigid_body.mass", ()))

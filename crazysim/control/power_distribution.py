@@ -36,11 +36,7 @@ class PowerDistributionParams(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> PowerDistributionParams:
-        """Return the shared parameters of an airframe.
-
-        Raises:
-            ConfigError: If the airframe lacks one.
-        """
+        """Return the shared parameters of an airframe."""
         return PowerDistributionParams(
             pwm_max=as_parameter(airframe.value("controller.pwm_max", ())),
             thrust_max=as_parameter(airframe.value("rotors.thrust_max", ())),

@@ -28,11 +28,7 @@ class RigidBodyParams(PyTree):
 
 
 def rigid_body_params(airframe: Airframe) -> dict[str, Any]:
-    """Return the fields of ``RigidBodyParams`` for an airframe.
-
-    Raises:
-        ConfigError: If the airframe lacks a value.
-    """
+    """Return the fields of ``RigidBodyParams`` for an airframe."""
     mass = airframe.value("rigid_body.mass")
     return {
         "mass": as_parameter(mass),

@@ -40,11 +40,7 @@ class StateParams(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> StateParams:
-        """Return the shared parameters of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no table for this controller.
-        """
+        """Return the shared parameters of an airframe."""
         require_gains(airframe, KEYS, "crazyflow")
         to_pwm = airframe.value("controller.mass_thrust", ())
         from_pwm = (

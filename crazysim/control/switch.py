@@ -67,11 +67,6 @@ class Switch(Controller):
         return self.controllers
 
     def params(self, airframe: Airframe) -> SwitchParams:
-        """Return the parameters of all controllers.
-
-        Raises:
-            ConfigError: If the airframe lacks a number for one, or the indices are invalid.
-        """
         index: Any = None if callable(self.switch) else _indices(self.switch, len(self.controllers))
         params = tuple(c.params(airframe) for c in self.controllers)
         return SwitchParams(params, AllocationParams.create(airframe), index)
@@ -84,7 +79,6 @@ class Switch(Controller):
     def update(
         self, data: DroneData, command: Setpoint | Array, memory: SwitchMemory, params: SwitchParams
     ) -> tuple[Array, SwitchMemory]:
-        """Return the rotor speeds of the chosen controller, rpm, and the memory. (n_rotors,)"""
         index = self._index(data, command, params)
         switched = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, after = memory.rotor_vel, []
@@ -121,11 +115,7 @@ class Switch(Controller):
 
 
 def make_switch(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
-    """Return several controllers with a switch.
-
-    Raises:
-        ConfigError: If there is no controller, or no switch.
-    """
+    """Return several controllers with a switch."""
     if not controllers:
         raise ConfigError("expected at least one controller, got an empty list. Use controller=['pid', 'mellinger'].")
     if switch is None:

@@ -192,11 +192,6 @@ class TrackingLQR(Controller):
     """Weights of the inputs, as for ``LQRParams.create``."""
 
     def params(self, airframe: Airframe) -> TrackingLQRParams:
-        """Return gains and constants for an airframe.
-
-        Raises:
-            ConfigError: If the setpoints are missing, too many or not finite, or no gain stabilises the drone.
-        """
         shape = np.shape(self.setpoints.pos) if isinstance(self.setpoints, Setpoint) else ()
         n = shape[0] if len(shape) == 2 else 0
         if not 2 <= n <= MAX_KNOTS or not 0 < self.dt < math.inf:

@@ -31,12 +31,7 @@ Airframes = Airframe | Sequence[Airframe]
 
 
 def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
-    """Return the airframe of each drone; drones of the same source have the same one. (n_drones,)
-
-    Raises:
-        UnknownNameError: If an airframe does not exist.
-        ConfigError: If an airframe is invalid, or a list has another length than there are drones.
-    """
+    """Return the airframe of each drone; drones of the same source have the same one. (n_drones,)"""
     if not is_list(drone):
         return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
     if not drone:

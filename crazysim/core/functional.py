@@ -50,9 +50,6 @@ def state_control(
         yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2; None for the yaw rate of the
             setpoint and zeros. Crazyflow's controller follows none. (n_worlds, n_drones, 8)
-
-    Raises:
-        ValueError: Wrong shape, type or command level, a NaN or infinite command, or both forms at once.
     """
     command, feedforward = check_setpoint(
         data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward
@@ -232,9 +229,6 @@ def check_command(data: SimData, control: Control, command: ArrayLike, check_fin
     """Return a command as an array of the state's dtype; of the data, shapes and types are enough.
 
     One of the host is a copy of its caller's; it is still on the host, and ``put_command`` moves it.
-
-    Raises:
-        ValueError: Wrong shape, type or command level, or a NaN or infinite command.
     """
     if data.controls.mode != control:
         raise ConfigError(

@@ -61,10 +61,6 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
 
     Returns:
         The tree of ``fn``, reduced.
-
-    Raises:
-        ConfigError: If the reduction does not exist or does not fit the type, or outside of a stage or an influence of
-            one drone.
     """
     if reduce not in REDUCTIONS:
         raise ConfigError(f"expected reduce as 'sum', 'min' or 'max', got {reduce!r}")

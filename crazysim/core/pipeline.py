@@ -35,57 +35,33 @@ def check_pipeline(name: str, pipeline: object) -> Pipeline:
 
 
 def append_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = None) -> None:
-    """Add a stage at the end, under the function's name if none is given.
-
-    Raises:
-        ValueError: If the name exists already, or the function has none.
-    """
+    """Add a stage at the end, under the function's name if none is given."""
     _insert(pipeline, len(pipeline), fn, name)
 
 
 def prepend_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str | None = None) -> None:
-    """Add a stage at the beginning, under the function's name if none is given.
-
-    Raises:
-        ValueError: If the name exists already, or the function has none.
-    """
+    """Add a stage at the beginning, under the function's name if none is given."""
     _insert(pipeline, 0, fn, name)
 
 
 def insert_fn_before(pipeline: Pipeline, anchor: str, fn: Callable[..., Any], name: str | None = None) -> None:
-    """Add a stage right before the stage ``anchor``.
-
-    Raises:
-        ValueError: If there is no such stage, or the name exists already.
-    """
+    """Add a stage right before the stage ``anchor``."""
     _insert(pipeline, _index(pipeline, anchor), fn, name)
 
 
 def insert_fn_after(pipeline: Pipeline, anchor: str, fn: Callable[..., Any], name: str | None = None) -> None:
-    """Add a stage right after the stage ``anchor``.
-
-    Raises:
-        ValueError: If there is no such stage, or the name exists already.
-    """
+    """Add a stage right after the stage ``anchor``."""
     _insert(pipeline, _index(pipeline, anchor) + 1, fn, name)
 
 
 def replace_fn(pipeline: Pipeline, fn: Callable[..., Any], name: str) -> None:
-    """Replace the function of the stage ``name``.
-
-    Raises:
-        ValueError: If there is no such stage.
-    """
+    """Replace the function of the stage ``name``."""
     _index(pipeline, name)
     pipeline[name] = fn
 
 
 def remove_fn(pipeline: Pipeline, name: str) -> None:
-    """Remove the stage ``name``.
-
-    Raises:
-        ValueError: If there is no such stage.
-    """
+    """Remove the stage ``name``."""
     _index(pipeline, name)
     del pipeline[name]
 
@@ -107,11 +83,7 @@ class BuiltPipeline(Generic[F]):
 
     @property
     def stages(self) -> Pipeline:
-        """Functions by name, in order.
-
-        Raises:
-            ConfigError: If it is assigned something else than a dict from names to functions.
-        """
+        """Functions by name, in order."""
         return self._stages
 
     @stages.setter

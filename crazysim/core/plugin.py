@@ -144,9 +144,6 @@ def check_parameter(
 
     Returns:
         (*core) or (n_worlds, n_drones, *core)
-
-    Raises:
-        ConfigError: If the shape, the type or a value is invalid.
     """
     allowed = range_between(low, high, positive)
     batch, array = sim.data.states.pos.shape[:2], np.asarray(value)
@@ -232,9 +229,6 @@ class Plugin:
 
         Args:
             sim: The simulation that the plugin is being added to.
-
-        Raises:
-            ConfigError: If a setting is invalid, or the simulation lacks something the plugin needs.
         """
         return None
 
@@ -269,11 +263,7 @@ class Plugin:
         return kind(**values)
 
     def check_plugins(self, sim: Simulation) -> None:
-        """Check the simulation with all of its plugins, which may be added in any order, before it steps.
-
-        Raises:
-            ConfigError: If the plugin lacks another one that it needs, or does not go with one.
-        """
+        """Check the simulation with all of its plugins, which may be added in any order, before it steps."""
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of the plugin with their positions, in the order in which they are inserted."""

@@ -236,11 +236,7 @@ def physics_freq(freq: object) -> int:
 
 
 def enum_member(enum: type[E], name: str, value: object) -> E:
-    """Return the member of an enum.
-
-    Raises:
-        UnknownNameError: If there is no such member; the message lists all members.
-    """
+    """Return the member of an enum that has a value, or raise an error with the name of the setting."""
     try:
         return enum(value)
     except ValueError:
@@ -372,11 +368,7 @@ def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[
 
 
 def dividing_rate(name: str, rate: object, freq: int) -> int:
-    """Return a rate that was set, Hz.
-
-    Raises:
-        ConfigError: If it does not divide ``freq``.
-    """
+    """Return a rate that divides ``freq``, Hz."""
     rate = positive_integer(name, rate)
     if freq % rate:
         raise ConfigError(

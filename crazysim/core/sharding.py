@@ -95,11 +95,7 @@ def world_mesh(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def shardings_of(data: SimData, mesh: Mesh) -> SimData:
-    """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated.
-
-    Raises:
-        ConfigError: If the mesh has no axis of worlds, or the worlds cannot be split evenly.
-    """
+    """Return the sharding of every leaf: leaves of members and worlds are split, shared leaves are replicated."""
     if not isinstance(mesh, Mesh):
         raise ConfigError(f"expected a mesh, got {mesh!r}; use world_mesh(jax.devices())")
     n_devices = mesh.shape.get(WORLD_AXIS)

@@ -120,9 +120,6 @@ def stage(
             steps where it acts nowhere.
         phase: When in a call of the step it runs: ``"before"`` the first of its physics steps, at ``"each"`` of them,
             or ``"after"`` the last.
-
-    Raises:
-        ConfigError: If the scope or the phase is none of these. A population is looked up when the stage is applied.
     """
     if not isinstance(scope, str) or not scope or scope in RESERVED_SCOPES:
         raise ConfigError(
@@ -233,9 +230,6 @@ def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
     Args:
         fn: The function of one world: from any trees of arrays to one.
         least: Number of batch axes from which a leaf is divided among worlds: 2 excludes batched leaves.
-
-    Raises:
-        ConfigError: When the function is called, if it changes a leaf that all worlds share.
     """
 
     def of_all(*args: Any) -> Any:

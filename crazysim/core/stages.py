@@ -192,9 +192,6 @@ def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> Si
         data: The simulation.
         default_data: The data to return to.
         mask: True in the worlds to reset; None for all. (n_worlds,)
-
-    Raises:
-        ConfigError: If the mask has another shape or type.
     """
     mask = as_mask(mask, data.core.steps.shape[:1])
     plugins = {name: default_data.plugins.get(name, plugin) for name, plugin in data.plugins.items()}

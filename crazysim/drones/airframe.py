@@ -50,11 +50,7 @@ class Airframe:
     """Reason why gains and fits of the base are missing, for messages; empty if all were inherited."""
 
     def table(self, path: str) -> Mapping[str, Any]:
-        """Return a table by its dotted path, such as ``controller.state``.
-
-        Raises:
-            ConfigError: If the airframe has no such table.
-        """
+        """Return a table by its dotted path, such as ``controller.state``."""
         node: Any = self.tables
         for part in path.split("."):
             node = node.get(part) if isinstance(node, Mapping) else None
@@ -71,9 +67,6 @@ class Airframe:
         Args:
             path: Table and key.
             shape: Expected shape; None for any.
-
-        Raises:
-            ConfigError: If the value is missing or has another shape.
         """
         if path not in self.values:
             raise ConfigError(
@@ -86,11 +79,7 @@ class Airframe:
         return value
 
     def matrix(self, path: str) -> NDArray[np.float64]:
-        """Return a matrix that is given whole or as its diagonal, such as ``drag.coefficients``. (3, 3)
-
-        Raises:
-            ConfigError: If there is no such value.
-        """
+        """Return a matrix that is given whole or as its diagonal, such as ``drag.coefficients``. (3, 3)"""
         value = self.value(path)
         return np.diag(value) if value.ndim == 1 else value
 

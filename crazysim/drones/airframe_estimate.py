@@ -135,9 +135,6 @@ def estimate_airframe(
         capacity: Charge of the battery, A h.
         resistance: Internal resistance of the battery, ohm.
         name: Name of the airframe.
-
-    Raises:
-        ConfigError: If a number is missing or cannot belong to a drone.
     """
     for key, value in (
         ("mass", mass),

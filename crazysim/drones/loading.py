@@ -39,7 +39,7 @@ def load_airframe(source: AirframeSource) -> Airframe:
 
     Raises:
         UnknownNameError: If the source is neither the name of an airframe nor a file.
-        ConfigError: If a table or key does not exist, or the numbers cannot belong to a drone.
+        ConfigError: If the file has an unknown table or key, or numbers that cannot belong to a drone.
     """
     return _load(source, ())
 

@@ -56,11 +56,7 @@ class Params(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> Params:
-        """Return the shared parameters of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no first-principles parameters.
-        """
+        """Return the shared parameters of an airframe."""
         require_support(airframe, Dynamics.first_principles)
         thrust_curve = airframe.value("rotors.thrust_curve")
         # In float64, whatever the precision of the simulation: the limits are constants, not results.

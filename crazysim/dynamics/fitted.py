@@ -66,11 +66,7 @@ class Params(PyTree):
 
     @staticmethod
     def create(airframe: Airframe, dynamics: Dynamics) -> Params:
-        """Return the shared parameters of an airframe for one of the fitted models.
-
-        Raises:
-            ConfigError: If the airframe has no fit of that model.
-        """
+        """Return the shared parameters of an airframe for one of the fitted models."""
         require_support(airframe, dynamics)
 
         def fitted(key: str) -> Array:

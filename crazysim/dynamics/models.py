@@ -40,22 +40,14 @@ def supported_dynamics(drone: AirframeSource) -> tuple[Dynamics, ...]:
 
 
 def supported_drones(dynamics: Dynamics | str) -> tuple[Drone, ...]:
-    """Return the built-in airframes that have parameters for a model.
-
-    Raises:
-        UnknownNameError: If the model does not exist.
-    """
+    """Return the built-in airframes that have parameters for a model."""
     if dynamics not in tuple(Dynamics):
         raise UnknownNameError(f"expected dynamics as one of {', '.join(Dynamics)}, got {dynamics!r}")
     return tuple(drone for drone in Drone if dynamics in supported_dynamics(drone))
 
 
 def require_support(airframe: Airframe, dynamics: Dynamics) -> None:
-    """Check that an airframe has the parameters of a model.
-
-    Raises:
-        ConfigError: If it lacks them; the message lists the supported models.
-    """
+    """Check that an airframe has the parameters of a model."""
     supported = supported_dynamics(airframe)
     if dynamics not in supported:
         raise ConfigError(

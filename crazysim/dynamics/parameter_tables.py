@@ -46,7 +46,6 @@ def load_params(
         device: Device of the values; None for the module's default.
 
     Raises:
-        UnknownNameError: If the model or the drone does not exist.
         ConfigError: If the drone has no parameters for the model.
     """
     if dynamics not in tuple(Dynamics):
@@ -90,9 +89,6 @@ def load_fn_params(
         drone: Airframe, or anything that ``load_airframe`` accepts.
         xp: Array module of the values; None for NumPy.
         device: Device of the values; None for the module's default.
-
-    Raises:
-        ConfigError: If ``fn`` is another function.
     """
     if fn is not first_principles.dynamics:
         hint = ", which is shared by all fitted models" if fn is fitted.dynamics else ""
@@ -113,9 +109,6 @@ def load_controller_params(
         drone: Airframe, or anything that ``load_airframe`` accepts.
         xp: Array module of the values, such as ``jax.numpy``; None for NumPy.
         device: Device of the values; None for the module's default.
-
-    Raises:
-        UnknownNameError: If the controller or the drone does not exist.
     """
     if controller != CASCADE_NAME:
         raise UnknownNameError(f"expected controller {CASCADE_NAME!r}, got {controller!r}")

@@ -25,9 +25,6 @@ def report_unsupported(problems: Sequence[str], strict: bool, reported: set[str]
         strict: True to raise an error instead.
         reported: Warnings that were given before; the new one is added.
         remedy: Way out of the error, as the beginning of a sentence that ends with ``use strict=False``.
-
-    Raises:
-        ConfigError: With ``strict``.
     """
     if not problems:
         return

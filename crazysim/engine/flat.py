@@ -26,7 +26,6 @@ class PackCache:
         self._last: tuple[Sequence[Any], Array | None] = (), None  # one attribute: other threads may replace it
 
     def __call__(self, arrays: list[Any]) -> Array:
-        """Return the arrays as one."""
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return _concatenate(arrays)
         before, packed = self._last
@@ -69,7 +68,6 @@ class ZerosCache:
         self._shared: dict[Any, list[int]] = {}
 
     def __call__(self, data: SimData, leaves: list[Any], treedef: Any) -> Zeros:
-        """Return the elements of a simulation's data, which is also passed flattened."""
         indices = self._indices(data, leaves, treedef)
         arrays = [leaves[i] for i in indices]
         before, zeros = self._last

@@ -52,7 +52,6 @@ class HostLeaves:
         self._made: dict[int, Array] = {}
 
     def __getitem__(self, i: int) -> Array:
-        """Return a leaf as an array of JAX."""
         x = self.items[i]
         if isinstance(x, jax.Array):
             return x

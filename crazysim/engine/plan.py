@@ -119,8 +119,7 @@ class Planner(NamedTuple):
                 runs all of the step; None for no rows.
 
         Raises:
-            ConfigError: If a stage is wrong, if an engine chosen by name cannot run it, or, with ``strict``, if a
-                stage or the fastest engine is not supported.
+            ConfigError: If an engine chosen by name cannot run the stages; with ``strict``, if a stage is unsupported.
         """
         if self.engine == "plain":
             return self._plain(data, "it was chosen")

@@ -58,10 +58,6 @@ def rollout(
 
     Returns:
         The data, and the records with time in front. (n_control_steps // every, ...)
-
-    Raises:
-        ConfigError: If a number is not a positive int, or does not divide.
-        ValueError: If the policy returns a command of another shape.
     """
     n_control_steps = positive_integer("n_control_steps", n_control_steps)
     n_substeps, every = positive_integer("n_substeps", n_substeps), positive_integer("every", every)

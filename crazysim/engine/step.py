@@ -53,11 +53,7 @@ class FlatData:
         return record
 
     def replace(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:
-        """Return the data with other values of some leaves.
-
-        Raises:
-            ValueError: If one is in rows, where its value would not be read.
-        """
+        """Return the data with other values of some leaves."""
         if any(i in rows.members for rows in self.plan.rows for i in numbers):
             raise ValueError(
                 "expected leaves that are not in rows, got one that is. Name it in apart= of Step.flatten."
@@ -129,7 +125,7 @@ class Step:
             strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
 
         Raises:
-            ConfigError: If the engine does not exist, or cannot run here.
+            ConfigError: If the engine cannot run here.
         """
         if engine not in ENGINES:
             raise ConfigError(f"engine {engine!r} does not exist; choose one of {', '.join(ENGINES)}")
@@ -169,10 +165,6 @@ class Step:
             n_steps: Number of steps, an integer of at least 0, or an array of one. ()
             zeros: Result of ``zeros`` for this data before it was traced. Under a trace the values of parameters are
                 unknown, and the step computes with zeros as with any other number.
-
-        Raises:
-            ConfigError: If the number of steps is not an integer, negative, or larger than ``MAX_STEPS``; of a traced
-                one only the type and shape are known.
         """
         _check_steps(n_steps)
         leaves, treedef = jax.tree.flatten(data)

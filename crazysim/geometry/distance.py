@@ -48,9 +48,6 @@ def distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
         b: Other shape, of any kind.
         pos: Position of the centre of ``a`` in the frame of ``b``, m. (..., 3)
         rot: Rotation matrix from the frame of ``a`` to the frame of ``b``. (..., 3, 3)
-
-    Raises:
-        ConfigError: If ``a`` is of another kind.
     """
     if a.kind not in DRONE_KINDS:
         raise ConfigError(f"expected a drone shape of kind {', '.join(DRONE_KINDS)}, got {a.kind}; use one of these")

@@ -32,9 +32,6 @@ class Shape:
     - ``ellipsoid``: semi-axes along x, y and z.
     - ``mesh``: none; the convex hull of its vertices. Made by ``hull``.
     - ``hfield``: half extents along x and y, largest height, depth of the ground below z = 0. Made by ``hfield``.
-
-    Raises:
-        ConfigError: If the kind is unknown, or the size is invalid for the kind.
     """
 
     kind: str
@@ -53,7 +50,6 @@ class Shape:
     """Heights of a height field, rows along y and columns along x, m. (n_rows, n_columns)"""
 
     def __post_init__(self) -> None:
-        """Check kind and size, and convert the size to floats."""
         if self.kind not in N_SIZES:
             raise ConfigError(f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these")
         needed = N_SIZES[self.kind]
@@ -70,11 +66,7 @@ class Shape:
         object.__setattr__(self, "size", tuple(size.tolist()))
 
     def array(self, name: str) -> np.ndarray:
-        """Return an array of the shape by name.
-
-        Raises:
-            TypeError: If shapes of this kind have no such array.
-        """
+        """Return an array of the shape by name."""
         found = getattr(self, name)
         if found is None:
             raise TypeError(f"expected a shape with {name}, got a {self.kind}, which has none")
@@ -85,11 +77,9 @@ class Shape:
         return (self.kind, self.size, *(None if a is None else (a.shape, a.tobytes()) for a in arrays))
 
     def __eq__(self, other: object) -> bool:
-        """Return True for a shape of the same content."""
         return isinstance(other, Shape) and self._content() == other._content()
 
     def __hash__(self) -> int:
-        """Return a hash of the content."""
         return hash(self._content())
 
 
@@ -100,9 +90,6 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
         vertices: Vertices, m. (n_vertices, 3)
         faces: Triangles of the convex hull as indices of vertices, in any orientation, as in a compiled MuJoCo model.
             None computes the hull, for up to 64 vertices. (n_faces, 3)
-
-    Raises:
-        ConfigError: If the vertices span no volume, or the faces are not their convex hull.
     """
     v = np.asarray(vertices, np.float64)
     if v.ndim != 2 or v.shape[1] != 3 or len(v) < 4 or not np.all(np.isfinite(v)):
@@ -147,9 +134,6 @@ def hfield(heights: ArrayLike, size: Sequence[float]) -> Shape:
     Args:
         heights: Heights of the surface, rows along y and columns along x, m. (n_rows, n_columns)
         size: Half extents along x and y, largest height, depth of the ground below z = 0, m. (4,)
-
-    Raises:
-        ConfigError: If there are fewer than two rows or columns, or a height is not between zero and the largest.
     """
     h = np.asarray(heights, np.float64)
     if h.ndim != 2 or min(h.shape) < 2:

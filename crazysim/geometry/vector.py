@@ -22,19 +22,15 @@ class Vector(PyTree):
     """Component along z. (...)"""
 
     def __add__(self, other: Vector) -> Vector:
-        """Return the sum."""
         return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
 
     def __sub__(self, other: Vector) -> Vector:
-        """Return the difference."""
         return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __neg__(self) -> Vector:
-        """Return the opposite."""
         return Vector(-self.x, -self.y, -self.z)
 
     def __mul__(self, factor: Array | float) -> Vector:
-        """Return the vector times a number. (...)"""
         return Vector(self.x * factor, self.y * factor, self.z * factor)
 
     def __getitem__(self, k: int) -> Vector:

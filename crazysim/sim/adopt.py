@@ -55,8 +55,7 @@ def read_vehicles(
         kinds: Airframe or population by further prefixes, besides ``known_kinds``.
 
     Raises:
-        UnknownNameError: If a prefix is unknown; the message lists the known ones.
-        ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
+        ConfigError: If the file cannot be read, or has no drone.
     """
     spec = read_spec(xml_path)
     vehicles = take_vehicles(spec, known_kinds() | dict(kinds))
@@ -93,10 +92,6 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list
     Args:
         spec: The spec.
         kinds: Airframe or population by prefix.
-
-    Raises:
-        UnknownNameError: If a prefix is unknown; the message lists the known ones.
-        ConfigError: If two bodies have the same name.
     """
     found = []
     for body in spec.worldbody.bodies:

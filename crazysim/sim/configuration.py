@@ -76,9 +76,6 @@ class Configuration:
         Args:
             data: Data to check.
             like: Data of the simulation.
-
-        Raises:
-            ConfigError: If they are not.
         """
         try:
             core, controls = data.core, data.controls
@@ -113,11 +110,7 @@ class Configuration:
         controllers: str | Controller | Sequence[str | Controller],
         switch: Callable[..., Array] | ArrayLike | None = None,
     ) -> Configuration:
-        """Return the configuration for the arguments of ``Sim``, as users pass them.
-
-        Raises:
-            ValueError: For an argument that is invalid or contradicts another, with what was expected.
-        """
+        """Return the configuration for the arguments of ``Sim``, as users pass them."""
         n_worlds, n_drones, freq = (
             positive_integer("n_worlds", n_worlds),
             positive_integer("n_drones", n_drones),
@@ -147,11 +140,7 @@ class Configuration:
 
 
 def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
-    """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones.
-
-    Raises:
-        ConfigError: If an argument of ``Sim`` is invalid.
-    """
+    """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones."""
     found: list[Plugin] = []
     if estimator is not None:
         estimator = find_estimator(estimator)

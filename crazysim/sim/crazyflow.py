@@ -29,9 +29,6 @@ def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) ->
         record: Record whose named fields begin with an axis over worlds, or broadcast to one.
         mask: True in the worlds to change; None for all. (n_worlds,)
         **changes: New values. (n_worlds, ...)
-
-    Raises:
-        ConfigError: If the mask has another shape or type.
     """
     return record.replace(
         **{name: _select_in_worlds(mask, new, getattr(record, name)) for name, new in changes.items()}
@@ -51,9 +48,6 @@ def pytree_replace(tree: Tree, new_tree: Tree, batched: Any, mask: Array | None 
         new_tree: Tree of the same structure with the new values.
         batched: Tree of bools, True for the leaves to replace, such as ``world_mask`` returns.
         mask: True in the worlds to change; None for all. (n_worlds,)
-
-    Raises:
-        ConfigError: If the mask has another shape or type.
     """
     return jax.tree.map(
         lambda old, new, is_batched: _select_in_worlds(mask, new, old) if is_batched else old,
@@ -75,9 +69,6 @@ def render_depth(
         camera: Id or name; 0 is ``track_cam:0``.
         resolution: Width and height, pixels.
         include_drone: True to show drones, including the one that carries the camera.
-
-    Raises:
-        ValueError: If the camera does not exist, the name means several cameras, or the resolution is invalid.
     """
     try:
         width, height = resolution

@@ -38,15 +38,9 @@ class Vector:
     those of the fields."""
 
     def __len__(self) -> int:
-        """Return the length of the vector."""
         return sum(self.sizes.values())
 
     def __getitem__(self, name: str) -> slice:
-        """Return the slice of a field.
-
-        Raises:
-            UnknownNameError: If it is not in the vector.
-        """
         if name not in self.sizes:
             raise UnknownNameError(f"{name!r} is not in this vector; it has {', '.join(self.sizes) or 'no fields'}")
         names = list(self.sizes)
@@ -98,8 +92,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         drone: Index of the drone in its world.
 
     Raises:
-        ValueError: If a name or the drone does not exist, or the step cannot be exported; the message names the stage
-            and the reason.
+        ValueError: If the step cannot be exported; the message names the stage and the reason.
         ImportError: If CasADi is not installed.
     """
     try:
@@ -193,11 +186,7 @@ def _command_field(data: SimData) -> str:
 
 
 def _parameter_leaves(program: Program, parameters: Sequence[str], command: str) -> list[int]:
-    """Return the indices of the leaves requested as parameters.
-
-    Raises:
-        ConfigError: If a name does not exist, occurs twice, or is not a parameter of the step.
-    """
+    """Return the indices of the leaves requested as parameters."""
     names = [leaf.name for leaf in program.leaves]
     if isinstance(parameters, str) or len(set(parameters)) < len(parameters):
         raise ConfigError(f"expected parameters as a list of distinct names, got {parameters!r}")

@@ -53,19 +53,10 @@ class Member:
     """Name of its population; ``"drone"`` for a drone."""
 
     def __init__(self, sim: Simulation, name: str, index: int, plugin: Population | None, stage: StageCommand):
-        """Take the simulation, the name, the index in the population, the population and the function that stages.
-
-        A ``plugin`` of None is for drones.
-        """
         self._sim, self.name, self.index, self._plugin, self._stage = sim, name, index, plugin, stage
         self.population, self.lock = DRONE_POPULATION if plugin is None else plugin.name, sim.lock
 
     def __getattr__(self, field: str) -> Array:
-        """Return a field of the record. (n_worlds, ...)
-
-        Raises:
-            AttributeError: If there is no such field.
-        """
         value: Any = None if field.startswith("_") else getattr(self._record(), field, None)
         if np.ndim(value) < 2:
             raise AttributeError(f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}.")
@@ -73,12 +64,7 @@ class Member:
 
     @locked
     def set(self, **values: ArrayLike) -> None:
-        """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each.
-
-        Raises:
-            UnknownNameError: If there is no such field.
-            ValueError: If a value has another shape, or is NaN or infinite.
-        """
+        """Write fields of the record, such as ``pos``, in all worlds: (...), or (n_worlds, ...) for each."""
         record, new = self._record(), {}
         for field, value in values.items():
             if field not in self._fields():
@@ -95,10 +81,6 @@ class Member:
         """Stage a command for this one alone: (k,), or (n_worlds, k) for each world.
 
         A drone takes a command of the simulation's level, a member a command of its population's level.
-
-        Raises:
-            ConfigError: If the population takes no commands.
-            ValueError: If the command has another shape, or is NaN or infinite.
         """
         data, plugin = self._sim.data, self._plugin
         if plugin is not None:
@@ -146,7 +128,6 @@ class Member:
         return [name for name in names if getattr(getattr(record, name), "ndim", 0) >= 2]
 
     def __repr__(self) -> str:
-        """Return name, population and index."""
         return f"<{self.name}: {self.population} {self.index}>"
 
 
@@ -179,11 +160,7 @@ def _replace_row_on_device(x: Array, index: Array | int, value: ArrayLike) -> Ar
 
 
 def find_member(sim: Simulation, plugins: PluginRegistry, name: str, stage: StageCommand) -> Member:
-    """Return the view of a drone or member of a population among the plugins.
-
-    Raises:
-        UnknownNameError: If there is none of that name; the message suggests similar names.
-    """
+    """Return the view of a drone or member of a population among the plugins."""
     if name in (drones := sim.names[: sim.n_drones]):
         return Member(sim, name, drones.index(name), None, stage)
     for plugin in plugins.values():

@@ -130,9 +130,6 @@ class MPPI:
             temperature: Temperature over the mean excess of the costs over the least, 1.
             cost: Cost of a control step; the cost of a rollout is the sum over its control steps.
             seed: Seed of the samples.
-
-        Raises:
-            ConfigError: If a setting is invalid.
         """
         c = sim.configuration
         if c.control not in COMMAND_LEVELS:

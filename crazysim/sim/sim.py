@@ -140,9 +140,6 @@ class Sim:
                 for those of the model alone. Short for ``Residual()`` at the head of ``plugins``.
             plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. One that begins
                 where the drones are, such as a load, is added when they are in place.
-
-        Raises:
-            ValueError: If an argument is invalid, with what was expected.
         """
         rates = {
             Control.state: state_freq,
@@ -205,8 +202,7 @@ class Sim:
             **settings: Further arguments of ``Sim``.
 
         Raises:
-            UnknownNameError: If a prefix is unknown; the message lists the known ones.
-            ConfigError: If the file cannot be read, two bodies have the same name, or there is no drone.
+            ConfigError: If the file cannot be read, or has no drone.
         """
         plugin_list("plugins", plugins)
         spec, drones, populations = read_vehicles(xml_path, kinds or {})
@@ -226,20 +222,12 @@ class Sim:
 
     @property
     def airframe(self) -> Airframe:
-        """Airframe of all drones.
-
-        Raises:
-            ConfigError: If the drones have several.
-        """
+        """Airframe of all drones, if they have only one."""
         return airframe_of(self.airframes)
 
     @property
     def drone(self) -> str:
-        """Name of the airframe of all drones.
-
-        Raises:
-            ConfigError: If the drones have several airframes.
-        """
+        """Name of the airframe of all drones, if they have only one."""
         return self.airframe.name
 
     # Names ------------------------------------------------------------------------------------------------------------
@@ -261,11 +249,7 @@ class Sim:
 
     @property
     def data(self) -> SimData:
-        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``.
-
-        Raises:
-            ConfigError: If it is assigned something else than data of a simulation with the same settings.
-        """
+        """Everything that changes. Assigning to it makes the scene stale, and clears ``core.mjx_synced``."""
         self._adopt_scene()
         return self._stepper.data
 
@@ -335,11 +319,7 @@ class Sim:
 
     @locked
     def seed(self, seed: int) -> None:
-        """Set the seed of all random numbers drawn from now on.
-
-        Raises:
-            ValueError: If it is not an integer.
-        """
+        """Set the seed of all random numbers drawn from now on."""
         self._seed = as_key(seed)
         self.data = seed_sim(self.data, self._seed)
 
@@ -355,9 +335,6 @@ class Sim:
         Args:
             plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
             name: Name to add it under; None for ``plugin.name``.
-
-        Raises:
-            ConfigError: If the name is taken, a setting is invalid, or the simulation lacks what the plugin needs.
         """
         return self.plugins.add(plugin, name)
 
@@ -366,7 +343,6 @@ class Sim:
         """Remove a plugin, with its record and its stages; stages that it had replaced return.
 
         Raises:
-            UnknownNameError: If it has not been added.
             ConfigError: If one of its stages has been replaced since.
         """
         self.plugins.remove(plugin)
@@ -376,10 +352,6 @@ class Sim:
         """Replace the settings of the plugin of the same name; its states continue.
 
         Where only numbers change (the fields declared with ``parameter``), nothing is compiled.
-
-        Raises:
-            UnknownNameError: If there is no plugin of that name.
-            ConfigError: If it is of another class, or a setting is invalid.
         """
         return self.plugins.replace(plugin)
 
@@ -489,8 +461,7 @@ class Sim:
         """Advance every world by a number of physics steps; any number uses the same compilation.
 
         Raises:
-            ConfigError: If it is not a positive integer, or a world would have taken more than
-                ``crazysim.core.data.MAX_STEPS`` since its last reset.
+            ConfigError: If a world would have taken more than ``crazysim.core.data.MAX_STEPS`` since its last reset.
         """
         n_steps = positive_integer("n_steps", n_steps)
         self._adopt_scene()
@@ -524,9 +495,6 @@ class Sim:
 
         Returns:
             The results of ``keep``, with time in front. (n_control_steps // every, ...)
-
-        Raises:
-            ValueError: If a number is invalid, or the policy returns a command of another shape.
         """
         n_substeps = self.freq // self.control_freq
         self._stepper.count(n_substeps, positive_integer("n_control_steps", n_control_steps))
@@ -554,9 +522,6 @@ class Sim:
 
         Args:
             mask: True in worlds to reset, of type bool; None for all. (n_worlds,)
-
-        Raises:
-            ConfigError: If the mask has another shape or type.
         """
         self._stepper.accept(self.reset_fn(self.data, self.default_data, mask))
 
@@ -643,9 +608,6 @@ class Sim:
 
         Args:
             world: World to write into ``mj_data``, without touching the others; None for all, in ``mjx_data``.
-
-        Raises:
-            ValueError: If the world does not exist.
         """
         data = self._data_with_moved_objects()
         if world is not None:
@@ -668,9 +630,6 @@ class Sim:
 
         Returns:
             (n_worlds, n_slots), bool
-
-        Raises:
-            ValueError: If the scene has no such body.
         """
         if body is not None:
             body_id(self.mj_model, body)  # a wrong name raises before anything changes
@@ -687,9 +646,6 @@ class Sim:
             objects: Handles from ``scene.add``, or names of bodies; None for all, () for none.
             floor: True to report the floor.
             drones: True to report the other drones of a world.
-
-        Raises:
-            ValueError: If nothing is requested, or an object does not exist.
         """
         return self._queries.contact_report(self._data_with_moved_objects(), objects, floor, drones)
 
@@ -705,9 +661,6 @@ class Sim:
         """Return depth images of all worlds, m; see ``scene.depth_fn``. (n_worlds, n_cameras, height, width)
 
         Infinite where nothing is hit.
-
-        Raises:
-            ValueError: If the camera does not exist, or the resolution is not positive.
         """
         return self._queries.depth(self._data_with_moved_objects(), camera, width, height, drones, hide_own, along)
 
@@ -735,7 +688,6 @@ class Sim:
             height: Pixels.
 
         Raises:
-            ValueError: If the world, camera, mode or a setting does not exist.
             RenderError: If this machine cannot draw.
         """
         self._scene.sync_one(self._data_with_moved_objects(), world)

@@ -23,9 +23,6 @@ def draw_line(
         rgba: Colour, 0 to 1, one or one per segment; None for red. (4,) or (n - 1, 4)
         start_size: Width at the first point, pixels.
         end_size: Width at the last point, pixels.
-
-    Raises:
-        ValueError: If the points have a wrong shape.
     """
     sim.overlays.line(_points(points), DEFAULT_COLOR if rgba is None else rgba, start_size, end_size)
 
@@ -38,9 +35,6 @@ def draw_points(sim: Sim, points: ArrayLike, rgba: ArrayLike | None = None, size
         points: World frame, m. (n, 3)
         rgba: Colour, 0 to 1; None for red. (4,)
         size: Radius, m.
-
-    Raises:
-        ValueError: If the points have a wrong shape.
     """
     sim.overlays.points(_points(points), DEFAULT_COLOR if rgba is None else rgba, size)
 
@@ -62,9 +56,6 @@ def draw_capsule(
         radius: Radius, m.
         rgba: Colour, 0 to 1; None for red. (4,)
         cylinder: True for flat ends.
-
-    Raises:
-        ValueError: If an end has a wrong shape.
     """
     first, last = np.asarray(p1, dtype=float), np.asarray(p2, dtype=float)
     if first.shape != (3,) or last.shape != (3,):
@@ -79,9 +70,6 @@ def draw_label(sim: Sim, point: ArrayLike, text: str) -> None:
         sim: Simulation.
         point: Left end of the text, world frame, m. (3,)
         text: ASCII text of at most 99 characters.
-
-    Raises:
-        ValueError: If the point has a wrong shape, or the text is invalid.
     """
     pos = np.asarray(point, dtype=float)
     if pos.shape != (3,):
@@ -96,9 +84,6 @@ def draw_text(sim: Sim, text: str, corner: str = "top left") -> None:
         sim: Simulation.
         text: ASCII text of one or several lines.
         corner: ``"top left"``, ``"top right"``, ``"bottom left"`` or ``"bottom right"``.
-
-    Raises:
-        ValueError: If the corner does not exist, or the text is invalid.
     """
     sim.overlays.text(text, corner)
 
@@ -111,9 +96,6 @@ def draw_setpoints(sim: Sim, world: int = 0, rgba: ArrayLike | None = None, size
         world: Index of the world.
         rgba: Colour, 0 to 1, one or one per drone; None for red. (4,) or (n_drones, 4)
         size: Radius, m.
-
-    Raises:
-        ValueError: If the simulation has another command level, or no such world.
     """
     if sim.data.controls.state is None:
         raise ConfigError(f"expected control='state', whose commands have positions, got control={str(sim.control)!r}")
@@ -138,9 +120,6 @@ def change_material(
         drone_ids: Indices of the drones. (n,)
         rgba: Colour, 0 to 1, one or one per drone. (4,) or (n, 4)
         emission: Emission, 0 to 1, one or one per drone. () or (n,)
-
-    Raises:
-        ValueError: If a drone or the material does not exist, or a shape is wrong.
     """
     ids = np.asarray(drone_ids)
     if ids.ndim != 1 or not np.issubdtype(ids.dtype, np.integer):

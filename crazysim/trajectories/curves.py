@@ -67,9 +67,6 @@ def lissajous(
         period: Period, s; None for 5 s, or for what the speed needs.
         speed: Upper bound of the speed instead, m/s, as if all axes were fastest at the same time.
         center: Centre, world frame, m. (3,)
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     a, k, phi, c = (require_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
                                                   (amplitudes, frequencies, phases, center), strict=True))  # fmt: skip
@@ -122,9 +119,6 @@ def helix(
         speed: Speed instead, m/s.
         height: Height of the start, m.
         along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     require_positive("turns", turns)
     given = {"radius": radius, "climb": climb, "height": height}
@@ -152,9 +146,6 @@ def line(
         duration: Time that it takes, s; None for 5 s, or for what the speed needs.
         speed: Largest speed instead, m/s, which is reached in the middle.
         yaw: Yaw, rad.
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     a, b = require_vector("start", start), require_vector("end", end)
     # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1 with three derivatives of zero at both; its slope is at most
@@ -173,9 +164,6 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
         pos: The point, world frame, m. (3,)
         yaw: Yaw, rad.
         duration: Time until what comes next with ``then``, s.
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     _period(duration, None, 0.0, "duration")
     return Trajectory.of_pieces(
@@ -226,11 +214,7 @@ def _period(period: float | None, speed: float | None, length: float, name: str 
 
 
 def require_positive(name: str, value: float) -> float:
-    """Return a setting as a positive number.
-
-    Raises:
-        ConfigError: If it is anything else.
-    """
+    """Return a setting as a positive number."""
     is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not is_number or not np.isfinite(value) or value <= 0:
         raise ConfigError(f"expected {name} as a positive number, got {value!r}")
@@ -238,11 +222,7 @@ def require_positive(name: str, value: float) -> float:
 
 
 def require_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
-    """Return a setting as numbers of some shape.
-
-    Raises:
-        ConfigError: If it is anything else, or a number is larger than ``MAX_SIZE``.
-    """
+    """Return a setting as numbers of some shape."""
     array = np.asarray(value)
     if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.abs(array.astype(float)) <= MAX_SIZE):
         kind = "3 finite numbers" if shape else "a finite number"

@@ -24,9 +24,6 @@ def line(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
         spacing: Distance between neighbours, m.
         center: Centre, world frame, m. (3,)
         yaw: Angle by which the line is turned around its centre, rad.
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     x = require_positive("spacing", spacing) * (np.arange(positive_integer("n", n)) - (n - 1) / 2)
     return _turn_and_move(np.stack([x, np.zeros(n)], axis=-1), center, yaw)
@@ -40,9 +37,6 @@ def grid(n: int, spacing: float = 1.0, center: ArrayLike = CENTER, yaw: float = 
         spacing: Distance between neighbours, m.
         center: Centre, world frame, m. (3,)
         yaw: Angle by which the grid is turned around its centre, rad.
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     return _turn_and_move(grid_2d(positive_integer("n", n), require_positive("spacing", spacing)), center, yaw)
 
@@ -62,9 +56,6 @@ def circle(
         radius: Radius instead, m.
         center: Centre, world frame, m. (3,)
         yaw: Angle by which the circle is turned, rad.
-
-    Raises:
-        ConfigError: If a setting is invalid, or both spacing and radius are given.
     """
     if spacing is not None and radius is not None:
         raise ConfigError(f"expected spacing or radius, got both: {spacing!r} and {radius!r} m. Leave one out.")
@@ -87,9 +78,6 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
     Args:
         starts: Places that the drones start from, m. (n, 3)
         targets: Places to fly to, in any order, m. (n, 3)
-
-    Raises:
-        ConfigError: If they are not as many finite places.
     """
     a, b = np.asarray(starts, float), np.asarray(targets, float)
     if a.shape != b.shape or a.ndim != 2 or a.shape[1] != 3 or not np.all(np.isfinite(a) & np.isfinite(b)):

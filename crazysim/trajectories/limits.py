@@ -53,12 +53,6 @@ class Limits:
     """Smallest height, m, negative in a pit."""
 
     def __post_init__(self) -> None:
-        """Check the limits.
-
-        Raises:
-            ConfigError: If a limit other than the floor is not positive, the weight is not within the thrust limits,
-                or the floor is not below the largest height.
-        """
         check_settings(self)
         if self.floor is not None and self.height is not None and self.floor >= self.height:
             raise ConfigError(
@@ -117,7 +111,6 @@ class Violation:
     """Names of the drones."""
 
     def __str__(self) -> str:
-        """Return the violation in one line."""
         unit = "m" if self.limit == "separation" else QUANTITIES[self.limit].unit
         relation = "below" if self.limit == "separation" or QUANTITIES[self.limit].sign < 0 else "above"
         return (
@@ -147,7 +140,6 @@ class Report:
         return not self.violations
 
     def __str__(self) -> str:
-        """Return the extremes of the table and every violation, a line each."""
         lines = [f"{len(self.names)} drone{'s' * (len(self.names) > 1)}, {self.duration:.2f} s"]
         for name, peak in self.peaks.items():
             k = int(np.argmax(QUANTITIES[name].sign * peak.value))
@@ -191,10 +183,6 @@ def check(
         duration: Duration, s; None for the time at which the last drone ends. A trajectory that repeats counts once.
         names: Names of the drones for the report; None for their numbers.
         tolerance: Largest error of a distance, m.
-
-    Raises:
-        ConfigError: If there is no trajectory, the number of names or starts differs from the number of trajectories,
-            or the tolerance is not positive.
     """
     several = trajectories.unstacked() if isinstance(trajectories, Trajectory) else list(trajectories)
     if len(several) == 1 and np.ndim(starts) == 1:

@@ -42,9 +42,6 @@ class PieceTable:
             starts: Start of each, s; one that is negative has begun before time zero. () or (n_drones,)
             duration: Duration, s; None for the time at which the last drone ends, where a trajectory that repeats
                 counts once.
-
-        Raises:
-            ConfigError: If there is no trajectory, a start is not finite, or the duration is not positive.
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")

@@ -31,10 +31,6 @@ def spline(
         yaw: Yaw, rad: one for all points, or one for each, between which the drone turns the shorter way. () or
             (n_points,)
         at_rest: True to start and end at rest; otherwise the derivatives at the ends are free, as of a natural spline.
-
-    Raises:
-        ConfigError: If the shapes do not fit, a number is not finite, the times do not ascend, or there are too few
-            points.
     """
     if degree not in SPLINE_ORDERS:
         raise ConfigError(f"expected a spline of degree 3, 5 or 7, got {degree!r}. Use spline(times, points, 7).")
@@ -71,9 +67,6 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
         control_points: Control points of each curve, the first and the last included: x, y, z, m, and, in all curves
             or in none, yaw, rad. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
         repeats: True to start again after the end.
-
-    Raises:
-        ConfigError: If the shapes do not fit, a number is not finite, or the ends do not ascend.
     """
     at = np.asarray(ends, float)
     curves = [np.asarray(points, float) for points in control_points]
@@ -120,9 +113,6 @@ def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
     Args:
         yaw: One yaw for all points, or one for each, rad. () or (n_points,)
         n_points: Number of points.
-
-    Raises:
-        ConfigError: If the shape does not fit or a number is not finite.
     """
     angles = require_finite(np.asarray(yaw, float), "yaw")
     if angles.shape not in ((), (n_points,)):
@@ -139,9 +129,6 @@ def require_finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64
     Args:
         values: Numbers. (...)
         name: Name for the message.
-
-    Raises:
-        ConfigError: If one is NaN or infinite.
     """
     if not np.all(np.isfinite(values)):
         where = np.argwhere(~np.isfinite(values))[0].tolist()

@@ -49,9 +49,6 @@ class Trajectory(PyTree):
             coefficients: Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, of the time
                 since its start, s. Without yaw, it is zero. (n_pieces, 4, degree + 1) or (n_pieces, 3, degree + 1)
             repeats: True to start again after the end.
-
-        Raises:
-            ConfigError: If the shapes do not fit, a number is not finite, or a duration is not positive.
         """
         lengths, c = np.asarray(durations, float), np.asarray(coefficients, float)
         if lengths.ndim != 1 or not lengths.size or c.ndim != 3 or c.shape[1] not in (3, 4) or len(c) != len(lengths):
@@ -182,9 +179,6 @@ class Trajectory(PyTree):
 
         Args:
             trajectories: Single trajectories.
-
-        Raises:
-            ConfigError: If there is none.
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
@@ -221,9 +215,6 @@ class Trajectory(PyTree):
 
         Args:
             n: Number of rounds, after which the trajectory ends; None for no end.
-
-        Raises:
-            ConfigError: If it is not a positive whole number.
         """
         if n is None:
             return self.replace(repeats=np.bool_(True))
@@ -247,9 +238,6 @@ class Trajectory(PyTree):
             other: The trajectory that follows.
             transition: Time between the two, s, during which one more piece of degree 7 connects them, with continuous
                 velocity, acceleration and jerk, and turns the shorter way; 0 for none.
-
-        Raises:
-            ConfigError: If one of them repeats without end, or the transition is negative.
         """
         if self.repeats or other.repeats:
             which = "first" if self.repeats else "second"
@@ -293,9 +281,6 @@ class Trajectory(PyTree):
         Args:
             offset: Displacement, m. (3,)
             yaw: Angle by which the curve and the yaw along it are turned, rad. ()
-
-        Raises:
-            ConfigError: If one has another shape, or is not finite.
         """
         for name, value, shape in (("offset", offset, (3,)), ("yaw", yaw, ())):
             is_known = not isinstance(value, jax.core.Tracer)

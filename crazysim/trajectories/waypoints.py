@@ -54,8 +54,7 @@ def minimum_snap(
         jerks: Jerks, likewise, m/s^3. (n, 3)
 
     Raises:
-        ConfigError: If a shape does not fit, a number is not finite, or the waypoints cannot be flown within the limits
-            or corridors.
+        ConfigError: If the waypoints cannot be flown within the limits or corridors.
     """
     return _plan(waypoints, durations, (velocities, accelerations, jerks), limits, yaw, corridors)
 

@@ -54,9 +54,6 @@ def sys_id_translation(
     Returns:
         ``cmd_f_coef``, thrust per commanded thrust, 1; with a lag ``thrust_dyn_coef``, its rate, 1/s; with drag
         ``drag_xy_coef`` and ``drag_z_coef``, N s/m.
-
-    Raises:
-        ConfigError: If the model is not one of these, or a plot is requested.
     """
     del verbose  # an argument of Crazyflow
     _refuse_plot(plot)
@@ -87,9 +84,6 @@ def sys_id_rotation(
 
     Returns:
         ``rpy_coef``, 1/s^2, ``rpy_rates_coef``, 1/s, and ``cmd_rpy_coef``, 1/s^2. (3,) each
-
-    Raises:
-        ConfigError: If a plot is requested.
     """
     del verbose  # an argument of Crazyflow
     _refuse_plot(plot)
@@ -104,11 +98,7 @@ def sys_id_rotation(
 def fit_translation(
     dynamics: str, mass: float, logs: Sequence[Mapping[str, ArrayLike]], gravity: ArrayLike = GRAVITY
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the parameters of ``sys_id_translation`` for several logs, and their standard deviations.
-
-    Raises:
-        ConfigError: If the model is not a fitted one, or the mass is not positive.
-    """
+    """Return the parameters of ``sys_id_translation`` for several logs, and their standard deviations."""
     if dynamics not in list(FITTED_MODELS):
         raise ConfigError(
             f"expected dynamics as one of {', '.join(FITTED_MODELS)}, got {dynamics!r}. Choose one of them."

@@ -106,10 +106,10 @@ class OneLane(Exchange):
         return name
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        """Write nothing."""
+        pass
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:
-        """Write nothing."""
+        pass
 
 
 class Registers(OneLane):
@@ -138,7 +138,6 @@ class SharedMemory(OneLane):
         self._records: dict[str, int] = {}
 
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
-        """Write a record of numbers for each thread, and return how the numbers of another thread are read."""
         order = sorted(range(len(values)), key=lambda k: -TYPE_BYTES[values[k][0]])
         text = "".join(f"{values[k][0]} x{n}; " for n, k in enumerate(order))
         record = f"Record{self._records.setdefault(text, len(self._records))}"
@@ -158,7 +157,6 @@ class SharedMemory(OneLane):
 
     @property
     def declarations(self) -> list[str]:
-        """Return the records, and the memory for them."""
         lines = []
         for text, k in self._records.items():
             lines.append(f"struct __align__(16) Record{k} {{ {text}}};")
@@ -178,7 +176,6 @@ class Sweeps(Exchange):
         self.kept: list[str] = []
 
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
-        """Store numbers and everything that is live, begin the next part, and return how numbers are read."""
         arrays = []
         for kind, value in values:
             arrays.append(writer.new("g"))
@@ -191,26 +188,21 @@ class Sweeps(Exchange):
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
     def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        """Write a number of the lanes to memory, and return the expression that reads it."""
         self.kept.append(f"{kind}v {name}[VECTORS];")
         writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
         return f"w.{name}[v]"
 
     def keep(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        """Write a number of the lanes to memory, and return the expression that reads it."""
         return self.variable(writer, name, kind, value, depth)
 
     def open_loop(self, writer: LineWriter, depth: int) -> None:
-        """Write the beginning of a loop over the vectors of the world."""
         writer.line("SWEEP {", depth)
 
     def close_loop(self, writer: LineWriter, depth: int) -> None:
-        """End the loop."""
         writer.line("}", depth)
 
     @property
     def declarations(self) -> list[str]:
-        """Return the numbers of a world in memory."""
         return ["struct World {", *(f"  {line}" for line in self.kept), "};"]
 
 

@@ -85,11 +85,9 @@ class HostLaunch:
     """A compiled kernel: called, it is an operation of a traced function."""
 
     def __init__(self, kernel: Kernel):
-        """Compile a kernel."""
         self._name, self._aliases, self._kept = target(kernel), kernel.aliases(), kernel.kept
 
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        """Return the outputs of the kernel."""
         if self._kept:
             lanes_of_vector = VECTOR_BYTES // 4
             count = np.append(

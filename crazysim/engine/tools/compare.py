@@ -46,7 +46,6 @@ class Difference:
     operations of a program."""
 
     def __str__(self) -> str:
-        """Return a sentence."""
         (a, b), (x, y) = self.engines, self.values
         where = f"{self.leaf}{list(self.index)}"
         text = f"stage {self.stage!r}: {where} is {x} by {a!r} and {y} by {b!r}"

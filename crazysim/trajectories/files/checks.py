@@ -30,9 +30,6 @@ def refuse(expected: str, got: str, place: str) -> NoReturn:
         expected: Description of an accepted value.
         got: Description of the value.
         place: File and place in it.
-
-    Raises:
-        ConfigError: Always.
     """
     raise ConfigError(f"expected {expected}, got {got} in {place}")
 

@@ -105,7 +105,7 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
         yaw: Yaw, rad; None for none. (n,)
 
     Raises:
-        ConfigError: If the shapes do not fit, or the folder does not exist.
+        ConfigError: If the folder does not exist.
     """
     columns = [np.asarray(times, float)[:, None], np.asarray(pos, float)]
     header = "t,x,y,z"

@@ -27,9 +27,6 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     Returns:
         Ends, s (n_pieces,), and coefficients of the pieces' times scaled to [0, 1], constant term first, of x, y, z, m,
         and yaw, rad. (n_pieces, 4, degree + 1)
-
-    Raises:
-        ConfigError: If it is the record of several vehicles.
     """
     ends = np.asarray(trajectory.ends)
     if ends.ndim != 1:

@@ -70,9 +70,6 @@ def trajectory_of_rows(rows: NDArray, place: str) -> Trajectory:
     Args:
         rows: (n_pieces, 33), or (n_pieces, 25) without yaw
         place: File, for messages.
-
-    Raises:
-        ConfigError: If a number is out of range.
     """
     lengths, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
     if not np.all(np.isfinite(rows)):
