@@ -13,11 +13,11 @@ body rates follow with a damping ratio of 0.65, which overshoots a step by 7%, a
 a pair of damping ratio 0.55, without overshoot. The attitude loop delays a slow command by kd / kp = 5 / a, from which
 the gains of the position loop follow.
 
-The rate has two limits. The first is the lag: ``1 / a`` is at least that of the rotors, with feedback of their speeds,
-and 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line on which
-kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can, from every error, if that
-is at most the angular acceleration that they give in hover where e is largest (``turn_rates``). Without this limit a
-drone with quick rotors turns faster than it can stop, saturates to both sides in turn, and never settles.
+The rate has two limits. The first is lag: ``1 / a`` is at least the lag of the rotors, with feedback of their speeds,
+and at least 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line
+on which kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can, from every error,
+if that is at most the angular acceleration that they give in hover where e is largest (``turn_rates``). Without this
+limit a drone with quick rotors turns faster than it can stop, saturates to both sides in turn, and never settles.
 
 A rotor that speeds up turns the body the other way. With rotors of the inertia I, whose drag torque changes by q over
 their speed, the yaw torque follows the drag torque y as y + z y' with z = I / q, up to a second for heavy rotors. As

@@ -95,11 +95,11 @@ def geometric_control(
     """Return the wrench that tracks a setpoint.
 
     The controller of Lee, Leok and McClamroch (2010): a force from the errors of position and velocity,
-    an attitude whose z axis is along that force, and a torque from the errors of rotation and body rates. Attitude,
-    rates and angular acceleration are those of a drone whose thrust is that force and changes with jerk and snap of the
-    setpoint (``attitude_of_thrust``). The drag of the setpoint's velocity is compensated, with its derivatives at the
-    present attitude (Faessler, Franchi and Scaramuzza 2018). The rotors' limits are respected by priority
-    (``prioritized_wrench``), so a saturated drone keeps its attitude and the motors stay on.
+    an attitude whose z axis is along that force, and a torque from the errors of rotation and body rates. The
+    desired attitude, rates and angular acceleration belong to a drone whose thrust is that force and changes with jerk
+    and snap of the setpoint (``attitude_of_thrust``). The drag of the setpoint's velocity is compensated, with its
+    derivatives at the present attitude (Faessler, Franchi and Scaramuzza 2018). The rotors' limits are respected by
+    priority (``prioritized_wrench``), so a saturated drone keeps its attitude and the motors stay on.
 
     Args:
         pos: Position, world frame, m. (..., 3)

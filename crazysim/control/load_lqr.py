@@ -218,8 +218,8 @@ def load_lqr_control(
 ) -> Array:
     """Return the wrench of the LQR with load, with the wrench of the setpoint's motion as feed-forward.
 
-    ``u = u_ref - K e`` with the errors of the drone as in ``lqr_control``, and those of the two angles of the rod and
-    their rates (``rod_angles``), all in the frame of the desired heading.
+    ``u = u_ref - K e`` with the errors of the drone as in ``lqr_control``, and the errors of the two angles of the rod
+    and of their rates (``rod_angles``), all in the frame of the desired heading.
 
     Args:
         pos: Position of the drone, world frame, m. (..., 3)

@@ -153,7 +153,7 @@ class Mellinger(Controller):
     Unlike Crazyflow's cascade, which descends from it, it lowers all motors where one would exceed its maximum, has no
     minimum PWM, resets its integrals at zero thrust, and runs the position part at the rate of the attitude part. The
     firmware's version has no rate mode: use ``controller="pid"`` for body rates. At the level ``state`` the desired
-    body rates are those of the command, ``cmd[13:16]``, since a ``Setpoint`` has none. Source: controller_mellinger.c
+    body rates come from the command, ``cmd[13:16]``; a ``Setpoint`` has none. Source: controller_mellinger.c
     of bitcraze/crazyflie-firmware, commit 2a18fc29.
     """
 

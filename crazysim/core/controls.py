@@ -161,7 +161,7 @@ def require_same_controllers(controls: SimControls, like: SimControls, name: str
 
     Args:
         controls: Commands and controllers to check.
-        like: Those of the simulation.
+        like: Commands and controllers of the simulation.
         name: Name of the simulation's controller.
     """
     given, needed = _controllers_of(controls), _controllers_of(like)

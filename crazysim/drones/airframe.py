@@ -20,7 +20,7 @@ TUNED_TABLES = ("fitted", "controller", "geometric", "mellinger", "pid", "residu
 
 
 GRAVITY_MAGNITUDE = 9.81
-"""Gravitational acceleration, m/s^2: the value with which the airframes were identified, and that of the Crazyflie's
+"""Gravitational acceleration, m/s^2: the value with which the airframes were identified, also used by the Crazyflie's
 firmware (``GRAVITY_MAGNITUDE`` in physicalConstants.h)."""
 
 

@@ -76,11 +76,11 @@ SOURCES = {
     "rotor_inertia": "estimate: thin rod, m D^2 / 12, of the propeller's mass m = 0.015 kg (D / 0.279 m)^2 (0.53 oz at "
     "11 inch, scaled as in SizingLab/FAST-UAV); the motor's bell is neglected",
     "lag": f"estimate: first order with {ROTOR_TIME_CONSTANT:g} s, longer in proportion to the diameter beyond 0.254 "
-    "m; thrust of cf21B_500 has 0.06 s around hover, that of hb_x500 (10 inch) 0.045 to 0.071 s",
+    "m; thrust of cf21B_500 has 0.06 s around hover, of hb_x500 (10 inch) 0.045 to 0.071 s",
     "drag": f"estimate: {DRAG_RATE:g} 1/s times the mass; airframes identified from flights (cf21B_500, cf2x_L250, "
     "hb_x500) have 0.35 to 0.58 1/s",
     "cells": "estimate: 1 cell below 0.1 kg, 3 below 0.5 kg, 4 below 3 kg, else 6",
-    "battery_mass": f"estimate: capacity times {CELL_VOLTAGE:g} V per cell over {BATTERY_ENERGY:g} W h/kg, that of a "
+    "battery_mass": f"estimate: capacity times {CELL_VOLTAGE:g} V per cell over {BATTERY_ENERGY:g} W h/kg, as in a "
     "pack of 3.4 A h, 4 cells and 0.329 kg (MK-quadro)",
     "capacity": f"estimate: battery of {BATTERY_SHARE:g} of the mass with {BATTERY_ENERGY:g} W h/kg",
     "resistance": f"estimate: cells times {CELL_RESISTANCE:g} ohm A h / capacity; good cells of several A h have "

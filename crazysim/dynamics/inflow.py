@@ -15,7 +15,7 @@ from jax import Array
 from crazysim.rotation import safe_sqrt
 
 MIN_AIR_SPEED = 1e-3
-"""Speed that is added in quadrature to that of the air at a rotor, m/s, so that a stopped rotor in still air has an
+"""Speed that is added in quadrature to the air speed at a rotor, m/s, so that a stopped rotor in still air has an
 inflow. An assumption; 1 mm/s changes nothing else."""
 N_ITERATIONS = 3
 """Newton steps from the solution without in-plane velocity. In-plane velocities of up to four times the induced one

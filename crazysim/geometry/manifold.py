@@ -20,8 +20,8 @@ N_BOX_POINTS = 13
 MIN_EDGE_SINE = 1e-3
 """Sine of the angle of two edges below which they span no separating axis."""
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
-"""An axis of two edges is taken where its overlap is below this share of that of the best face, by more than this share
-of the smaller box: faces have several points, which rest more steadily."""
+"""An axis of two edges is taken where its overlap is below this share of the best face's, by more than this share of
+the smaller box: faces have several points, which rest more steadily."""
 FACE_BIAS = 1e-3
 """A face of the first box is taken unless one of the second has less overlap by this share of the smaller box: between
 aligned boxes rounding would choose, and impulses of the last step would belong to other points."""

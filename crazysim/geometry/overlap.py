@@ -2,8 +2,8 @@
 
 The point of the surface of the Minkowski difference nearest to the origin is on a flat or smooth part, never on an
 edge, because the largest ball inside a convex body touches no edge. It therefore pairs a face of one shape with a
-corner of the other, or an edge of the first shape with an edge or a curved side of the second. Its normal is that of a
-face, or perpendicular to an edge, or, for an ellipsoid, the normal at the point nearest to a corner.
+corner of the other, or an edge of the first shape with an edge or a curved side of the second. Its normal is the
+normal of a face, or perpendicular to an edge, or, for an ellipsoid, the normal at the point nearest to a corner.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 
     The error is below 1e-3 m for shapes of up to a few metres that are separated or overlap slightly. The overlap of
     two boxes is exact, by the 15 normals of the separating axis theorem (Gottschalk 1996). The depth of a deep overlap
-    with another shape is an upper bound, that of the best direction found. The gradient is that of the nearest points;
-    deep inside a curved shape its direction has an error of some hundredths.
+    with another shape is an upper bound, from the best direction found. The gradient follows the nearest points; deep
+    inside a curved shape its direction has an error of some hundredths.
 
     Args:
         a: Box, or the core of a capsule, without its radius.

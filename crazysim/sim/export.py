@@ -34,8 +34,8 @@ class Vector:
     """Layout of a vector: fields of ``SimData``, concatenated, each in row-major order."""
 
     sizes: Mapping[str, int]
-    """Size of each field of one drone, in the order of the vector. The names are paths in ``SimData``; the units are
-    those of the fields."""
+    """Size of each field of one drone, in the order of the vector. The names are paths in ``SimData``; each
+    entry has the unit of its field."""
 
     def __len__(self) -> int:
         return sum(self.sizes.values())
@@ -80,7 +80,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     """Return the step of one drone as a CasADi function.
 
     The step pipeline in ``sim.step_pipeline``, including effects and user stages, is converted to expressions operation
-    by operation, so the result equals that of ``sim.step`` in float64 up to rounding. Everything that is neither state,
+    by operation, so the result equals ``sim.step`` in float64 up to rounding. Everything that is neither state,
     nor command, nor a requested parameter is a constant with its current value for that drone. In a float32 simulation
     the constants have that precision.
 

@@ -141,7 +141,7 @@ def _read_row(x: Array | NDArray, index: int) -> Any:
 
 
 def _replace_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
-    """Return rows with that of one drone or member replaced, on the host if all are there. (n_worlds, n, ...)"""
+    """Return rows with the row of one drone or member replaced, on the host if they are there. (n_worlds, n, ...)"""
     if is_on_host(x) and not isinstance(value, jax.Array):
         rows = np.array(x)
         rows[:, index] = value

@@ -137,7 +137,7 @@ class Sim:
                 sensors of its own, such as ``Kalman([IMU(), OpticalFlow(), TimeOfFlight()])``; None for the true state.
                 Short for its sensors and itself at the head of ``plugins``.
             aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
-                for those of the model alone. Short for ``Residual()`` at the head of ``plugins``.
+                for the model alone. Short for ``Residual()`` at the head of ``plugins``.
             plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. One that begins
                 where the drones are, such as a load, is added when they are in place.
         """
@@ -357,7 +357,7 @@ class Sim:
 
     # Commands ---------------------------------------------------------------------------------------------------------
 
-    # A command moves nothing, so the scene stays as fresh as it was. Arguments and errors of all methods are those of
+    # A command moves nothing, so the scene stays as fresh as it was. All methods have the arguments and errors of
     # ``crazysim.core.functional.state_control``.
 
     @property

@@ -83,8 +83,8 @@ def fill_derivatives(nodes: Floats, durations: Floats) -> Floats:
     """Return the derivatives at all waypoints that minimise the integral of the squared k-th derivative.
 
     Each axis is solved on its own, since different derivatives may be free in each. Times are scaled by the mean
-    duration; a Cholesky factorisation needs no further scaling, as its error does not depend on that of rows and
-    columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
+    duration; a Cholesky factorisation needs no further scaling, as its error does not depend on the scaling of
+    rows and columns (Higham, *Accuracy and Stability of Numerical Algorithms*, section 10.1).
 
     Args:
         nodes: Derivatives 0 to k - 1 at each waypoint, NaN where free. (n_pieces + 1, k, n_axes)

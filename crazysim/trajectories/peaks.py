@@ -98,7 +98,7 @@ def peaks(table: PieceTable, names: Sequence[str]) -> dict[str, Peak]:
     Each piece is sampled at ``N_INTERVALS + 1`` times; every local maximum of the samples that lies at most
     ``REFINED_PART`` of their range below the largest is refined by golden sections. The squares of speed,
     acceleration and jerk are polynomials of degree 12 at most, whose maxima the samples separate, so that the error
-    is that of rounding, about 1e-9 of the value. Body rates can have narrower peaks, where the thrust almost
+    is rounding, about 1e-9 of the value. Body rates can have narrower peaks, where the thrust almost
     vanishes or is almost horizontal; one narrower than an interval may be missed.
 
     Args:

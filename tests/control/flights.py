@@ -46,7 +46,7 @@ def start_at(sim, path):
 def fly(sim, law, path, seconds, memory=None, change=None):
     """Return the states over time, and the setpoints, of one drone under ``law(data, setpoint, memory)``.
 
-    The law runs at every tick of the commands of ``sim``, whose level is that of its output. ``change(data, t)``
+    The law runs at every tick of the commands of ``sim``, whose level is the level of its output. ``change(data, t)``
     changes the data before each tick.
     """
     step, every = sim.build_step_fn(), sim.freq // sim.control_freq

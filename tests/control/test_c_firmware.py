@@ -226,7 +226,7 @@ def test_a_library_that_is_compiled_again_is_another_one_to_the_next_controller(
 
 
 def test_the_example_hands_the_firmware_what_it_expects(tmp_path):
-    """The types are those of stabilizer_types.h of the firmware, the controller a sum of what it receives."""
+    """The types are from stabilizer_types.h of the firmware, the controller a sum of what it receives."""
     for name in ("math3d", "controller_lee", "controller_mellinger", "power_distribution"):
         (tmp_path / f"{name}.h").write_text(STAND_IN if name == "math3d" else '#include "math3d.h"')
     words = [

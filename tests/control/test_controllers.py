@@ -415,7 +415,7 @@ def is_number(x):
 def every_controller(control):
     """Return a simulation with 8 worlds for each controller of a level, and the slope of their climb by the command.
 
-    The slope is that of 10 steps, pulled back step by step through one compiled program.
+    The slope is the slope of 10 steps, pulled back step by step through one compiled program.
     """
     names = LEVELS[control]
     switch = np.repeat(np.arange(len(names)), 8)[:, None]

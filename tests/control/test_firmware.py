@@ -21,7 +21,7 @@ jitted = jax.jit(distribute, static_argnames="whole_numbers")
 
 @pytest.mark.parametrize("name", flown.CASES)
 def test_the_motors_are_those_of_the_firmware(name):
-    """Those of the compiled C sources (docs/guides/controllers.md), whose integers differ by up to 5 PWM from reals.
+    """Results of the compiled C sources (docs/guides/controllers.md), whose integers differ by up to 5 PWM from reals.
 
     Roll, pitch, yaw and motor lose less than one each. Where all motors are lowered by the excess of the highest, the
     difference of two motors counts: twice two of the torques, and less than one.

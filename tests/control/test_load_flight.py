@@ -58,7 +58,7 @@ def test_load_along_a_figure_eight(freq):
 def test_a_load_that_hangs_off_the_centre(target):
     """Of the drone: load or drone come to rest at the setpoint, which a controller without the offset misses.
 
-    With RK4, whose velocities are those of the motion: symplectic Euler's are offset by the impulses of half a step.
+    With RK4, whose velocities match the motion: symplectic Euler's are offset by the impulses of half a step.
     """
     attach, at = np.array([0.05, -0.02, -0.03]), np.array([0.3, 0.2, 1.5])
     with_offset, without = (

@@ -99,7 +99,7 @@ def test_wrong_weights(case):
 
 
 def test_weights_may_be_singular_matrices():
-    """That of the sum of two states, whose least eigenvalue is zero but for rounding."""
+    """A weight of the sum of two states, whose least eigenvalue is zero but for rounding."""
     direction = np.array([0.1, 0.7, 0.3])
     np.testing.assert_array_equal(weight_matrix("Q", np.outer(direction, direction), 3), np.outer(direction, direction))
 

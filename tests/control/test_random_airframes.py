@@ -96,7 +96,7 @@ OTHERS = {
     "indi": {},
     "lqr": {"tilt": 0.35, "rate": 1.0, "speed": 0.5, "away": 0.5, "heading": 0.5},
 }
-"""Throws that other controllers catch, where they differ from those of the default one."""
+"""Throws that other controllers catch, where they differ from the default controller's."""
 
 
 ALL = [pytest.param(name, n, marks=SLOW) for name in OTHERS for n in (4, 5, 6, 8)]

@@ -148,7 +148,7 @@ def test_the_order_of_adding_does_not_matter():
 
 
 def test_a_simulation_is_made_with_plugins_as_if_they_were_added():
-    """``estimator`` and ``aero`` are short for plugins, which come before those of the list."""
+    """``estimator`` and ``aero`` are short for plugins, which come before the listed plugins."""
     wind, battery = Wind((1.0, 0, 0), speed_20ft=7.7), Battery()
     settings = {"engine": "interpret", "drone": "cf21B_500_idsia", "control": "state", "rng_key": 4}
     short = Sim(2, estimator="kalman", aero="identified", plugins=[wind, battery], **settings)

@@ -71,7 +71,7 @@ def test_a_drawn_mass_sinks_or_climbs_by_newtons_law():
     assert not heavier.all()
     np.testing.assert_array_equal(np.asarray(sim.data.states.vel[..., 2]) < 0, heavier)
 
-    # A reset of one world draws new masses there and keeps those of the others.
+    # A reset of one world draws new masses there and keeps the masses of the others.
     sim.reset(np.array([False, True, False]))
     again = np.asarray(sim.data.params.mass, np.float64)
     np.testing.assert_array_equal(again[::2], mass[::2])

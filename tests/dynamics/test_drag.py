@@ -27,7 +27,7 @@ def test_drag_is_r_d_rt_v(quat, vel):
 
 @given(quat=quats, vel=vectors)
 def test_law_08_drag_only_dissipates(quat, vel):
-    """Law 8: its power is between those of the largest and the least coefficient; rounding is 1e-13 of 50 W."""
+    """Law 8: its power is between the powers of the largest and the least coefficient; rounding is 1e-13 of 50 W."""
     power = force(quat / np.linalg.norm(quat), vel, D) @ vel
     assert -0.05 * vel @ vel - 1e-12 <= power <= -0.02 * vel @ vel + 1e-12
 

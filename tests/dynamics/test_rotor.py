@@ -45,7 +45,7 @@ def test_rotors_go_towards_their_command(cmd, rotor_vel):
 
 
 def test_law_07_rotor_acceleration_has_the_gradient_of_one_side_where_rise_turns_into_fall():
-    """At cmd = r the two sides' slopes differ, a + 2 b r; the gradient is that of the falling side, and finite."""
+    """At cmd = r the two sides' slopes differ, a + 2 b r; the gradient is the slope of the falling side, and finite."""
     rotor_vel = jnp.array([0.0, 10e3])
     slope = jax.vmap(jax.grad(lambda c, r: rotor_acceleration(c[None], r[None], LAG)[0]))(rotor_vel, rotor_vel)
     np.testing.assert_allclose(slope, 6.0 + 2 * 3.2e-4 * rotor_vel, rtol=1e-14)

@@ -65,7 +65,7 @@ class Given(PyTree):
 
 
 class Results(PyTree):
-    """Values of the programs, those of floating point and the others."""
+    """Values of the programs: floating point, and other types."""
 
     drone: dict = leaf("drone", 1)
     """Of stages of one drone. (n,)"""
@@ -108,7 +108,7 @@ def flat(g: Given) -> dict:
 
 
 def inputs_of(scope: str) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return shapes and types that a program sees: those of one drone, or of one world."""
+    """Return shapes and types that a program sees, of one drone or of one world."""
     lead = () if scope == "drone" else (N_DRONES,)
     return {
         letter + "".join(map(str, s)): jax.ShapeDtypeStruct((*lead, *s), DTYPES[letter])

@@ -34,7 +34,7 @@ class Program:
     """Expressions, each of which is the next value."""
 
     def values(self, given: dict) -> list:
-        """Return all values: the inputs, and those of the lines."""
+        """Return all values: the inputs, and the results of the lines."""
         values = [given[name] for name in self.inputs]
         for line in self.lines:
             values.append(evaluate(line, values))

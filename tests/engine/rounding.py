@@ -1,7 +1,7 @@
 """When two engines agree: equality, and what rounding explains.
 
 Numbers that were rounded may differ by a few units in the last place: XLA and the host's library approximate functions
-differently, and compilers contract a product and a sum. A larger difference must be that of an ill-conditioned
+differently, and compilers contract a product and a sum. A larger difference must come from an ill-conditioned
 function: computed primitive by primitive, with every result disturbed by a few units in the last place, it must spread
 over both numbers.
 """

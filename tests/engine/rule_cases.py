@@ -239,7 +239,7 @@ def own_gradient(g):
 
 
 def random_bits(key, g):
-    """Bits must be those of JAX's own generator, exactly."""
+    """Bits must equal the bits of JAX's own generator exactly."""
     a, b = jax.random.split(jax.random.fold_in(key, g.i[0]))
     c = jax.random.key(g.i[1])
     bits = [jax.random.bits(a, (5,)), jax.random.bits(c, (2,)), jax.random.key_data(jnp.where(g.x[0] > 0, a, b))]

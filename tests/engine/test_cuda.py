@@ -37,7 +37,7 @@ def source():
 
 
 def test_an_architecture_is_that_of_the_device():
-    """Not that of the first device that was ever asked for."""
+    """Not the architecture of the first device that was requested."""
     assert [cuda.architecture(d) for d in (NEW, OLD, NEW)] == ["compute_90", "compute_86", "compute_90"]
     assert cuda.architecture(None) == cuda.DEFAULT_ARCHITECTURE
     assert jaxcompat.compute_capability(Gpu("12.0")) == 120

@@ -45,7 +45,7 @@ FOUND = {
     "a product of bools": (("b3",), "jnp.outer(v0, v0) @ v0 | (v0 @ v0)"),
     "angles of any size": (("f33",), "jnp.sin(v0) + jnp.cos(v0 * 1e7)"),
     "lgamma of infinity": (("f3",), "lax.lgamma(v0)"),
-    # XLA's threads on a CPU take subnormal numbers for zero; those of NumPy do not by themselves.
+    # XLA's threads on a CPU take subnormal numbers for zero; NumPy's do not by themselves.
     "infinity times a subnormal number": (("f33",), "jnp.sort(jnp.deg2rad(v0), 0) * np.float32(np.inf)"),
     "order of subnormal numbers": (("f4",), "jnp.argsort(v0 * np.float32([0.0, 0.5, -0.5, 1e-8]))"),
     "device_put": (("f3",), "jax.device_put(v0) + 1"),

@@ -1,4 +1,4 @@
-"""Gradients of steps in a kernel: equal to those of the stages as they are written, in whatever way they are used."""
+"""Gradients of steps in a kernel: equal to gradients of the unfused stages, in whatever way they are used."""
 
 import jax
 import jax.numpy as jnp

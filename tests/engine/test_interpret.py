@@ -61,7 +61,7 @@ def test_vmap_is_a_loop(step):
 
 
 def test_outside_of_a_trace_nothing_is_compiled():
-    """Results are those of the callback inside of one, and on the device of the data."""
+    """Results equal the callback of a trace, and are on the device of the data."""
     sim = Sim(n_worlds=2, control="rotor_vel", engine="interpret", device="cpu:1")
     sim.rotor_vel_control(np.full((2, 1, 4), 1.7e4))
     found = sim.step_fn(sim.data, jnp.int32(3))

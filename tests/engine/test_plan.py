@@ -121,7 +121,7 @@ def test_a_bug_in_tracing_is_found_at_planning(sim, monkeypatch):
 
 
 def test_planning_traces_what_the_first_call_runs(sim):
-    """Law 6: the trace of planning is that of the call."""
+    """Law 6: planning and the call share one trace."""
     for n_steps in (jnp.int32(2), 2):
         step = Step(sim.step_pipeline)
         step(sim.data, n_steps)

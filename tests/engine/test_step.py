@@ -222,7 +222,7 @@ def test_a_stage_of_one_drone_or_one_world_fuses_and_an_undeclared_one_splits_th
 
 @pytest.mark.parametrize("n_drones", [1, 3, MAX_UNROLLED_DRONES])
 def test_a_stage_of_one_world_is_in_the_kernel(n_drones):
-    """Worlds that fill a vector, and worlds that do not: its force is that of the stage as it is written."""
+    """Worlds that fill a vector, and worlds that do not: its force equals the force of the stage as it is written."""
     _, data = with_stages(n_drones, separation)
     step = Step({"separation": separation})
     assert step.plan(data).program.fused

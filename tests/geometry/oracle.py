@@ -218,7 +218,7 @@ def check_slopes(a, b, rng, n, deepest=-np.inf):
 def check_finite(a, b, dtype, n):
     """Check that distances and gradients are finite with aligned centres, faces and edges, and far away.
 
-    The number of poses is that of another test, so that nothing is compiled twice; 1,250 of them differ.
+    The number of poses is the same as in another test, so that nothing is compiled twice; 1,250 of them differ.
     """
     size = np.asarray([*b.size, 0.3, 0.3, 0.3])[:3]
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 0.5, 1.0, 1e4]] * 3), axis=-1).reshape(-1, 3)

@@ -23,7 +23,7 @@ def test_convex_pairs(x64, rng, a, b):
 @pytest.mark.parametrize("a, b", PAIRS)
 def test_law_08_gradients_equal_central_differences(x64, rng, a, b):
     by_pos, by_rot = check_slopes(DRONES[a], SHAPES[b], rng, N, deepest=-0.05)
-    # The error of a direction is the square root of that of a distance; on parallel faces any point may be nearest.
+    # A direction's error is the square root of a distance's; on parallel faces any point may be nearest.
     assert np.mean(by_pos > 5e-3) < 0.005
     assert np.mean(by_rot > 5e-3) < 0.02
 

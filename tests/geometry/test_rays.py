@@ -17,7 +17,7 @@ N = 4000
 def judge(kind):
     """Return a compiled function from rays to distances, normals, gradients of the distances, and of both. (N, 3)
 
-    The gradients are those of the sum of distances of rays that hit, and of that and the sum of cubes of the normals.
+    The gradients are of the sum of distances of rays that hit, and of that sum and the sum of cubes of the normals.
     """
 
     def answer(origin, direction):

@@ -93,7 +93,7 @@ def turns():
 
 @pytest.mark.long("compiles two kernels, and switches threads at every line of the engine")
 def test_a_pure_step_computes_with_the_parameters_of_its_own_thread(sim, turns):
-    """Packed numbers and zeros of parameters are kept from call to call: those of other threads are others."""
+    """Packed numbers and zeros of parameters are kept from call to call, and each thread has its own."""
     flying = with_states(sim.data, pos=[0.0, 0.0, 5.0], rotor_vel=15e3, ang_vel=[1.0, 2.0, 3.0])
     lopsided = np.array(flying.params.J_inv)
     lopsided[0, 1] = lopsided[1, 0] = 1e4

@@ -183,7 +183,7 @@ def test_it_is_linear_in_its_coefficients_and_has_their_gradient():
 
 
 def test_float32_keeps_a_minute_of_long_pieces_to_a_hundredth_of_a_millimetre():
-    """Coefficients of seconds would reach 60^7 = 3e12 in size; those of the scaled time are positions."""
+    """Coefficients of seconds would reach 60^7 = 3e12 in size; coefficients of the scaled time are positions."""
     t_end, n = 60.0, 8
     c = np.zeros((1, 4, n))
     c[0, :3, :4] = np.array([0, 0, 3 / t_end**2, -2 / t_end**3]) * np.array([[5.0], [-4.0], [2.0]])

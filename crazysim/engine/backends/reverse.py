@@ -42,7 +42,7 @@ class ReverseProgram:
     carried: tuple[Slot, ...]
     """Numbers that a step begins with, and that steps change."""
     read_back: frozenset[Slot]
-    """Those of them that the way back through a step needs."""
+    """Members of ``carried`` that the way back through a step needs."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
