@@ -47,7 +47,7 @@ from crazysim.control.flatness import MIN_HEADING_SINE, MIN_THRUST
 from crazysim.control.levels import Control
 from crazysim.control.position import PositionMemory, PositionParams, keep_upright, specific_force
 from crazysim.control.priority import prioritized_thrusts
-from crazysim.control.protocol import Controller, DroneData, DroneState
+from crazysim.control.protocol import Controller, DroneData, FlightState
 from crazysim.control.rigid_body_params import RigidBodyParams, rigid_body_params
 from crazysim.control.setpoint import Setpoint
 from crazysim.drones import Airframe
@@ -305,7 +305,7 @@ class Auto(Controller):
         driven = jnp.maximum(driven, 1.0)  # zero would be off
         return jnp.where(on, driven, 0.0), memory.replace(momentum=expected, torque=unknown)
 
-    def _of_command(self, s: DroneState, command: Array, mode: Control) -> tuple[Array | None, Array]:
+    def _of_command(self, s: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
         """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
             return None, command[..., :3]

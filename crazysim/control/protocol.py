@@ -17,7 +17,7 @@ OUTPUTS = (Control.attitude, Control.force_torque, Control.rotor_vel)
 """Levels of the commands that controllers return."""
 
 
-class DroneState(Protocol):
+class FlightState(Protocol):
     """The fields of ``crazysim.core.data.SimState`` that controllers read, of one drone."""
 
     @property
@@ -50,7 +50,7 @@ class DroneData(Protocol):
     """The parts of ``crazysim.core.data.SimData`` that controllers read, of one drone."""
 
     @property
-    def states(self) -> DroneState:
+    def states(self) -> FlightState:
         """State of the drone."""
         ...
 

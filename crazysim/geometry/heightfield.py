@@ -61,7 +61,7 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
 
     For separated shapes the nearest points are a corner of the box and a point of the ground, or a point of the box
     and one on an edge of the ground. The result is exact up to the diagonal of the box, and an upper bound beyond. For
-    overlapping shapes the depth is the larger of the depths of the deepest corner and the deepest edge, which is not the
+    overlapping shapes the depth is the larger of the depths of the deepest corner and edge, which is not the
     shortest translation out of all triangles at once.
 
     Args:

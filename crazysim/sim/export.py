@@ -30,7 +30,7 @@ FEEDFORWARD = "controls.state.staged_feedforward"
 
 
 @dataclasses.dataclass(frozen=True)
-class Vector:
+class VectorLayout:
     """Layout of a vector: fields of ``SimData``, concatenated, each in row-major order."""
 
     sizes: Mapping[str, int]
@@ -61,12 +61,12 @@ class CasadiStep:
 
     function: Any
     """``casadi.Function``: ``x_next = step(x, u)``, or ``step(x, u, p)`` if there are parameters."""
-    x: Vector
+    x: VectorLayout
     """State: position, attitude, velocity, body rates, rotor speeds, internal states of controllers and effects."""
-    u: Vector
+    u: VectorLayout
     """Command, in the order and units of the setter of the command level. The feedforward of a setpoint is its yaw rate
     and zeros, unless ``"controls.state.staged_feedforward"`` is a parameter."""
-    p: Vector
+    p: VectorLayout
     """Requested parameters."""
     dt: float
     """Length of the step, s."""
@@ -143,7 +143,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     x_next = casadi.vertcat(*(then[leaf] for leaf in state))
     return CasadiStep(
         casadi.Function("step", arguments, [x_next], given_parts, ["x_next"]),
-        *(Vector({names[leaf]: sizes[leaf] for leaf in part}) for part in parts.values()),
+        *(VectorLayout({names[leaf]: sizes[leaf] for leaf in part}) for part in parts.values()),
         dt=1 / data.core.freq,
     )
 

@@ -45,7 +45,7 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
     return register
 
 
-class Entry(NamedTuple):
+class TableEntry(NamedTuple):
     """Index of a number in a table: the sum of a computed base and a constant."""
 
     table: Value
@@ -61,7 +61,9 @@ class Entry(NamedTuple):
 class Lowering:
     """Lowers jaxprs into a block of scalar operations."""
 
-    def __init__(self, builder: Builder | None = None, entries: dict[Value, Entry] | None = None, n_members: int = 0):
+    def __init__(
+        self, builder: Builder | None = None, entries: dict[Value, TableEntry] | None = None, n_members: int = 0
+    ):
         """Add operations to a block, to a new one if none is given.
 
         Args:
@@ -136,7 +138,7 @@ class Lowering:
     def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
         """Return a number of a table, whose base is a multiple of four if it is aligned."""
         found = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
-        self.entries[found] = Entry(table, base, offset, aligned)
+        self.entries[found] = TableEntry(table, base, offset, aligned)
         return found
 
     def finish(self, outputs: Sequence[Elements]) -> Block:

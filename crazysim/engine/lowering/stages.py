@@ -15,7 +15,7 @@ from crazysim.core.stage import PHASES, Axes, Phase, Stage, is_first_step
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
 from crazysim.engine.ir.program import TABLE_INDEX, Leaf, Program, Segment, Slot, UnfusedStage, Zeros
-from crazysim.engine.lowering.jaxprs import Elements, Entry, Lowering, as_elements, inputs, scalars
+from crazysim.engine.lowering.jaxprs import Elements, Lowering, TableEntry, as_elements, inputs, scalars
 from crazysim.engine.lowering.relative import RelativeAxes, view_leaves
 from crazysim.engine.lowering.tracing import TracedStage, Tracer
 from crazysim.jaxcompat import equations, is_key
@@ -162,7 +162,7 @@ def _table(lowering: Lowering, elements: Elements) -> Value:
     items = elements.reshape(-1)
     table = lowering.builder.input(items[0].dtype, len(items))
     zero = constant(0, np.int32)
-    lowering.entries.update((x, Entry(table, zero, k)) for k, x in enumerate(items) if isinstance(x, Value))
+    lowering.entries.update((x, TableEntry(table, zero, k)) for k, x in enumerate(items) if isinstance(x, Value))
     return table
 
 

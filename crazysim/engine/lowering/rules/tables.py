@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crazysim.engine.ir.blocks import Element, TableEntries, Value, constant, is_constant
-from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Entry, Lowering, as_elements
+from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Lowering, TableEntry, as_elements
 
 MAX_SELECTED = 4
 """Most elements from which an entry of a shared array is selected: its numbers are in registers already."""
@@ -17,11 +17,11 @@ MAX_SELECTED_CONSTANTS = 8
 ZERO = constant(0, np.int32)
 
 
-class Table:
+class TableView:
     """An array whose elements are entries of a table in memory, each at a computed base plus a constant offset."""
 
-    def __init__(self, ctx: Lowering, entry: Entry, offsets: np.ndarray, strides: dict[int, int]):
-        """Describe where the elements stand.
+    def __init__(self, ctx: Lowering, entry: TableEntry, offsets: np.ndarray, strides: dict[int, int]):
+        """Describe where the elements are stored.
 
         Args:
             ctx: The lowering.
@@ -57,7 +57,7 @@ class Table:
         return as_elements(found, offsets.shape)
 
 
-def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> Table | None:
+def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> TableView | None:
     """Return an array as a table in which an index along some axes moves all entries alike, or None.
 
     Args:
@@ -79,17 +79,17 @@ def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) 
         return None
     offsets = np.array([p.offset for p in locations if p is not None]).reshape(x.shape)
     strides = _strides(offsets, axes)
-    return None if strides is None else Table(ctx, first, offsets, strides)
+    return None if strides is None else TableView(ctx, first, offsets, strides)
 
 
-def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Table | None:
+def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> TableView | None:
     """Return an array of constants as a table. Entries that are equal at all indices stay constants."""
     numbers = np.array([item.item() for item in x.reshape(-1)], x.reshape(-1)[0].dtype)
     if not np.all(np.isfinite(numbers)):
         return None
     offsets = np.arange(x.size).reshape(x.shape)
     (value,) = ctx.builder.add_many("table", (), (numbers.dtype,), (("numbers", TableEntries(numbers)),))
-    table = Table(ctx, Entry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
+    table = TableView(ctx, TableEntry(value, ZERO, 0), offsets, _strides(offsets, axes) or {})
     first = tuple([slice(0, 1) if axis in axes else slice(None) for axis in range(x.ndim)])
     bits = numbers.view(f"u{numbers.itemsize}").reshape(x.shape)
     same = np.all(bits == bits[first], tuple(axes), keepdims=True)
