@@ -1,123 +1,303 @@
-"""Training results: several seeds per task, evaluated on held-out initial states, with wall time.
+"""Training results: several seeds per task, evaluated on 1,000 held-out initial states, and the table of the page.
 
-    python benchmarks/train.py [--device gpu] [--tasks hover recover track race] [--seeds 0 1 2 3 4] [--out out/train]
-                               [--parallel 1]
+    python benchmarks/train.py [--tasks hover track] [--seeds 0 1 2 3 4] [--device gpu] [--parallel 12] [--plot FILE]
+    python benchmarks/train.py --all --seeds $(seq 201 220) --device gpu --parallel 12 --write
+    python benchmarks/train.py --check --device gpu --parallel 12
+    python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
-Each training runs in its own process, like ``crazysim train``, so its time includes imports, building, compilation and
-evaluation. One JSON line each, and one with the success of all seeds of a task and its quantiles; ``--plot FILE`` plots
-all learning curves. ``--parallel 12`` runs twelve trainings at a time, which changes their times alone.
+Each training runs in its own process, ``crazysim train TASK``, so its time includes imports, building, compilation and
+evaluation. A JSON line for each run, as it ends, and one for each task, with medians over its seeds. All tasks are
+trained with the first seed, then all with the next one: the first runs compile, the others load their programs.
+
+Finished runs are kept in one file, ``results.jsonl`` of the folder ``--out``, and are not trained again while the
+sources of the package are the same: an interrupted command continues where it was, also on another machine that is
+given this file. A failed training is reported at the end, and the others go on.
+
+``--write`` puts the rows of the tasks of which all seeds are finished into the committed table,
+docs/concepts/training-results.json, and into the page beside it. ``--check`` trains one seed of each task, and fails
+where its success is below the table's least by more than two standard errors of 1,000 starts. Arguments after ``--``
+are passed to ``crazysim train``.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
+import hashlib
+import json
+import os
 import re
+import shutil
+import statistics
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import digits, report
+from measure import digits, machine, run_in_process
 
+import crazysim
+from crazysim.envs.registry import TASKS, entry_of
 from crazysim.train.show import read_curve
-from crazysim.train.training import kept_point
+from crazysim.train.training import kept_point, least_kept_success, stored_config
+
+PACKAGE = Path(crazysim.__file__).parent
+TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json"
+"""The committed table, a row for each task."""
+PAGE = TABLE.with_suffix(".md")
+"""The page that shows the table, between two comments."""
+BEGIN, END = "<!-- table of benchmarks/train.py -->", "<!-- end of the table -->"
+STARTS = 1000
+"""Held-out starts of an evaluation of ``crazysim train``."""
+SHOWN = ("task", "seed", "success", "crashed", "error", "seconds")
+"""Entries of a result that are printed."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--tasks", nargs="+", default=["hover", "recover", "track", "race"])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--tasks", nargs="+", help="tasks; by default hover, recover, track and race, or all to check")
+    parser.add_argument("--all", action="store_true", help="train all built-in tasks")
+    parser.add_argument("--seeds", type=int, nargs="+", help="by default 0 to 4, or 0 to check")
     parser.add_argument("--out", type=Path, default=Path("out/train"), help="folder of the runs")
     parser.add_argument("--parallel", type=int, default=1, help="trainings that run at a time")
     parser.add_argument("--plot", type=Path, help="image of the learning curves")
-    parser.add_argument("--only-plot", action="store_true", help="plot and summarise existing runs without training")
-    args = parser.parse_args()
-    folders = {key: folder_of(args.out, *key, args.device) for key in itertools.product(args.tasks, args.seeds)}
+    parser.add_argument("--only-plot", action="store_true", help="plot, summarise and write finished runs; train none")
+    parser.add_argument("--keep", action="store_true", help="use finished runs of other sources of the package too")
+    parser.add_argument("--commit", default=commit(), help="name of the sources in the table; by default %(default)s")
+    mode = parser.add_mutually_exclusive_group()
+    mode.add_argument("--write", action="store_true", help="write the committed table and the page")
+    mode.add_argument("--check", action="store_true", help="compare with the committed table")
+    at = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    args, arguments = parser.parse_args(sys.argv[1:at]), sys.argv[at + 1 :]
+    if arguments and (args.write or args.check):
+        parser.error("expected no arguments of the training with --write or --check: the table is of the recipes")
+    tasks = args.tasks or (list(TASKS) if args.all or args.check else ["hover", "recover", "track", "race"])
+    seeds = args.seeds or ([0] if args.check else [0, 1, 2, 3, 4])
+
+    store, source = args.out / "results.jsonl", sources()
+    wanted = [(task, seed, args.device, *arguments) for seed in seeds for task in tasks]
+    results = {key: x for key, x in read(store).items() if key in wanted and (args.keep or x["sources"] == source)}
+    failures = []
     if not args.only_plot:
-        with ThreadPoolExecutor(args.parallel) as pool:
-            for run in [pool.submit(train, *key, folder, args.device) for key, folder in folders.items()]:
-                run.result()
-    curves = {task: [read_curve(folders[task, seed]) for seed in args.seeds] for task in args.tasks}
-    for task in args.tasks:
-        summary(task, curves[task], args.device, args.parallel)
+        missing = [key for key in wanted if key not in results]
+        print(json.dumps({"finished": len(results), "to_train": len(missing)}), flush=True)
+        about = {"sources": source, "commit": args.commit, "parallel": args.parallel}
+        if missing:
+            about |= run_in_process(machine, args.device)  # in this process it would hold memory of the device
+            cores = f"{about['cores']} cores of {about['processor']}"
+            about["machine"] = cores if about["device"] == "cpu" else about["device"]
+        failures = train_all(missing, args.out, store, about, results)
+
+    finished = {task: [results[key] for key in wanted if key[0] == task and key in results] for task in tasks}
+    rows = [row_of(runs) for runs in finished.values() if runs]
+    for row in rows:
+        print(json.dumps(row), flush=True)
     if args.plot is not None:
-        plot(curves, args.plot)
+        plot({task: runs for task, runs in finished.items() if runs}, args.plot)
+    if args.write:
+        write([row for row in rows if len(row["seeds"]) == len(seeds)])
+    if args.check:
+        failures += check([run for runs in finished.values() for run in runs])
+    if failures:
+        raise SystemExit("\n".join(failures))
 
 
-def folder_of(out: Path, task: str, seed: int, device: str) -> Path:
+def sources() -> str:
+    """Return a hash of the sources of the package, by which finished runs of others are told."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml", ".xml")):
+        digest.update(str(path.relative_to(PACKAGE)).encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def commit() -> str:
+    """Return the commit of the sources, with a + if the package has changed since; without Git, the version."""
+    git = ["git", "-C", str(PACKAGE)]
+    found = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    if found.returncode:
+        return crazysim.__version__
+    changed = subprocess.run([*git, "status", "--porcelain", "--", "."], capture_output=True, text=True).stdout
+    return found.stdout.strip() + "+" * bool(changed)
+
+
+def read(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Return the results in a file by task, seed, device and arguments, the last of each."""
+    results = [json.loads(line) for line in store.read_text().splitlines()] if store.exists() else []
+    return {(x["task"], x["seed"], x["on"], *x["arguments"]): x for x in results}
+
+
+def train_all(
+    missing: list[tuple[Any, ...]], out: Path, store: Path, about: dict[str, Any], results: dict[Any, dict[str, Any]]
+) -> list[str]:
+    """Train, add what ends well to the results and their file, and return what went wrong."""
+    failures = []
+    out.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(about["parallel"]) as pool:
+        runs = {pool.submit(train, *key, out=out, shared=about["parallel"] > 1): key for key in missing}
+        try:
+            for run in as_completed(runs):
+                task, seed, device, *arguments = key = runs[run]
+                try:
+                    result = {"task": task, "seed": seed, "on": device, "arguments": arguments} | run.result() | about
+                except RuntimeError as error:
+                    failures.append(f"{task}: training with seed {seed} failed")
+                    print(json.dumps({"task": task, "seed": seed, "failed": str(error)}), flush=True)
+                    continue
+                with store.open("a") as file:
+                    file.write(json.dumps(result) + "\n")
+                results[key] = result
+                print(json.dumps({name: result[name] for name in SHOWN}), flush=True)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return failures
+
+
+def folder_of(out: Path, task: str, seed: int, device: str, *arguments: str) -> Path:
     """Return the folder of a run, which is in ``out`` whatever the place of the task, such as ``../task.py:NAME``."""
-    return out / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', task)}-{device}-{seed}"
+    return out / re.sub(r"[^A-Za-z0-9_.-]+", "_", "-".join([task, device, str(seed), *arguments]))
 
 
-def plot(curves: dict[str, list[Any]], path: Path) -> None:
+def train(task: str, seed: int, device: str, *arguments: str, out: Path, shared: bool) -> dict[str, Any]:
+    """Train in a new process and return the results.
+
+    Args:
+        task: Name of the task.
+        seed: Random seed.
+        device: Device of the training.
+        arguments: Further arguments of ``crazysim train``.
+        out: Folder of the runs.
+        shared: True if other trainings run on the device at the same time.
+
+    Raises:
+        RuntimeError: If the training fails, with the end of its output.
+    """
+    folder = folder_of(out, task, seed, device, *arguments)
+    shutil.rmtree(folder, ignore_errors=True)  # of a training that was interrupted
+    command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seed", str(seed), "--out", str(folder)]
+    # By default each process would take three quarters of the memory of a GPU.
+    environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if shared else {}) | os.environ
+    # The same package as here, whatever the folder in which this runs.
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    log, begin = folder.with_name(f"{folder.name}.log"), time.perf_counter()
+    with log.open("w") as file:
+        done = subprocess.run(
+            [*command, "--no-film", "--device", device, *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        )
+    wall_s = time.perf_counter() - begin
+    if done.returncode:
+        last = (log.read_text().strip().splitlines() or ["no output"])[-1]
+        raise RuntimeError(f"status {done.returncode}, {last} (see {log})")
+    curve = read_curve(folder)
+    point, last = kept_point(curve), curve[-1]
+    solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
+    return {
+        "algorithm": stored_config(folder).algorithm,
+        "success": round(point["success"], 4),
+        "crashed": round(point["crashed"], 4),
+        "error": digits(point["error"]) if point["error"] == point["error"] else None,
+        "kept_iteration": point["iteration"],
+        "env_steps": last["env_steps"],
+        "seconds": digits(last["seconds"]),
+        "compile_seconds": digits(last["compile_seconds"]),
+        "seconds_to_95_percent": None if solved is None else digits(solved),
+        "wall_s": digits(wall_s),
+        "curve": [[digits(p["seconds"]), round(p["success"], 4)] for p in curve],
+    }
+
+
+def row_of(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the row of a task: quantiles of the success over its seeds, and medians of error and time."""
+    success = [run["success"] for run in runs]
+    errors = [run["error"] for run in runs if run["error"] is not None]
+    row: dict[str, Any] = {name: runs[-1][name] for name in ("task", "algorithm", "env_steps")}
+    row |= {
+        "seeds": sorted(run["seed"] for run in runs),
+        "least": min(success),
+        "tenth": round(float(np.quantile(success, 0.1)), 4),
+        "median": round(statistics.median(success), 4),
+        "error": digits(statistics.median(errors)) if errors else None,
+        "unit": entry_of(runs[0]["task"]).task.unit,
+        "seconds": digits(statistics.median(run["seconds"] for run in runs)),
+    }
+    row["parallel"] = max(run["parallel"] for run in runs)
+    return row | {name: ", ".join(sorted({run[name] for run in runs})) for name in ("commit", "date", "machine", "jax")}
+
+
+def write(rows: list[dict[str, Any]]) -> None:
+    """Put rows into the committed table, and the table into the page."""
+    known = {row["task"]: row for row in [*json.loads(TABLE.read_text()), *rows]}
+    rows = [known[task] for task in [*TASKS, *sorted(known.keys() - TASKS)] if task in known]
+    TABLE.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+    page = PAGE.read_text()
+    before, after = page[: page.index(BEGIN)], page[page.index(END) :]
+    PAGE.write_text(f"{before}{BEGIN}\n\n{markdown(rows)}\n\n{after}")
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """Return the table as the page shows it."""
+    names = {"ppo": "PPO", "apg": "analytic gradients"}
+    lines = [
+        "| Task | Algorithm, environment steps | Seeds | Least | Median | Mean error | Time | Commit, date | Machine |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        seeds = row["seeds"]
+        joined = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
+        cells = (
+            f"`{row['task']}`",
+            f"{names[row['algorithm']]}, {row['env_steps'] / 1e6:.2g} M",
+            f"{seeds[0]} to {seeds[-1]}" if joined else ", ".join(map(str, seeds)),
+            f"{row['least']:.1%}",
+            f"{row['median']:.1%}",
+            "" if row["error"] is None else f"{digits(row['error'], 2):g} {row['unit']}",
+            f"{digits(row['seconds'], 2):g} s" + (f", {row['parallel']} at a time" if row["parallel"] != 1 else ""),
+            f"{row['commit']}, {row['date']}",
+            f"{row['machine']}, jax {row['jax']}",
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def check(runs: list[dict[str, Any]]) -> list[str]:
+    """Return a message for each run whose success is below the table's least by more than two standard errors."""
+    least = {row["task"]: row["least"] for row in json.loads(TABLE.read_text())}
+    failures = []
+    for run in runs:
+        task, success = run["task"], run["success"]
+        if task not in least:
+            failures.append(f"{task} has no row in {TABLE.name} to compare with. Add it with --tasks {task} --write.")
+        elif success < least_kept_success(least[task], STARTS):
+            failures.append(
+                f"{task}: expected at least {least[task]:.1%} as in {TABLE.name}, got {success:.1%} with seed "
+                f"{run['seed']}, lower by more than two standard errors of {STARTS:,} starts."
+            )
+    return failures
+
+
+def plot(runs: dict[str, list[dict[str, Any]]], path: Path) -> None:
     """Plot success over time, with a panel for each task and a line for each seed."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(curves), figsize=(3.2 * len(curves), 2.8), sharey=True, layout="constrained")
-    for axis, (task, seeds) in zip(np.atleast_1d(axes), curves.items(), strict=True):
-        for curve in seeds:
-            axis.plot([p["seconds"] for p in curve], [100 * p["success"] for p in curve], marker=".")
+    figure, axes = plt.subplots(1, len(runs), figsize=(3.2 * len(runs), 2.8), sharey=True, layout="constrained")
+    for axis, (task, seeds) in zip(np.atleast_1d(axes), runs.items(), strict=True):
+        for run in seeds:
+            seconds, success = np.array(run["curve"]).T
+            axis.plot(seconds, 100 * success, marker=".")
         axis.set(title=task, xlabel="time with compilation, s", ylim=(-3, 103))
         axis.grid(alpha=0.3)
     np.atleast_1d(axes)[0].set_ylabel("held-out starts that succeed, %")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
-
-
-def train(task: str, seed: int, folder: Path, device: str) -> None:
-    """Train in a new process and print the results."""
-    command = [sys.executable, "-m", "crazysim", "train", task, "--seed", str(seed), "--out", str(folder), "--no-film"]
-    begin = time.perf_counter()
-    done = subprocess.run([*command, "--device", device], capture_output=True, text=True)
-    wall_s = time.perf_counter() - begin
-    if done.returncode:
-        raise SystemExit(f"training {task} failed: {done.stderr[-2000:]}")
-    curve = read_curve(folder)
-    point, last = kept_point(curve), curve[-1]
-    solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
-    report(
-        device,
-        benchmark="train",
-        task=task,
-        seed=seed,
-        success=round(point["success"], 4),
-        crashed=round(point["crashed"], 4),
-        error=digits(point["error"]) if point["error"] == point["error"] else None,
-        kept_iteration=point["iteration"],
-        env_steps=last["env_steps"],
-        seconds=digits(last["seconds"]),
-        compile_seconds=digits(last["compile_seconds"]),
-        seconds_to_95_percent=None if solved is None else digits(solved),
-        wall_s=digits(wall_s),
-    )
-
-
-def summary(task: str, curves: list[Any], device: str, parallel: int) -> None:
-    """Print the success of all seeds of a task, sorted, with quantiles, and medians of error and time."""
-    points = [kept_point(curve) for curve in curves]
-    success = sorted(round(point["success"], 4) for point in points)
-    shares = (0, 0.1, 0.25, 0.5, 1)
-    error = np.nanquantile([point["error"] for point in points], shares)
-    report(
-        device,
-        benchmark="train_seeds",
-        task=task,
-        parallel=parallel,
-        success=success,
-        quantiles=shares,
-        success_quantiles=np.quantile(success, shares).round(4).tolist(),
-        error_quantiles=[digits(float(x)) for x in error],
-        seconds=digits(float(np.median([curve[-1]["seconds"] for curve in curves]))),
-        env_steps=curves[0][-1]["env_steps"],
-    )
 
 
 if __name__ == "__main__":

@@ -209,7 +209,9 @@ def test_a_loop_of_commands_steps_and_reads_is_timed(benchmarks):
         loop.require_flying()
 
 
-@pytest.mark.parametrize("script", ["step.py", "compile.py", "scaling.py", "limits.py", "versus_crazyflow.py"])
+@pytest.mark.parametrize(
+    "script", ["step.py", "compile.py", "scaling.py", "limits.py", "train.py", "versus_crazyflow.py"]
+)
 def test_every_script_explains_itself(script, run, capsys):
     with pytest.raises(SystemExit) as end:
         run(script, "--help")
@@ -217,25 +219,101 @@ def test_every_script_explains_itself(script, run, capsys):
     assert "--device" in capsys.readouterr().out
 
 
-def test_learning_curves_of_several_seeds_are_drawn_and_summarised(run, tmp_path):
-    """The figures are those of the kept policies."""
+def finished(train, out, successes, **changes):
+    """Write the results of trainings of hover that ended with these successes."""
+    out.mkdir(exist_ok=True)
+    for seed, success in enumerate(successes):
+        result = {
+            "task": "hover", "seed": seed, "on": "cpu", "arguments": [], "algorithm": "ppo", "success": success,
+            "crashed": 0.0, "error": 0.01 * (1 + seed), "env_steps": 2_600_000, "seconds": 20.0 + seed,
+            "curve": [[5.0, 0.5], [9.0, success]], "sources": train.sources(), "commit": "abc1234", "parallel": 1,
+            "date": "2026-11-26", "machine": "a machine", "jax": "0.10.1",
+        }  # fmt: skip
+        with (out / "results.jsonl").open("a") as file:
+            file.write(json.dumps(result | changes) + "\n")
+
+
+@pytest.fixture
+def train(benchmarks, monkeypatch, tmp_path):
+    """Return the script of trainings, whose committed table and page are copies here, the table without rows."""
+    train = importlib.import_module("train")
+    page = tmp_path / train.PAGE.name
+    page.write_text(train.PAGE.read_text())
+    (tmp_path / train.TABLE.name).write_text("[]")
+    monkeypatch.setattr(train, "PAGE", page)
+    monkeypatch.setattr(train, "TABLE", tmp_path / train.TABLE.name)
+    return train
+
+
+def test_learning_curves_of_several_seeds_are_drawn_and_summarised(run, train, tmp_path):
     plt = pytest.importorskip("matplotlib.pyplot")
-    for seed, success in enumerate((0.0, 1.0)):
-        folder = tmp_path / f"hover-cpu-{seed}"
-        folder.mkdir()
-        first = {"seconds": 5.0, "success": 0.5, "error": 0.2, "env_steps": 10, "kept": True}
-        curve = [first, first | {"seconds": 9.0, "success": success, "env_steps": 20, "kept": success > 0.5}]
-        (folder / "curve.json").write_text(json.dumps(curve))
+    finished(train, tmp_path, (0.5, 1.0))
     picture = tmp_path / "curves.png"
-    (line,) = run(
-        "train.py", "--only-plot", "--tasks", "hover", "--seeds", "0", "1", "--out", tmp_path, "--plot", picture
-    )
-    assert line["success"] == [0.5, 1.0]
-    np.testing.assert_allclose(line["success_quantiles"], [0.5, 0.55, 0.625, 0.75, 1.0])
-    assert line["env_steps"] == 20
+    (line,) = run("train.py", "--only-plot", "--tasks", "hover", "--out", tmp_path, "--plot", picture)
+    assert (line["seeds"], line["least"], line["median"], line["seconds"]) == ([0, 1], 0.5, 0.75, 20.5)
+    assert (line["tenth"], line["error"]) == (0.55, 0.015)
     pixels = (plt.imread(picture)[..., :3].reshape(-1, 3) * 255).round()
     for color in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two, a line for each seed; smoothed
         assert (np.abs(pixels - color).max(axis=-1) < 40).sum() > 20, color
+
+
+def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp_path):
+    """The page shows the same; rows of other tasks stay, in the order of the tasks."""
+    other = {"task": "track", "algorithm": "apg", "env_steps": 256_000, "seeds": [3, 7], "least": 1.0, "tenth": 1.0,
+             "median": 1.0, "error": None, "unit": "m", "seconds": 5.0, "parallel": 12, "commit": "0000000",
+             "date": "2026-11-25", "machine": "another", "jax": "0.11.2"}  # fmt: skip
+    train.TABLE.write_text(json.dumps([other]))
+    finished(train, tmp_path, (0.99, 1.0, 0.995))
+    before = train.PAGE.read_text()
+    run("train.py", "--only-plot", "--tasks", "hover", "--seeds", 0, 1, 2, 3, "--out", tmp_path, "--write")
+    assert json.loads(train.TABLE.read_text()) == [other]
+    (row,) = run("train.py", "--tasks", "hover", "--seeds", 0, 1, 2, "--out", tmp_path, "--write")[1:]
+    assert json.loads(train.TABLE.read_text()) == [row, other]
+    page, end = train.PAGE.read_text(), train.END
+    assert "| `hover` | PPO, 2.6 M | 0 to 2 | 99.0% | 99.5% | 0.02 m | 21 s | abc1234, 2026-11-26 | a machine" in page
+    assert "| `track` | analytic gradients, 0.26 M | 3, 7 | 100.0% | 100.0% |  | 5 s, 12 at a time | 0000000" in page
+    assert page[page.index(end) :] == before[before.index(end) :]
+    assert page[: page.index(train.BEGIN)] == before[: before.index(train.BEGIN)]
+
+
+def test_a_check_fails_below_the_table_by_more_than_two_standard_errors(run, train, tmp_path, capsys):
+    """Of 1,000 starts at 99% these are 0.69 percentage points, with two more successes and failures."""
+    table = [{"task": "hover", "least": 0.99}]
+    train.TABLE.write_text(json.dumps(table))
+    check = ("train.py", "--check", "--tasks", "hover")
+    finished(train, tmp_path / "good", [0.984])
+    run(*check, "--out", tmp_path / "good")
+    finished(train, tmp_path / "bad", [0.983])
+    with pytest.raises(SystemExit, match=r"hover: expected at least 99\.0% .*, got 98\.3% with seed 0"):
+        run(*check, "--out", tmp_path / "bad")
+    train.TABLE.write_text("[]")
+    with pytest.raises(SystemExit, match=r"hover has no row in training-results\.json.*--write"):
+        run(*check, "--out", tmp_path / "good")
+    capsys.readouterr()
+    finished(train, tmp_path / "old", [1.0], sources="others")
+    assert run("train.py", "--only-plot", "--tasks", "hover", "--seeds", 0, "--out", tmp_path / "old") == []
+    (kept,) = run("train.py", "--only-plot", "--keep", "--tasks", "hover", "--seeds", 0, "--out", tmp_path / "old")
+    assert kept["least"] == 1.0
+
+
+def test_the_page_shows_the_committed_table(benchmarks):
+    train = importlib.import_module("train")
+    shown = train.PAGE.read_text().partition(train.BEGIN)[2].partition(train.END)[0]
+    assert shown.strip() == train.markdown(json.loads(train.TABLE.read_text()))
+
+
+@pytest.mark.long("trains in a process of its own")
+def test_a_training_that_fails_leaves_the_others_which_are_not_trained_again(run, train, tmp_path, capsys):
+    options = ("--seeds", "0", "--parallel", "2", "--out", tmp_path, "--")
+    small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "--config", "n_steps=4", "hidden=[8]")
+    with pytest.raises(SystemExit, match=r"^nothing: training with seed 0 failed$"):
+        run("train.py", "--tasks", "nothing", "hover", *options, *small)
+    count, *lines = lines_of(capsys.readouterr().out)
+    assert count == {"finished": 0, "to_train": 2}
+    assert any("task 'nothing' does not exist" in line.get("failed", "") for line in lines)
+    assert lines[-1]["env_steps"] == 8
+    again = run("train.py", "--tasks", "hover", *options, *small)
+    assert again == [{"finished": 1, "to_train": 0}, lines[-1]]
 
 
 def test_mppi_prints_the_rate_of_commands(run):
@@ -310,6 +388,8 @@ def test_the_runs_of_any_task_are_below_the_folder_that_was_named(benchmarks, tm
     train = importlib.import_module("train")
     places = ["hover", "tasks/mine.py:Mine", "../mine.py:Mine", f"{tmp_path}/mine.py:Mine"]
     folders = [train.folder_of(tmp_path / "out", place, 0, "cpu") for place in places]
+    others = train.folder_of(tmp_path / "out", "hover", 0, "cpu", "--set", "drone=a/b.toml")
+    assert others.parent == folders[0].parent
     assert folders[0] == tmp_path / "out" / "hover-cpu-0"
     assert {folder.resolve().parent for folder in folders} == {tmp_path / "out"}
     assert len(set(folders)) == len(places)
