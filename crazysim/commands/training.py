@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from crazysim.commands.options import DefaultsFormatter, given_options
 from crazysim.storage import PICTURES, check_writable
@@ -28,6 +29,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--out", type=Path, help="folder of the run; by default out/TASK")
     resume = "continue from the checkpoint in that folder, with its settings where none are given"
     add("--resume", action="store_true", help=resume)
+    every = "write a checkpoint every so many seconds, besides those of the evaluations"
+    add("--checkpoint-every", type=float, metavar="SECONDS", help=every)
     add("--device", help="device: cpu, gpu; by default cpu")
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="options of the task and the simulation")
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
@@ -89,17 +92,28 @@ def train(options: argparse.Namespace) -> None:
         return
     from crazysim.train.runs import run
 
-    run(
-        options.task,
-        options.out,
-        resume=options.resume,
-        film=not options.no_film,
-        algorithm=options.algorithm,
-        seed=options.seed,
-        n_worlds=options.worlds,
-        options=_pairs(options.set) | given_options(options, "device"),
-        config=_pairs(options.config) | given_options(options, "iterations"),
-    )
+    before = signal.signal(signal.SIGTERM, _exit)
+    try:
+        run(
+            options.task,
+            options.out,
+            resume=options.resume,
+            film=not options.no_film,
+            checkpoint_every=options.checkpoint_every,
+            algorithm=options.algorithm,
+            seed=options.seed,
+            n_worlds=options.worlds,
+            options=_pairs(options.set) | given_options(options, "device"),
+            config=_pairs(options.config) | given_options(options, "iterations"),
+        )
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _exit(*_: object) -> NoReturn:
+    """End the process as a signal that terminates it does, after a training has written its checkpoint."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent again, it would interrupt the writing
+    raise SystemExit(128 + signal.SIGTERM)
 
 
 def evaluate(options: argparse.Namespace) -> None:

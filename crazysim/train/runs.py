@@ -26,13 +26,14 @@ def run(
     evaluation_worlds: int = 1000,
     log: Callable[[str], None] = print,
     progress: bool = True,
+    checkpoint_every: float | None = None,
     **settings: Any,
 ) -> TrainResult:
     """Train a policy, evaluate it, plot the training and an episode, and film it, as ``crazysim train`` does.
 
     The folder then has ``checkpoint.npz``, ``policy.npz``, ``curve.json``, ``curve.png``, ``episode.png`` and
     ``policy.mp4``. Where matplotlib, the encoder or OpenGL is missing, the pictures are left out, with a line that says
-    so. An interrupt (Ctrl-C) writes a checkpoint first.
+    so. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` that a handler of a signal raises.
 
     Args:
         task: Name of a task, the place of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such as
@@ -43,13 +44,14 @@ def run(
         evaluation_worlds: Number of held-out initial states of each evaluation.
         log: Function that is called with each line of output.
         progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
+        checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         settings: ``algorithm``, ``seed``, ``n_worlds``, ``options`` and ``config`` of ``TrainConfig.create``.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has other settings than those that
             may change or is damaged; if a setting is invalid; if files cannot be written.
         DivergedError: If weights or losses become non-finite; the last checkpoint stays.
-        KeyboardInterrupt: After the checkpoint of an interrupted run has been written.
+        KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
     if unknown := settings.keys() - SETTINGS:
         raise ConfigError(
@@ -60,7 +62,7 @@ def run(
     folder = Path("out") / config.title if folder is None else Path(folder)
     if resume:
         config = TrainConfig.create(task, **settings, resumed=stored_config(folder))
-    result = train(config, folder, resume, evaluation_worlds, log, progress)
+    result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every)
     log(f"wrote {folder / CHECKPOINT}, {folder / POLICY}")
     try:
         plot_curve({config.title: read_curve(folder)}, folder / "curve.png")

@@ -31,6 +31,7 @@ from crazysim.envs.wrappers import AutoReset
 from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.storage import replacing
+from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, recipe_of
 from crazysim.train.evaluation import evaluate, outcome
@@ -69,14 +70,15 @@ def train(
     evaluation_worlds: int = 1000,
     log: Callable[[str], None] = print,
     progress: bool = True,
+    checkpoint_every: float | None = None,
 ) -> TrainResult:
     """Train a policy and write checkpoint, learning curve and policy into a folder.
 
     Every evaluation flies two sets of initial states that are not trained on. The success on the check set decides
     which policy is kept; the held-out set gives the figures, and decides nothing.
 
-    An interrupt (Ctrl-C) writes a checkpoint first. A resumed run is bit for bit the same as an uninterrupted one on
-    the same machine.
+    Each evaluation writes a checkpoint. So does an interrupt (Ctrl-C), or a ``SystemExit`` that a handler of a signal
+    raises, before it is passed on. A resumed run is bit for bit the same as an uninterrupted one on the same machine.
 
     Args:
         config: Configuration of the run.
@@ -85,19 +87,22 @@ def train(
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
         log: Function that is called with each line of output.
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
+        checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
             damaged; if files cannot be written.
         DivergedError: If weights or losses become non-finite; the last checkpoint stays.
-        KeyboardInterrupt: After the checkpoint of an interrupted run has been written.
+        KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
     folder = Path(folder)
     path = folder / CHECKPOINT
     started = time.perf_counter()
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
+    if checkpoint_every is not None:
+        checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)
     meta = _meta(config)
-    stored, curve, code = _read_run(path, config) if resume else ({}, [], meta["code"])
+    stored, curve, code, seconds_before = _read_run(path, config) if resume else ({}, [], meta["code"], 0.0)
     check_key = jax.random.key(CHECK_SEED)
     if path.exists() and not resume:
         raise ConfigError(
@@ -142,7 +147,8 @@ def train(
         evaluating = pool.submit(compile_evaluation)
         (learner, kept), description = starting.result(), evaluating.result()
         iterate, compile_s = compiling.result()
-    done, seconds_before = int(learner.iteration), curve[-1]["seconds"] if curve else 0.0
+    done = saved = int(learner.iteration)
+    saved_at = time.perf_counter()
     steps_per_iteration = config.n_worlds * base.sim.n_drones * hyperparameters.n_steps
     log(
         f"{config.title} by {config.algorithm}, seed {config.seed}: {hyperparameters.iterations} iterations of "
@@ -154,6 +160,15 @@ def train(
     if done >= hyperparameters.iterations:
         log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
 
+    def seconds() -> float:
+        return seconds_before + time.perf_counter() - started
+
+    def save(learner: Learner) -> None:
+        """Write the checkpoint."""
+        nonlocal saved, saved_at
+        checkpoint.save(path, {"learner": learner, "kept": kept}, meta | {"curve": curve, "seconds": seconds()})
+        saved, saved_at = int(learner.iteration), time.perf_counter()
+
     def record(learner: Learner, interrupted: bool = False) -> dict[str, Any]:
         """Evaluate the policy, keep it if none was clearly better, write all files, and return the point."""
         nonlocal kept
@@ -161,8 +176,7 @@ def train(
         require_finite(finite, iteration)
         metrics, check = evaluate(eval_env, policy), evaluate(eval_env, policy, check_key)["success"]
         curve[:] = [earlier for earlier in curve if earlier["iteration"] < iteration]
-        seconds = seconds_before + time.perf_counter() - started
-        point = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds, **metrics}
+        point = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds(), **metrics}
         point |= {"compile_seconds": compile_s, "check": check}
         best_check = max((earlier["check"] for earlier in curve if earlier["kept"]), default=0.0)
         point["kept"] = check >= least_kept_success(best_check, evaluation_worlds)
@@ -173,14 +187,14 @@ def train(
         # A run without the interruption makes no evaluation here, so it decides nothing in the resumed run.
         kept, point["kept"] = (kept, False) if interrupted else (best, point["kept"])
         curve.append(point)
-        checkpoint.save(path, {"learner": learner, "kept": kept}, meta | {"curve": curve})
+        save(learner)
         return point
 
     def require_finite(finite: Array | bool, iteration: int) -> None:
         if not finite:
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
-                f"by {config.algorithm}; {path} is of iteration {curve[-1]['iteration']}, {POLICY} of "
+                f"by {config.algorithm}; {path} is of iteration {saved}, {POLICY} of "
                 f"iteration {kept_point(curve)['iteration']}. Use a smaller learning_rate or max_grad_norm, with "
                 f"another --out."
             )
@@ -198,7 +212,10 @@ def train(
                 show(metrics if i % 5 == 0 else None)
                 if (i + 1) % every == 0 and i + 1 < hyperparameters.iterations:
                     show(record(learner), 0)
-    except KeyboardInterrupt:
+                elif checkpoint_every is not None and time.perf_counter() - saved_at > checkpoint_every:
+                    require_finite(finite, i + 1)
+                    save(learner)
+    except (KeyboardInterrupt, SystemExit):
         jax.block_until_ready(learner)
         record(learner, interrupted=True)
         log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
@@ -309,8 +326,8 @@ def stored_config(folder: str | Path) -> TrainConfig:
         return TrainConfig(**meta["settings"])
 
 
-def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str]:
-    """Return the arrays of a checkpoint, the learning curve until then, and the hash of the code of the task.
+def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str, float]:
+    """Return the arrays of a checkpoint, the learning curve until then, the hash of the code of the task, and the time.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
@@ -318,7 +335,7 @@ def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dic
     arrays, meta = checkpoint.read(path)
     with checkpoint.reading_checkpoint(path):
         _require_same(path, meta, config)
-        return arrays, list(meta["curve"]), meta["code"]
+        return arrays, list(meta["curve"]), meta["code"], float(meta["seconds"])
 
 
 def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None:

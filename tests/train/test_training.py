@@ -7,6 +7,8 @@ import io
 import json
 import re
 import shutil
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 from disks import full_disk
 from pictures import frames_of
+from waiting import wait_for
 
 import crazysim
 from crazysim import ConfigError, Randomize
@@ -71,8 +74,8 @@ def arrays(folder):
 
 
 @contextlib.contextmanager
-def interrupted_after(iterations, monkeypatch):
-    """Press Ctrl-C after some iterations."""
+def interrupted_after(iterations, monkeypatch, by=KeyboardInterrupt):
+    """Press Ctrl-C after some iterations, or raise another exception."""
     shown = [0]
 
     @contextlib.contextmanager
@@ -80,7 +83,7 @@ def interrupted_after(iterations, monkeypatch):
         def show(*_):
             shown[0] += 1
             if shown[0] == iterations:
-                raise KeyboardInterrupt
+                raise by
 
         yield show
 
@@ -103,6 +106,37 @@ def test_an_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     for name, x in mine.items():
         np.testing.assert_array_equal(x, others[name], err_msg=name)
     assert [p["iteration"] for p in json.loads((tmp_path / "curve.json").read_text())][-1] == 4
+
+
+def test_a_checkpoint_between_evaluations_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
+    """A run that is killed after three of four iterations, which writes nothing any more, goes on from the second."""
+    with interrupted_after(3, monkeypatch, by=MemoryError), pytest.raises(MemoryError):
+        trained(tmp_path, small_config(), checkpoint_every=1e-6)
+    assert arrays(tmp_path)["['learner'].iteration"] == 2
+    lines = []
+    train(small_config(), tmp_path, resume=True, evaluation_worlds=8, log=lines.append, progress=False)
+    assert "continues after iteration 2" in lines[0]
+    mine, others = arrays(tmp_path), arrays(whole.folder)
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    assert [p["iteration"] for p in read_curve(tmp_path)] == [0, 4]
+
+
+@pytest.mark.long("trains in a process of its own")
+def test_a_run_that_a_scheduler_ends_writes_its_checkpoint(tmp_path):
+    """Sent SIGTERM twice, as ``timeout`` does, it ends with the status of that signal and continues from there."""
+    small = ["--worlds", "4", "--set", "seconds=0.1", "--config", "n_steps=4", "hidden=[8]", "iterations=1000000"]
+    options = ["--out", tmp_path, "--checkpoint-every", "0.01", *small]
+    command = [sys.executable, "-m", "crazysim", "train", "hover", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert "hover by ppo" in process.stdout.readline()
+        wait_for(lambda: (tmp_path / CHECKPOINT).exists() and arrays(tmp_path)["['learner'].iteration"] > 0)
+        process.terminate()
+        process.terminate()
+        out = process.stdout.read()
+    assert process.returncode == 143
+    ended = int(re.search(r"interrupted after iteration (\d+); wrote", out)[1])
+    assert arrays(tmp_path)["['learner'].iteration"] == ended > 0
 
 
 def test_a_later_policy_within_two_standard_errors_is_kept():
@@ -319,6 +353,8 @@ def test_invalid_settings_of_a_run_are_refused(tmp_path):
         trained(tmp_path / "run", small_config(options={"seconds": 0.4, "pos": np.zeros(3)}))
     with pytest.raises(ConfigError, match=r"not JSON serializable.* add plugins in install of a task of your own"):
         trained(tmp_path / "run", small_config(options={"effects": [Randomize.crazyflie()]}))
+    with pytest.raises(ConfigError, match="expected checkpoint_every to be positive, got 0"):
+        trained(tmp_path / "run", small_config(), checkpoint_every=0)
     with pytest.raises(ConfigError, match="evaluation_worlds is 0"):
         train(small_config(), tmp_path / "run", evaluation_worlds=0)
     with pytest.raises(ConfigError, match="n_worlds is 0"):
