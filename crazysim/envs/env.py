@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Plugin
@@ -25,7 +26,7 @@ from crazysim.envs.episode_reset import EpisodeReset
 from crazysim.envs.hooks import Hooks
 from crazysim.envs.phases import Phases, select_states, vectorize_over_worlds
 from crazysim.envs.reset_policy import ResetPolicy
-from crazysim.envs.state import NAME, OUTPUTS, EnvState, state_of_data, validate_action
+from crazysim.envs.state import NAME, OUTPUTS, EnvState, state_of_data, validate_action, validate_goals
 from crazysim.envs.task import Task
 from crazysim.envs.task_check import check_record, check_task, require_finite_start, require_installed
 from crazysim.errors import ConfigError
@@ -141,6 +142,25 @@ class Env(ABC):
             new = self._reset_episodes(state)
             new = new if self.reset_policy is None else self.reset_policy.after_step(new)
             return select_states(mask, new, state)
+
+    def set_goal(self, state: EnvState, pos: ArrayLike) -> EnvState:
+        """Return the state with other goals, from the next step on; the episode goes on, and a new one draws its own.
+
+        The observations of the state stay: those of the next step are of the new goals.
+
+        Args:
+            state: The state of all worlds.
+            pos: Goals, world frame, m: one of all drones (3,), one of each world (n_worlds, 3), or one of each drone
+                (n_worlds, n_drones, 3); an axis of worlds or drones may have length 1.
+
+        Raises:
+            ConfigError: If the goals of the task are not positions, or ``pos`` has another shape or, given as host
+                numbers, is not finite.
+        """
+        with default_device_of(state.full_data.core.steps):
+            pos = validate_goals(pos, state)
+            state = state.replace(data=vectorize_over_worlds(self.task.set_goal, self.task.batched)(state.data, pos))
+        return state if self.sim.mesh is None else EnvState(shard(state.full_data, self.sim.mesh))
 
     def step(self, state: EnvState, action: Array) -> EnvState:
         """Return the state one environment step later; with ``AutoReset``, with new episodes where one is over.

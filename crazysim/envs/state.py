@@ -14,6 +14,7 @@ from crazysim.core.data import SimData
 from crazysim.envs.actions import Actions
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, leaf
+from crazysim.tables import read_numbers
 
 NAME = "environment"
 """Key of the environment's record in the plugins of its data."""
@@ -210,3 +211,23 @@ def validate_action(action: Array, state: EnvState, actions: Actions) -> Array:
             f"{jnp.shape(action)}. Actions of this environment: {actions}"
         )
     return jnp.asarray(action, state.action.dtype)
+
+
+def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
+    """Return goals of every drone, in the type of its position. (n_worlds, n_drones, 3)
+
+    Args:
+        pos: One of all drones (3,), one of each world (n_worlds, 3), or one of each drone (n_worlds, n_drones, 3); an
+            axis of worlds or drones may have length 1.
+        state: The state of all worlds.
+    """
+    like = state.full_data.states.pos
+    goals = pos if isinstance(pos, Array) else read_numbers("pos", pos)
+    goals = goals[:, None] if goals.ndim == 2 else goals
+    fits = all(n in (1, expected) for n, expected in zip(goals.shape, like.shape[:2], strict=False))
+    if goals.shape[-1:] != (3,) or not (goals.ndim == 1 or (goals.ndim == 3 and fits)):
+        raise ConfigError(
+            f"expected goals of shape (3,), (n_worlds, 3) or (n_worlds, n_drones, 3) = {like.shape}, got "
+            f"{np.shape(pos)}. Use (1, n_drones, 3) for the same goals in every world."
+        )
+    return jnp.broadcast_to(jnp.asarray(goals, like.dtype), like.shape)

@@ -12,6 +12,7 @@ from crazysim.core.data import SimData
 from crazysim.core.plugin import FunctionPlugin, StagePlacement
 from crazysim.core.settings import check_settings, setting
 from crazysim.envs.state import Obs
+from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.sim.sim import Sim
 
@@ -73,6 +74,19 @@ class Task:
             key: Random key of the episode, for ``crazysim.envs.random`` or ``jax.random``. ()
         """
         raise NotImplementedError(self._undefined("spawn(data, key)"))
+
+    def set_goal(self, data: SimData, pos: Array) -> SimData:
+        """Return the data with other goals, for ``env.set_goal``; tasks whose goals are positions define it.
+
+        Args:
+            data: The world.
+            pos: Goal of every drone, or of its load, world frame, m. (n_drones, 3)
+        """
+        del data, pos
+        raise ConfigError(
+            f"expected a task whose goals are positions, got {self.name!r}. Define set_goal(data, pos) in "
+            f"{type(self).__name__}, or use a task that has it, such as hover."
+        )
 
     def before_step(self, data: SimData) -> SimData:
         """Return the data before an environment step; for rewards of differences, note here what they start from."""

@@ -71,6 +71,13 @@ def keeps_apart(result):
     assert rms.max() < 0.15
 
 
+def visits(result):
+    """Check that every world passed all points, and hovers at the last one."""
+    passed, distance = result
+    assert passed.tolist() == [5] * 8
+    assert distance.max() < 0.05
+
+
 CHECKS = {
     "crazyswarm2": lands,
     "fit_flight": fits,
@@ -80,11 +87,19 @@ CHECKS = {
     "pick_and_place": places,
     "race": races,
     "replayed_twin": repeats,
+    "waypoints": visits,
 }
 """Further checks of the values that ``main`` of an example returns."""
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+LONG = {"waypoints": "trains a policy"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(x, marks=[pytest.mark.long(LONG[x.stem])] if x.stem in LONG else []) for x in EXAMPLES],
+    ids=lambda path: path.stem,
+)
 def test_example_runs(path, capsys):
     spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)

@@ -23,9 +23,10 @@ from env_cases import (
 )
 from gymnasium.vector.utils import batch_space
 
+from crazysim import ConfigError
 from crazysim.dynamics import first_principles
 from crazysim.engine.backends import cuda
-from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, make
+from crazysim.envs import TASKS, AutoReset, DroneEnv, DroneVectorEnv, EpisodeStatistics, Task, make
 from crazysim.envs.phases import vectorize_over_worlds
 from crazysim.envs.spawn import flying
 from crazysim.envs.state import EnvState
@@ -53,6 +54,22 @@ def env(name):
 def begun(env):
     """All worlds at the beginning of an episode."""
     return env.reset(jax.random.key(0))
+
+
+def test_goals_that_are_positions_can_be_set(env, begun, name):
+    """One for each world; the others are an error that says what to do."""
+    pos = jnp.asarray(np.linspace([0.0, 0.5, 1.0], [0.3, -0.5, 1.5], N_WORLDS), jnp.float32)
+    if type(env.task).set_goal is Task.set_goal:
+        assert name not in ("hover", "recover", "swarm", "avoid", "transport", "deliver")
+        with pytest.raises(
+            ConfigError, match=rf"expected a task whose goals are positions, got '{env.task.name}'.*hover"
+        ):
+            env.set_goal(begun, pos)
+        return
+    state = env.set_goal(begun, pos)
+    np.testing.assert_array_equal(env.target(state), np.broadcast_to(pos[:, None], begun.data.states.pos.shape))
+    assert jax.tree.structure(state) == jax.tree.structure(begun)
+    trees_equal(jax.jit(env.set_goal)(begun, pos), state)
 
 
 class Flight(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 
 from crazysim import ConfigError, Sim, Wind
 from crazysim.core.stage import vmap_worlds
-from crazysim.envs import DroneEnv, DroneVectorEnv, Task, draw, make, uniform
+from crazysim.envs import AutoReset, DroneEnv, DroneVectorEnv, Task, draw, make, uniform
 from crazysim.envs.random import episode_key, scale_symmetric, scale_to
 from crazysim.envs.task import total
 from crazysim.envs.tasks.hover import Hover
@@ -43,6 +43,32 @@ def test_an_environment_needs_the_task_installed(installed):
 def test_names_are_no_tasks():
     with pytest.raises(ConfigError, match="expected a Task, got 'hover'"):
         DroneEnv(Sim(control="attitude"), "hover")
+
+
+def test_goals_are_set_for_all_for_each_world_and_for_each_drone():
+    """They are observed from the next step on, which is the one program; another shape is an error."""
+    env = AutoReset(make("hover", 3, n_drones=2, engine="interpret"))
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
+    full = np.arange(18, dtype=np.float32).reshape(3, 2, 3)
+    for pos, expected in (
+        ([0.1, 0.2, 1.0], np.broadcast_to(np.float32([0.1, 0.2, 1.0]), (3, 2, 3))),
+        (full[:, 0].astype(float), np.broadcast_to(full[:, :1], (3, 2, 3))),
+        (jnp.asarray(full), full),
+        (full[:1], np.broadcast_to(full[:1], (3, 2, 3))),
+    ):
+        new = env.set_goal(state, pos)
+        np.testing.assert_array_equal(env.target(new), expected)
+        np.testing.assert_array_equal(new.obs["difference_to_goal"], state.obs["difference_to_goal"])
+        after = step(new, jnp.zeros((3, 2, 4)))
+        np.testing.assert_allclose(after.obs["difference_to_goal"], expected - after.data.states.pos, atol=1e-6)
+    assert step._cache_size() == 1
+    for wrong in (full[:2, 0], full[:, 0, :2], full[None], full[0, 0, 0], full[:2]):
+        with pytest.raises(
+            ConfigError, match=r"expected goals of shape \(3,\), .* = \(3, 2, 3\), got .*Use \(1, n_drones, 3\)"
+        ):
+            env.set_goal(state, wrong)
+    with pytest.raises(ConfigError, match="expected pos to be finite"):
+        env.set_goal(state, [0.0, np.nan, 1.0])
 
 
 def test_the_total_of_terms_is_their_sum_in_order():

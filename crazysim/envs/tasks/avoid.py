@@ -235,6 +235,9 @@ class Avoid(Task):
         del n_drones
         return {"elevation": -35}
 
+    def set_goal(self, data: SimData, pos: Array) -> SimData:
+        return with_record(data, crossing_of(data).replace(goal=pos))
+
     def target(self, data: SimData) -> Array:
         return crossing_of(data).goal
 

@@ -87,6 +87,9 @@ class BringLoad(Task):
         record = delivery_of(data)
         return {"delivered": record.delivered, "crashed": record.crashed}
 
+    def set_goal(self, data: SimData, pos: Array) -> SimData:
+        return with_record(data, delivery_of(data).replace(goal=pos))
+
     def target(self, data: SimData) -> Array:
         return delivery_of(data).goal
 

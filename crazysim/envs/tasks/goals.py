@@ -45,6 +45,9 @@ class GoalTask(Task):
     def install(self, sim: Sim) -> None:
         install_goal(sim)
 
+    def set_goal(self, data: SimData, pos: Array) -> SimData:
+        return with_goal(data, pos)
+
     def observe(self, data: SimData) -> dict[str, Array]:
         """Return the drone's state and the way to its goal, m."""
         return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}

@@ -159,6 +159,9 @@ class Swarm(Task):
         """Return a camera that shows the whole circle."""
         return {"lookat": (0, 0, 1.0), "distance": 4.0 + 2 * circle_radius(n_drones), "elevation": -35}
 
+    def set_goal(self, data: SimData, pos: Array) -> SimData:
+        return with_record(data, swarm_of(data).replace(goal=pos))
+
     def target(self, data: SimData) -> Array:
         """Return the goal, m."""
         return swarm_of(data).goal
