@@ -29,7 +29,7 @@ from crazysim.storage import FOLDER_REMEDY, distrust, make_private
 VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 MAX_CACHE_BYTES = 1_000_000_000
-"""Size of all files, bytes, above which the oldest are removed when the cache is first used: some 5,000 programs."""
+"""Size of all files, bytes, above which the oldest are removed when the cache is first used: about 5,000 programs."""
 SHARE_AFTER_TRIM = 0.8
 """Share of the limit that is left by a removal, so that not every process has to remove files."""
 MIN_FREE = 50_000_000
@@ -42,11 +42,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 def caches_folder() -> Path:
-    """Return crazysim's folder in the user's folder of caches: ``$XDG_CACHE_HOME/crazysim`` or ``~/.cache/crazysim``.
-
-    Raises:
-        ConfigError: If the user has no home folder.
-    """
+    """Return crazysim's folder of caches: ``$XDG_CACHE_HOME/crazysim`` or ``~/.cache/crazysim``."""
     home = os.environ.get("XDG_CACHE_HOME", "")
     if Path(home).is_absolute():
         return Path(home) / "crazysim"
@@ -72,16 +68,16 @@ def default_cache() -> Path | None:
 
 
 def _root() -> Path | None:
-    chosen = os.environ.get(VARIABLE, "")
-    if chosen.lower() in ("off", "0", "false", "no"):
+    variable = os.environ.get(VARIABLE, "")
+    if variable.lower() in ("off", "0", "false", "no"):
         return None
-    if not chosen:
+    if not variable:
         return caches_folder() / "jax"
     try:
-        return Path(chosen).expanduser().absolute()  # the working directory may change
+        return Path(variable).expanduser().absolute()  # the working directory may change
     except RuntimeError:
         raise ConfigError(
-            f"expected a folder in {VARIABLE}, got {chosen!r}, whose user has no home folder. Use an absolute path."
+            f"expected a folder in {VARIABLE}, got {variable!r}, whose user has no home folder. Use an absolute path."
         ) from None
 
 
@@ -96,9 +92,9 @@ def cpu_features() -> str:
 
 
 def folder() -> Path | None:
-    """Return the folder of this process: of JAX's configuration, else the default one; None if there is none.
+    """Return the folder of this process: of JAX's configuration, else the default one; None without one.
 
-    A default folder that cannot be used is a line on stderr, once; the process then keeps nothing.
+    A default folder that cannot be used is reported on stderr, once; the process then keeps no programs.
     """
     configured = jaxcompat.cache_folder()
     if configured is not None:
@@ -122,7 +118,7 @@ def _prepare_default(*environment: str | None) -> Path | None:
 
 
 def _prepare(root: Path, path: Path) -> None:
-    """Make the folder of a cache, and remove what is too much in it.
+    """Make the folder of a cache, and remove the oldest files if they are too many.
 
     Args:
         root: Folder whose size is limited.
@@ -166,11 +162,11 @@ def enable_cache(
 
     Args:
         cache_path: Folder; None for the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
-            the user's folder of caches, where each kind of CPU has a folder of its own. Where the variable is ``off``,
-            None keeps nothing and returns None.
+            the user's folder of caches, with a folder for each kind of CPU. Where the variable is ``off``,
+            None keeps no programs and returns None.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
         min_compile_time_secs: Shortest compilation whose program is kept, s.
-        enable_xla_caches: True to let XLA keep files of its own beside JAX's.
+        enable_xla_caches: True to let XLA keep files, too, in addition to JAX's.
 
     Raises:
         ConfigError: If the folder cannot be made or written, belongs to another user, can be written by others, or its
@@ -191,7 +187,7 @@ def enable_cache(
 class keep_programs(contextlib.ContextDecorator):
     """Block or function in which the programs that this thread compiles are kept.
 
-    Where JAX has a cache of its own nothing changes. What the thread compiles outside is not kept.
+    If JAX has a cache already, nothing changes. Programs that the thread compiles outside are not kept.
     """
 
     _entered = threading.local()
@@ -282,17 +278,17 @@ def trim(folder: Path, limit: int = MAX_CACHE_BYTES) -> None:
         folder: Folder of the cache.
         limit: Largest size of all programs, bytes.
     """
-    found = []
+    files = []
     for pattern in PATTERNS:
         for path in (*folder.glob(pattern), *folder.glob(f"cpu-*/{pattern}")):
             with contextlib.suppress(OSError):  # another process has removed it
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode):
-                    found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
-    size = sum(n for _, n, _ in found)
+                    files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    size = sum(n for _, n, _ in files)
     if size <= limit:
         return
-    for _, n, path in sorted(found):
+    for _, n, path in sorted(files):
         with contextlib.suppress(OSError):
             path.unlink()
         size -= n

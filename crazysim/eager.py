@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def jit_unless_traced(*static: str) -> Callable[[F], F]:
-    """Return a decorator that compiles a function for calls with arrays, and leaves calls with tracers as they are.
+    """Return a decorator that compiles a function for calls with arrays, and does not change calls with tracers.
 
     Outside of ``jit``, JAX compiles each operation separately, which takes 10 ms to 30 ms per operation and shape; the
     decorated function is compiled once instead. Within ``jit``, ``grad`` and the engine's stages its operations become

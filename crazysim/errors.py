@@ -82,7 +82,7 @@ class EngineWarning(UserWarning):
 class UnsupportedError(Exception):
     """A primitive, or a use of one, that the engine cannot lower.
 
-    Rules raise it with the reason alone. Lowering adds the primitive and the stage, so that whoever catches it can
+    Rules raise it with the reason alone. Lowering adds the primitive and the stage, so that the caller can
     name them.
     """
 

@@ -85,11 +85,11 @@ class PyTree:
 
         def __getattr__(self, name: str) -> Any:
             """Return a field of a record from ``lazy_record`` when it is first read."""
-            own = self.__dict__
-            template = own.get(_TEMPLATE)
+            fields = self.__dict__
+            template = fields.get(_TEMPLATE)
             if template is None or name not in template.__dict__:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
-            return own.setdefault(name, _lazy_child(template.__dict__[name], own[_READ]))
+            return fields.setdefault(name, _lazy_child(template.__dict__[name], fields[_READ]))
 
         def __getstate__(self) -> dict[str, Any]:
             """Return all fields, for copies and pickles."""
@@ -111,10 +111,10 @@ def lazy_record(template: T, read: Callable[[Any], Any]) -> T:
         read: Returns a leaf. Two threads that read a field at once may both call it.
     """
     record, values = object.__new__(type(template)), template.__dict__
-    own = record.__dict__
-    own[_TEMPLATE], own[_READ] = template, read
+    fields = record.__dict__
+    fields[_TEMPLATE], fields[_READ] = template, read
     for name, is_static in _present_fields(type(template)):
-        own[name] = values[name] if is_static else _lazy_child(values[name], read)
+        fields[name] = values[name] if is_static else _lazy_child(values[name], read)
     return record
 
 
@@ -202,11 +202,7 @@ def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
 
 
 def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
-    """Check that every leaf has the axes of its scope: a parameter of one drone must not pass for one of a world.
-
-    Raises:
-        ConfigError: If a leaf has others, with its name and the shapes it may have.
-    """
+    """Check that every leaf has the axes of its scope: a parameter of one drone must not pass for one of a world."""
     batches = {"world": (n_worlds, 1), "shared": ()}
 
     def check(x: Any, metadata: Any, name: str, members: Members | None) -> None:
@@ -223,10 +219,10 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         n, kind, kinds = n_drones, "drone", "drones"
         if members is not None and scope != "drone":
             n, kind, kinds = members.n_members, "member", members.population
-        each = (n_worlds, n)
+        member_shape = (n_worlds, n)
         shape, batch, core_ndim, core = (
             jnp.shape(x),
-            batches.get(scope, each),
+            batches.get(scope, member_shape),
             metadata[CORE_NDIM_KEY],
             metadata["core"],
         )
@@ -234,7 +230,7 @@ def check_axes(tree: Any, n_worlds: int, n_drones: int) -> None:
         has_axes = shape[: len(batch)] == batch and len(shape) == n_axes
         if not has_axes or core not in (None, shape[len(batch) :]):
             is_parameter = metadata["scope"] == "parameter"
-            batch = each if is_parameter else batch
+            batch = member_shape if is_parameter else batch
             or_shared = f", or {core_ndim} if all {kinds} share it" if is_parameter else ""
             ending = "" if core is None else f" and end with {core}"
             n_axes = len(batch) + (core_ndim or 0)
@@ -276,7 +272,7 @@ def _map_foreign(
     """Return a record of another library, such as ``flax.struct``, mapped like ``_map_leaves``."""
     children, treedef = jax.tree_util.tree_flatten_with_path(record, is_leaf=lambda x: x is not record)
     metadata = {field.name: field.metadata for field in dataclasses.fields(record)}
-    mapped = []
+    leaves = []
     for path, child in children:
         key = getattr(path[0], "name", "")  # absent where the record is registered without names
         child_name, field_metadata = f"{name}{jax.tree_util.keystr(path)}", metadata.get(key, {})
@@ -285,8 +281,8 @@ def _map_foreign(
                 f"expected an array in {child_name}, whose metadata have {CORE_NDIM_KEY!r}, got a "
                 f"{type(child).__name__}. Give the metadata to the fields of that record."
             )
-        mapped.append(_map_leaves(fn, child, field_metadata, child_name, members))
-    return treedef.unflatten(mapped)
+        leaves.append(_map_leaves(fn, child, field_metadata, child_name, members))
+    return treedef.unflatten(leaves)
 
 
 def _is_record(node: Any) -> bool:
@@ -354,7 +350,7 @@ def as_parameter(value: Any) -> Any:
 def device_array(value: Any, dtype: Any = None) -> jax.Array:
     """Return host data as an array on the default device, of floating dtype by default.
 
-    It compiles nothing, where ``jnp.asarray`` compiles a program for each shape.
+    It compiles no program; ``jnp.asarray`` compiles one for each shape.
     """
     return jax.device_put(np.array(value, dtype or float_dtype()))
 

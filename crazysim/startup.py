@@ -31,8 +31,8 @@ def set_variables() -> None:
     """Set the variables that the user has not set."""
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # JAX sets 1, which a process passes to its children
         os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
-    chosen = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform == "linux" and not chosen and _has_egl():
+    has_display = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
+    if sys.platform == "linux" and not has_display and _has_egl():
         os.environ["MUJOCO_GL"] = "egl"
 
 
@@ -41,14 +41,14 @@ def import_mujoco() -> None:
     try:
         import mujoco
     except Exception as error:  # of OpenGL's libraries, whose faults have many types
-        given = os.environ.get("MUJOCO_GL", "")
+        backend = os.environ.get("MUJOCO_GL", "")
         os.environ["MUJOCO_GL"] = "disable"
         import mujoco  # noqa: F401
 
-        refused["MUJOCO_GL"] = given
+        refused["MUJOCO_GL"] = backend
         warnings.warn(
-            f"expected a MUJOCO_GL that MuJoCo can use, got {given!r}: {error}. Use egl or glfw; until then nothing is "
-            "drawn.",
+            f"expected a MUJOCO_GL that MuJoCo can use, got {backend!r}: {error}. Use egl or glfw; "
+            "until then nothing is drawn.",
             stacklevel=2,
         )
 
@@ -77,7 +77,7 @@ def import_required() -> None:
     for name, load in (("jax", lambda: importlib.import_module("jax")), ("mujoco", import_mujoco)):
         try:
             load()
-        except Exception as error:  # whatever a damaged package raises
+        except Exception as error:  # a damaged package can raise any error
             reason = str(error).strip().partition("\n")[0][:300]
             text = (
                 f"expected the package {name!r} to be importable, got {type(error).__name__}: {reason}. Install it "

@@ -27,10 +27,10 @@ MAX_ARRAYS = 10_000
 """Most arrays of an ``.npz`` file."""
 MAX_UNPACKED, MAX_RATIO = 2**30, 100
 """Most bytes that are unpacked from an ``.npz`` file: so many, or so many times its size if that is more."""
-FOLDER_REMEDY = "Remove it, since what it holds may not be yours, or use another."
+FOLDER_REMEDY = "Remove it, since its files may not be yours, or use another."
 """End of the message for a folder that is refused."""
 SYSTEM_USERS = (0, 65534)
-"""Users that may own the folders above: root, and the one that stands for root in containers that do not map it."""
+"""Users that may own the folders above: root, and the user that containers show instead of an unmapped root."""
 
 
 def is_file(path: str | Path) -> bool:
@@ -135,7 +135,7 @@ def unfinished_path(path: Path) -> Path:
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
     """Open a file for writing that takes the place of ``path`` at the end of the block.
 
-    If writing fails, or the block raises an error, ``path`` is as before, and nothing is left beside it.
+    If writing fails, or the block raises an error, ``path`` is unchanged, and no other file is left.
 
     Raises:
         ConfigError: If the folder does not exist, or the file cannot be written, for example on a full disk.
@@ -184,11 +184,11 @@ def write_figure(figure: Any, path: str | Path, dpi: float) -> None:
 
 
 class _NothingToWriteError(Exception):
-    """Raised to leave a file as it is."""
+    """Raised to leave a file unchanged."""
 
 
 def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, before the work whose result it is for; it is left as it is.
+    """Check that a file can be written, before the work whose result it is for; it is not changed.
 
     Args:
         path: The file.
@@ -260,8 +260,8 @@ def read_arrays(file: BinaryIO, place: str) -> dict[str, NDArray]:
         ConfigError: If it unpacks to much more than its size.
         Exception: Of any type, if it is damaged; see ``reading``.
     """
-    most = max(MAX_UNPACKED, MAX_RATIO * file.seek(0, os.SEEK_END))
-    archive = ZipReader(file, place, MAX_ARRAYS, most, most)
+    limit = max(MAX_UNPACKED, MAX_RATIO * file.seek(0, os.SEEK_END))
+    archive = ZipReader(file, place, MAX_ARRAYS, limit, limit)
     # A whole member is read before NumPy parses it: the checksum of a member is compared only at its end.
     return {name.removesuffix(".npy"): _array(archive.read(name), f"{place}: {name}") for name in archive.names}
 

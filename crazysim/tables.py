@@ -60,12 +60,12 @@ class Key(NamedTuple):
 
 def range_between(low: float = -np.inf, high: float = np.inf, positive: bool = False) -> Range:
     """Return the range of finite numbers between two bounds, or of positive ones."""
-    most = "" if high > MAX_NUMBER else f" to {high:.6g}"
+    upper = "" if high > MAX_NUMBER else f" to {high:.6g}"
     if positive:
-        return Range(f"positive{most and f', at most {high:.6g}'}", 1 / MAX_NUMBER, min(high, MAX_NUMBER))
+        return Range(f"positive{upper and f', at most {high:.6g}'}", 1 / MAX_NUMBER, min(high, MAX_NUMBER))
     if low < -MAX_NUMBER:
-        return ANY_NUMBER if not most else Range(f"finite and at most {high:.6g}", -MAX_NUMBER, high)
-    return Range(f"from {low:.6g}{most}" if most else f"finite and at least {low:.6g}", low, min(high, MAX_NUMBER))
+        return ANY_NUMBER if not upper else Range(f"finite and at most {high:.6g}", -MAX_NUMBER, high)
+    return Range(f"from {low:.6g}{upper}" if upper else f"finite and at least {low:.6g}", low, min(high, MAX_NUMBER))
 
 
 def read_numbers(
@@ -86,11 +86,8 @@ def read_numbers(
         allowed: Range of all entries.
         shapes: Allowed shapes; None for any that is not empty.
         whole: True for whole numbers.
-        owner: Kind and name of what it belongs to, for the beginning of messages.
+        owner: Kind and name of the owner, for the beginning of messages.
         remedy: Sentence for the end of messages.
-
-    Raises:
-        ConfigError: If it is anything else, such as text, has another shape, or an entry is out of the range.
     """
     owner, remedy = owner and f"{owner}: ", remedy and f". {remedy}"
     array = _as_array(name, value, shapes, whole, owner, remedy)
@@ -113,11 +110,7 @@ def read_number(name: str, value: Any, allowed: Range = ANY_NUMBER, remedy: str 
 def _as_array(
     name: str, value: Any, shapes: Shapes | None = None, whole: bool = False, owner: str = "", remedy: str = ""
 ) -> NDArray:
-    """Return a number or an array of numbers as an array.
-
-    Raises:
-        ConfigError: If it is anything else, such as text.
-    """
+    """Return a number or an array of numbers as an array."""
     try:
         array = np.array(value)
     except (TypeError, ValueError, RecursionError):
@@ -141,9 +134,6 @@ def as_numbers(owner: str, path: str, value: Any) -> NDArray[np.float64]:
         owner: Kind and name of what the number belongs to, for messages.
         path: Table and key.
         value: The number, plain or as ``{ value, unit, source }``.
-
-    Raises:
-        ConfigError: If it is anything else, such as text.
     """
     if isinstance(value, Mapping) and "value" in value:
         value = value["value"]
@@ -159,9 +149,6 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
         value: The number or array.
         key: Its shapes and range.
         n: Number of rotors.
-
-    Raises:
-        ConfigError: If it has another shape, or an entry is out of the range.
     """
     shapes = tuple(tuple(n if length == "n" else length for length in shape) for shape in key.shapes)
     read_numbers(path, value, key.range, shapes, owner=owner)
@@ -190,12 +177,9 @@ class Layout:
         """Yield the dotted path and the value of every number of tables that a user wrote.
 
         Args:
-            owner: Kind, name and origin of what they belong to, for messages.
+            owner: Kind, name and origin of the owner, for messages.
             tables: The tables, with plain numbers or with units and sources.
             prefix: Dotted path of these tables, with a dot at the end; empty for all.
-
-        Raises:
-            ConfigError: If a table or key does not exist, with those that are probably meant, or a value is no number.
         """
         for key, item in tables.items():
             path = f"{prefix}{key}"
@@ -215,11 +199,11 @@ class Layout:
                     )
                 yield path, as_numbers(owner, path, item)
             elif isinstance(item, Mapping) and "value" not in item:
-                near = self._did_you_mean(f"[{table}]" for table in difflib.get_close_matches(path, self.tables))
-                raise ConfigError(f"{owner}: expected a table that exists, got [{path}]. {near}")
+                suggestion = self._did_you_mean(f"[{table}]" for table in difflib.get_close_matches(path, self.tables))
+                raise ConfigError(f"{owner}: expected a table that exists, got [{path}]. {suggestion}")
             else:
-                known = [*self.keys, *self.top_level] if not prefix else list(self.keys)
-                raise ConfigError(f"{owner}: expected a key that exists, got {path!r}. {self.suggestion(path, known)}")
+                paths = [*self.keys, *self.top_level] if not prefix else list(self.keys)
+                raise ConfigError(f"{owner}: expected a key that exists, got {path!r}. {self.suggestion(path, paths)}")
 
     def suggestion(self, path: str, paths: Iterable[str]) -> str:
         """Return the paths that are probably meant: first the same key in another table, then those spelt alike."""
@@ -227,15 +211,15 @@ class Layout:
         table, _, key = path.rpartition(".")
         same_table = {p.rpartition(".")[2]: p for p in paths if p.rpartition(".")[0] == table}
         keys = {p.rpartition(".")[2]: p for p in paths}
-        found = [p for p in paths if p.rpartition(".")[2] == key]
-        found += [same_table[k] for k in difflib.get_close_matches(key, same_table)]
-        found += difflib.get_close_matches(path, paths)
-        found += [keys[k] for k in difflib.get_close_matches(key, keys)]
-        return self._did_you_mean(repr(p) for p in dict.fromkeys(found))
+        candidates = [p for p in paths if p.rpartition(".")[2] == key]
+        candidates += [same_table[k] for k in difflib.get_close_matches(key, same_table)]
+        candidates += difflib.get_close_matches(path, paths)
+        candidates += [keys[k] for k in difflib.get_close_matches(key, keys)]
+        return self._did_you_mean(repr(p) for p in dict.fromkeys(candidates))
 
     def _did_you_mean(self, candidates: Iterable[str]) -> str:
-        found = list(candidates)[:3]
-        meant = f"Did you mean {' or '.join(found)}? " if found else ""
+        nearest = list(candidates)[:3]
+        meant = f"Did you mean {' or '.join(nearest)}? " if nearest else ""
         return f"{meant}{self.guide} lists all keys."
 
 
@@ -254,7 +238,7 @@ def read_source(
 
     Raises:
         UnknownNameError: If the source is neither the name of a built-in file nor a file.
-        ConfigError: If it is none of these, or not TOML.
+        ConfigError: If the source has another type, or the file is not TOML.
     """
     if isinstance(source, Mapping):
         return "custom", "", dict(source)
@@ -283,16 +267,13 @@ def extend_bases(bases: tuple[str, ...], source: Any) -> tuple[str, ...]:
     Args:
         bases: Names, paths or kinds of the sources so far, each with the next one as its base.
         source: Name, path or dict of the next one.
-
-    Raises:
-        ConfigError: If it is among them already, or there are more than ``MAX_BASES``.
     """
     is_text = isinstance(source, (str, Path))
     name = str(source) if is_text else f"a {type(source).__name__}"
-    found = (*bases, name)
-    if (is_text and name in bases) or len(found) > MAX_BASES:
+    chain = (*bases, name)
+    if (is_text and name in bases) or len(chain) > MAX_BASES:
         raise ConfigError(
-            f"expected a base that leads to a file without one, got {' -> '.join(found)[:400]}. Remove the key "
+            f"expected a base that leads to a file without one, got {' -> '.join(chain)[:400]}. Remove the key "
             f"base from one of them."
         )
-    return found
+    return chain

@@ -72,7 +72,7 @@ def test_new_takes_rotors_one_by_one(tmp_path):
     np.testing.assert_array_equal(airframe.value("rotors.yaw_torque_sign"), [-1, 1, -1])
     warnings = [line for line in describe_airframe(airframe).splitlines() if line.startswith("warning")]
     assert len(warnings) == 2
-    assert "beside the centre of mass" in warnings[0]
+    assert "not centred on the centre of mass" in warnings[0]
     assert "turn one way" in warnings[1]
 
 

@@ -43,7 +43,7 @@ FREQ = 500
 
 
 def describe_airframe(airframe: Airframe) -> str:
-    """Return what an airframe can do, what it lacks for which controller, and warnings."""
+    """Return a report on an airframe: capabilities, missing parameters of each controller, and warnings."""
     rows = [("airframe", airframe.name), *_body(airframe)]
     dynamics = supported_dynamics(airframe)
     rows.append(("dynamics", ", ".join(dynamics) or "none"))
@@ -87,11 +87,11 @@ def _ratio(airframe: Airframe) -> float:
 
 
 def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
-    """Yield mass, thrust and what follows from them and the rotors' positions."""
+    """Yield mass, thrust, and quantities that follow from them and the rotors' positions."""
     mass, ratio = float(airframe.value("rigid_body.mass")), _ratio(airframe)
-    most, least = (float(airframe.value(f"rotors.thrust_{end}")) for end in ("max", "min"))
+    high, low = (float(airframe.value(f"rotors.thrust_{end}")) for end in ("max", "min"))
     hover = mass * GRAVITY_MAGNITUDE / airframe.n_rotors
-    yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {least:.3g} to {most:.3g} N"
+    yield "mass", f"{mass:.4g} kg, {airframe.n_rotors} rotors of {low:.3g} to {high:.3g} N"
     positions = airframe.value("rotors.position")
     wheelbase = np.max(np.linalg.norm(positions[:, None] - positions, axis=-1))
     yield "wheelbase", f"{1000 * wheelbase:.0f} mm, the largest distance of two rotors"
@@ -107,7 +107,7 @@ def _body(airframe: Airframe) -> Iterator[tuple[str, str]]:
     if Dynamics.first_principles in supported_dynamics(airframe):
         arms["yaw"] = yaw_arm(airframe)
     for axis, (name, arm) in enumerate(arms.items()):
-        torque = min(hover - least, most - hover) * arm * np.sum(np.abs(airframe.mixing_matrix[axis]))
+        torque = min(hover - low, high - hover) * arm * np.sum(np.abs(airframe.mixing_matrix[axis]))
         acc = torque / airframe.inertia[axis, axis]
         rate, seconds = np.sqrt(acc * QUARTER_TURN), 2 * np.sqrt(QUARTER_TURN / max(acc, 1e-9))
         yield (
@@ -138,7 +138,7 @@ def _battery(airframe: Airframe) -> str:
 
 
 def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    """Yield the command levels that each controller follows, or what it lacks."""
+    """Yield the command levels that each controller follows, or the parameters that it lacks."""
     yield "controllers", "command levels that each of them follows"
     if Dynamics.first_principles not in dynamics:
         if dynamics:
@@ -149,9 +149,9 @@ def _controllers(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[tupl
             )
         return
     for name in STATE_CONTROLLERS:
-        found: Any = find_controller(name)
-        lack = _missing_parameters(functools.partial(found.params, airframe))
-        yield f"  {name}", _levels({", ".join(level.value for level in found.levels): lack})
+        controller: Any = find_controller(name)
+        lack = _missing_parameters(functools.partial(controller.params, airframe))
+        yield f"  {name}", _levels({", ".join(level.value for level in controller.levels): lack})
     stages = {"state": StateParams, "attitude, body_rate": AttitudeParams, "force_torque": AllocationParams}
     lacks = {
         levels: _missing_parameters(functools.partial(params.create, airframe)) for levels, params in stages.items()
@@ -177,12 +177,12 @@ def _missing_parameters(create: Callable[[], Any]) -> str:
 
 
 def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
-    """Yield what is allowed and probably not meant."""
+    """Yield warnings about allowed settings that are probably mistakes."""
     positions, ratio = airframe.value("rotors.position"), _ratio(airframe)
     if ratio < MIN_THRUST_TO_WEIGHT:
         yield f"thrust over weight is {ratio:.2f}; below {MIN_THRUST_TO_WEIGHT:g} little is left for manoeuvres"
     if np.linalg.norm(np.mean(positions[:, :2], axis=0)) > 0.05 * airframe.arm:
-        yield "the middle of the rotors is beside the centre of mass: rotors differ in hover"
+        yield "the rotors are not centred on the centre of mass: their speeds differ in hover"
     if np.sum(airframe.value("rotors.yaw_torque_sign")):
         yield "more rotors turn one way than the other: their drag turns the drone in hover"
     if Dynamics.first_principles in dynamics:
@@ -192,9 +192,9 @@ def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
 
 
 def _agility_warnings(airframe: Airframe) -> Iterator[str]:
-    """Yield what makes flights slow, or steps of the default rate diverge."""
-    for (axis, least), acc in zip(MIN_AUTHORITY.items(), max_ang_acc(airframe), strict=True):
-        if acc < least:
+    """Yield warnings about slow flights, and about steps of the default rate that diverge."""
+    for (axis, minimum), acc in zip(MIN_AUTHORITY.items(), max_ang_acc(airframe), strict=True):
+        if acc < minimum:
             seconds = 2 * np.sqrt(QUARTER_TURN / acc)
             yield f"{axis} has {acc:.2g} rad/s^2 in hover: a turn by 90 degrees takes {seconds:.2g} s at least"
     if precession_rate(airframe) > MAX_PRECESSION_SHARE * np.min(max_ang_acc(airframe)[:2]):

@@ -65,24 +65,24 @@ def fly(
     fleet = f"{count_text(n_worlds, 'world')} of {count_text(n_drones, 'drone')}"
     print(f"{fleet}, {sim.freq} Hz, {seconds:g} s, on {device}, {engine}")
 
-    begin = perf_counter()
+    start_time = perf_counter()
     compiled_frame = fly_frame.lower(sim.data).compile()
-    compile_s = perf_counter() - begin
-    begin = perf_counter()
+    compile_s = perf_counter() - start_time
+    start_time = perf_counter()
     find_touches(sim)
-    contacts_compile_s = perf_counter() - begin
+    contacts_compile_s = perf_counter() - start_time
 
     recorder = Recorder(sim, worlds=[0])
     errors, touched = [], []
     step_s = contacts_s = 0.0
     for _ in progress_bar(range(n_frames), "flying"):
-        begin = perf_counter()
+        start_time = perf_counter()
         data, error = jax.block_until_ready(compiled_frame(sim.data))
-        step_s += perf_counter() - begin
+        step_s += perf_counter() - start_time
         sim.data = data
-        begin = perf_counter()
+        start_time = perf_counter()
         touched.append(find_touches(sim))
-        contacts_s += perf_counter() - begin
+        contacts_s += perf_counter() - start_time
         recorder.add()
         errors.append(np.asarray(error))
 

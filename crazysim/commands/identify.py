@@ -137,22 +137,22 @@ def _write(path: Path, text: str) -> None:
 
 def _part(text: str) -> tuple[str, tuple[float, float]]:
     """Return path, start and end of ``LOG@START:END``; start and end may be left out."""
-    found = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
-    if found is None or Path(text).exists():
+    match = re.fullmatch(r"(.+)@(\d*\.?\d*):(\d*\.?\d*)", text)
+    if match is None or Path(text).exists():
         return text, (0.0, math.inf)
-    return found[1], (float(found[2] or 0), float(found[3] or math.inf))
+    return match[1], (float(match[2] or 0), float(match[3] or math.inf))
 
 
 def _columns(texts: Sequence[str]) -> Columns:
     """Return the columns of FIELD=NAMES pairs."""
-    known = Columns.__dataclass_fields__
+    names_of_columns = Columns.__dataclass_fields__
     fields: dict[str, Any] = {}
     for text in texts:
         name, mark, names = text.partition("=")
-        if name not in known or not mark:
+        if name not in names_of_columns or not mark:
             raise ConfigError(
                 f"expected FIELD=NAMES without spaces, such as pos=px,py,pz, got {text!r}. "
-                f"Fields are {', '.join(known)}."
+                f"Fields are {', '.join(names_of_columns)}."
             )
         if "_per_" not in name:
             fields[name] = names if name == "time" else tuple(filter(None, names.split(",")))

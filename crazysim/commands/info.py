@@ -24,7 +24,7 @@ OPTIONAL = ("optax", "viser", "websockets", "matplotlib", "imageio-ffmpeg", "cas
 VARIABLES = ("JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "XLA_FLAGS", "CUDA_VISIBLE_DEVICES",
              "CXX", "CXXFLAGS", "CRAZYSIM_CACHE", "CRAZYSIM_COMPILE_TIMEOUT", "CRAZYSIM_RENDERING",
              "XDG_CACHE_HOME", "MUJOCO_GL")  # fmt: skip
-"""Environment variables that change what runs."""
+"""Environment variables that change the behaviour of crazysim."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -61,7 +61,7 @@ def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
 
 
 def _or_reason(value: Callable[[], str]) -> str:
-    """Return the value of a line, or why there is none."""
+    """Return the value of a line, or the reason why it is missing."""
     try:
         return value()
     except importlib.metadata.PackageNotFoundError:
@@ -80,13 +80,13 @@ def _cores() -> int:
 
 
 def _extras() -> str:
-    found = []
+    versions = []
     for name in OPTIONAL:
         try:
-            found.append(f"{name} {importlib.metadata.version(name)}")
+            versions.append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
             continue
-    return ", ".join(found) or "none"
+    return ", ".join(versions) or "none"
 
 
 def _devices() -> str:
@@ -101,8 +101,10 @@ def _compiler() -> str:
     program = native.compiler()
     if program is None:
         return f"none; steps run on a slower engine: {native.MISSING_COMPILER}"
-    done = subprocess.run([*shlex.split(program), "--version"], capture_output=True, text=True, timeout=20, check=False)
-    return f"{program}, {_first_line(done.stdout or done.stderr)}; {shlex.join(native.compiler_command()[1:])}"
+    result = subprocess.run(
+        [*shlex.split(program), "--version"], capture_output=True, text=True, timeout=20, check=False
+    )
+    return f"{program}, {_first_line(result.stdout or result.stderr)}; {shlex.join(native.compiler_command()[1:])}"
 
 
 def _nvrtc() -> str:
@@ -133,7 +135,7 @@ def _size(folder: Path) -> str:
 
 
 def _rendering() -> str:
-    """Return the backend of OpenGL, and whether it draws; tried in a process of its own, which it can end."""
+    """Return the backend of OpenGL, and whether it draws, tried in another process, which a crash may end."""
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
     environment = os.environ | startup.refused
     backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"
@@ -150,5 +152,5 @@ def _rendering() -> str:
 
 def _variables() -> str:
     environment = os.environ | startup.refused
-    given = [f"{name}={environment[name]}" for name in VARIABLES if name in environment]
-    return ", ".join(given) or "none"
+    settings = [f"{name}={environment[name]}" for name in VARIABLES if name in environment]
+    return ", ".join(settings) or "none"

@@ -7,7 +7,7 @@ from typing import Any
 
 
 class DefaultsFormatter(argparse.HelpFormatter):
-    """Help that states the defaults which are numbers or names; a help text that says "by default" states its own."""
+    """Help that states defaults that are numbers or names, unless a help text already says "by default"."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         text, default = action.help, action.default

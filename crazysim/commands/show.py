@@ -78,9 +78,9 @@ def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any])
     from crazysim.lab.shows.live_show import live_show
     from crazysim.lab.shows.view import camera_around
 
-    written = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
-    if written is not None:
-        raise ConfigError(f"expected --live or --{written}, got both. Leave one of them out.")
+    file_option = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
+    if file_option is not None:
+        raise ConfigError(f"expected --live or --{file_option}, got both. Leave one of them out.")
     with live_show(show, **settings) as live:
         if options.window:
             planned = planned_at(show.trajectories, np.linspace(0.0, show.duration, 50))

@@ -19,7 +19,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("train", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=train)
     add = parser.add_argument
-    task = "name of a task, such as hover, or place of your own, FILE.py:CLASS; list prints all names"
+    task = "name of a task, such as hover, or FILE.py:CLASS for your task; list prints all names"
     add("task", help=task)
     add("--algorithm", help="ppo or apg; by default the recipe's")
     add("--seed", type=int, help="random seed; by default 0")
@@ -63,7 +63,7 @@ def _of_run(commands: argparse._SubParsersAction, name: str, text: str, run: Any
 
 def _add_place(add: Any) -> None:
     """Add the options of a command that makes the environment of a run again."""
-    place = "place of a task of your own, if it is not where it was in training"
+    place = "FILE.py:CLASS of your task, if it has moved since training"
     add("--task", metavar="FILE.py:CLASS", help=place)
     add("--device", help="device: cpu, gpu; by default the training's")
 

@@ -20,7 +20,7 @@ from crazysim.lab.validate.sections import sections
 from crazysim.storage import check_writable, write_file
 
 PICTURES = "pictures"
-"""Name of the folder of the pictures, beside the page."""
+"""Name of the folder of the pictures, in the folder of the page."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -31,7 +31,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder with logs in idsia/ and nanobench/")
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES, help="sections; by default all")
     parser.add_argument("--out", type=Path, default=Path("validation.md"), metavar="FILE", help="page to write; its "
-                        "pictures, of logs alone, go to a folder pictures beside it")  # fmt: skip
+                        "pictures, of logs alone, go to the folder pictures next to it")  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> int:
@@ -40,12 +40,12 @@ def run(options: argparse.Namespace) -> int:
     if (pictures := options.out.parent / PICTURES).exists():
         check_writable(pictures / options.out.name)
     rows = validate(options.data, options.only)
-    chosen = [section for section in sections(options.data) if section.name in options.only]
-    for section in chosen:
+    selected = [section for section in sections(options.data) if section.name in options.only]
+    for section in selected:
         if section.missing:
             print(f"left out {section.name}: {section.missing}")
-    pictures = _draw(chosen, rows, options.out.parent)
-    write_file(options.out, page(chosen, rows, _provenance(chosen), pictures))
+    pictures = _draw(selected, rows, options.out.parent)
+    write_file(options.out, page(selected, rows, _provenance(selected), pictures))
     for row in rows:
         if row.failed:
             print(f"failed: {row.what}: {row.problem or f'{row.text}, {bound_text(row.bound)} passes'}")
@@ -53,10 +53,10 @@ def run(options: argparse.Namespace) -> int:
     return int(any(row.failed for row in rows))
 
 
-def _draw(chosen: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[str, str]:
+def _draw(selected: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[str, str]:
     """Write the pictures, and return their paths relative to the page by the names of the sections."""
     pictures = {}
-    for section in chosen:
+    for section in selected:
         section_rows = [row for row in rows if row.section == section.name]
         if not any(row.series for row in section_rows):
             continue
@@ -69,16 +69,16 @@ def _draw(chosen: Sequence[Section], rows: Sequence[Row], folder: Path) -> dict[
     return pictures
 
 
-def _provenance(chosen: Sequence[Section]) -> str:
-    """Return a sentence that says with what the page was made."""
+def _provenance(selected: Sequence[Section]) -> str:
+    """Return a sentence with the date and the versions of the programs that made the page."""
     command = ["git", "-C", str(Path(crazysim.__file__).parent), "describe", "--always", "--dirty"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        commit = f", commit {done.stdout.strip()}" if done.returncode == 0 else ""
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        commit = f", commit {result.stdout.strip()}" if result.returncode == 0 else ""
     except OSError:
         commit = ""
-    used = dict(item for section in chosen if not section.missing for item in section.packages.items())
-    others = [name.partition("==")[0] for name in used.values()]
+    packages = dict(item for section in selected if not section.missing for item in section.packages.items())
+    others = [name.partition("==")[0] for name in packages.values()]
     programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy", *others))
     return (
         f"Made on {datetime.now(UTC):%Y-%m-%d} with crazysim {crazysim.__version__}{commit}, {programs}, Python "

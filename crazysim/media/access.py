@@ -58,7 +58,7 @@ class Access:
         if not is_own_name(host, self.host):
             return wrong_name_message(host)
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
-            return f"expected a request of this page itself, got one of {origin!r}. Open the page in a tab of its own."
+            return f"expected a request of this page itself, got one of {origin!r}. Open the page itself in a tab."
         if not hmac.compare_digest(self._first_part(path).encode(errors="replace"), self._token.encode()):
             return "expected the address with its token, got another one. Use the address that the program printed."
         return ""
@@ -92,8 +92,8 @@ def is_own_name(host: str, listening: str) -> bool:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return False
-    own = socket.gethostname().lower()
-    if name in ("localhost", own, f"{own}.local", listening.lower()):
+    host_name = socket.gethostname().lower()
+    if name in ("localhost", host_name, f"{host_name}.local", listening.lower()):
         return True
     try:
         ipaddress.ip_address(name)

@@ -85,8 +85,8 @@ class Film:
         self.fps, self.speed, self.n_frames = float(fps), float(speed), 0
         self._command = self._encode(*size)
         self._ffmpeg: subprocess.Popen[bytes] | None = None
-        wanted = check_flag("progress", progress)
-        self._bar = progress_bar(label="filming", required=True, total=total) if wanted else None
+        shows_progress = check_flag("progress", progress)
+        self._bar = progress_bar(label="filming", required=True, total=total) if shows_progress else None
         self._clock = Clock()
 
     def add(self, sim: Sim) -> int:
@@ -111,7 +111,6 @@ class Film:
             flight: Flight.
 
         Raises:
-            ValueError: If the simulation has other drones or bodies, or the view shows a world that was not recorded.
             RenderError: If this machine cannot draw, or the file cannot be written.
         """
         for world in self.view.worlds:
@@ -138,9 +137,9 @@ class Film:
         Raises:
             RenderError: If the file cannot be written.
         """
-        pixels, needed = np.asarray(image), (self.view.height, self.view.width, 3)
-        if pixels.shape != needed or pixels.dtype != np.uint8:
-            raise ConfigError(f"expected an image of shape {needed}, uint8, got {pixels.shape}, {pixels.dtype}")
+        pixels, shape = np.asarray(image), (self.view.height, self.view.width, 3)
+        if pixels.shape != shape or pixels.dtype != np.uint8:
+            raise ConfigError(f"expected an image of shape {shape}, uint8, got {pixels.shape}, {pixels.dtype}")
         if self._ffmpeg is None:
             self._ffmpeg = subprocess.Popen(self._command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
         try:

@@ -50,15 +50,11 @@ class Flight:
         return self.pos.shape[2]
 
     def index(self, world: int) -> int:
-        """Return the index in the recording of a world of the simulation.
-
-        Raises:
-            ConfigError: If it was not recorded.
-        """
-        found = np.flatnonzero(self.worlds == world)
-        if not len(found):
+        """Return the index in the recording of a world of the simulation."""
+        indices = np.flatnonzero(self.worlds == world)
+        if not len(indices):
             raise ConfigError(f"expected a recorded world, one of {self.worlds.tolist()}, got {world!r}")
-        return int(found[0])
+        return int(indices[0])
 
     def at(self, time: float) -> dict[str, NDArray]:
         """Return pos, quat, body_pos, body_quat and setpoint at a time, interpolated.
@@ -92,7 +88,7 @@ class Flight:
         """Write the flight to a compressed ``.npz`` file.
 
         Raises:
-            ConfigError: If the name has another suffix, or the file cannot be written; then nothing of it stays.
+            ConfigError: If the name has another suffix, or the file cannot be written, in which case no file is left.
         """
         path = Path(path)
         if path.suffix != ".npz":
@@ -151,7 +147,7 @@ def _shapes(arrays: dict[str, NDArray]) -> list[VisualGeom]:
 
 
 SCENE_CHUNK, SAMPLE_CHUNK = b"SCEN", b"SAMP"
-"""Kinds of chunks of a flight: what does not change, and one sample."""
+"""Kinds of chunks of a flight: the constants, and one sample."""
 SAMPLE_FIELDS = ("time", "pos", "quat", "body_pos", "body_quat", "setpoint")
 """Fields of a sample, in their order in a chunk."""
 

@@ -76,7 +76,7 @@ class Recorder:
         return self._n
 
     def add(self, time: float | None = None) -> None:
-        """Record the poses as they are now.
+        """Record the present poses.
 
         A second sample at the same time replaces the first, or in a file is left out.
 
@@ -138,10 +138,10 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
         dt: Time between two states, s.
         worlds: Indices of the worlds to record; None for all.
     """
-    indices, needed = world_indices(sim, worlds), (sim.n_worlds, sim.n_drones)
-    if np.shape(states.pos)[1:] != (*needed, 3) or np.shape(states.quat) != (len(states.pos), *needed, 4):
+    indices, sizes = world_indices(sim, worlds), (sim.n_worlds, sim.n_drones)
+    if np.shape(states.pos)[1:] != (*sizes, 3) or np.shape(states.quat) != (len(states.pos), *sizes, 4):
         raise ConfigError(
-            f"expected positions of shape (n, *{(*needed, 3)}) and quaternions of shape (n, *{(*needed, 4)}), as "
+            f"expected positions of shape (n, *{(*sizes, 3)}) and quaternions of shape (n, *{(*sizes, 4)}), as "
             f"sim.rollout returns them, got {np.shape(states.pos)} and {np.shape(states.quat)}"
         )
     if not np.isfinite(dt) or dt <= 0:
@@ -174,11 +174,14 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
     """
     worlds = flight.worlds
     world_indices(sim, worlds.tolist())
-    found, recorded = (sim.n_drones, sim.mj_model.nmocap - sim.n_drones), (flight.n_drones, len(flight.body_ids))
-    if found != recorded:
+    counts, recorded_counts = (
+        (sim.n_drones, sim.mj_model.nmocap - sim.n_drones),
+        (flight.n_drones, len(flight.body_ids)),
+    )
+    if counts != recorded_counts:
         raise ConfigError(
-            f"expected a simulation of {recorded[0]} drones and {recorded[1]} other mocap bodies, as the flight has, "
-            f"got {found[0]} and {found[1]}"
+            f"expected a simulation of {recorded_counts[0]} drones and {recorded_counts[1]} other mocap bodies, as the "
+            f"flight has, got {counts[0]} and {counts[1]}"
         )
     now, data = flight.at(time), sim.data
     controls, objects = data.controls, data.objects

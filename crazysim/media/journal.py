@@ -81,9 +81,9 @@ class Journal(Closing):
             self._file = -1
 
     def _write(self, content: bytes) -> None:
-        rest = memoryview(content)
-        while rest:
-            rest = rest[os.write(self._file, rest) :]
+        unwritten = memoryview(content)
+        while unwritten:
+            unwritten = unwritten[os.write(self._file, unwritten) :]
 
 
 def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
@@ -104,7 +104,7 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
             kind, length, checksum = CHUNK_HEADER.unpack(head) if len(head) == CHUNK_HEADER.size else (b"", size, 0)
             content = file.read(length) if length <= size - file.tell() else b""
             if len(content) < length or zlib.crc32(content, zlib.crc32(kind)) != checksum:
-                log.warning("%s is cut off or damaged at byte %d of %d; what is before it was read", path, start, size)
+                log.warning("%s is cut off or damaged at byte %d of %d; the part before it was read", path, start, size)
                 return
             yield kind, content
 

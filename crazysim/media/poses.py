@@ -9,7 +9,7 @@ from crazysim.sim.sim import Sim
 
 
 def mocap_poses(sim: Sim, worlds: int | NDArray) -> tuple[NDArray, NDArray]:
-    """Return poses of all mocap bodies: drones, objects, and what plugins place, such as loads.
+    """Return poses of all mocap bodies: drones, objects, and bodies of plugins, such as loads.
 
     Args:
         sim: Simulation.

@@ -77,10 +77,10 @@ class Trail:
         """
         path: list[NDArray] = []
         later = np.inf
-        for then, pos in reversed(self._samples):
-            if then[world] > later or then[world] < self._samples[-1][0][world] - self.seconds - 1e-6:
+        for time, pos in reversed(self._samples):
+            if time[world] > later or time[world] < self._samples[-1][0][world] - self.seconds - 1e-6:
                 break
-            later = then[world]
+            later = time[world]
             path.append(pos[world])
         return np.stack(path[::-1]) if path else np.zeros((0, 0, 3))
 
@@ -97,7 +97,7 @@ class Trail:
         if len(path) < 2:
             return
         fade = np.linspace(MIN_ALPHA, 1.0, len(path) - 1)[:, None] ** [0, 0, 0, 1]
-        moved = (np.ptp(path, axis=0) > 0).any(-1)
+        is_moving = (np.ptp(path, axis=0) > 0).any(-1)
         colors = colors_of(path.shape[1], rgba)
-        for drone in np.flatnonzero(moved):
+        for drone in np.flatnonzero(is_moving):
             overlays.line(path[:, drone], colors[drone] * fade, 1.0, width)

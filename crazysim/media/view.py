@@ -1,4 +1,4 @@
-"""Views: which worlds an image shows side by side, from which camera, with which overlays."""
+"""Views: the worlds that an image shows side by side, its camera and its overlays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_PIXELS = 16_384
 MIN_VIEW_RADIUS = 0.25
 """Least radius around points that a camera holds in view, m: at it a Crazyflie is a sixth of the image's height."""
 DISTANCE_MARGIN = 1.25
-"""Distance of a camera that holds points in view, as a multiple of that from which they just fit."""
+"""Distance of a camera that holds points in view, as a multiple of the distance from which they just fit."""
 
 
 @dataclass
@@ -52,7 +52,7 @@ class View:
     """Function that returns points of a world, ``hold(sim, world)``, world frame, m (n, 3): the free camera holds them
     and all drones in view, from a distance that fits; None for none."""
     lag: float = setting(default=0.3, low=0.0)
-    """Time constant with which the camera follows what ``follow`` or ``hold`` names, s."""
+    """Time constant with which the camera follows the bodies of ``follow`` or ``hold``, s."""
     trail: float = setting(default=0.0, low=0.0)
     """Duration of the drones' trails, s; 0 for none."""
     setpoints: bool = False
@@ -188,10 +188,10 @@ class View:
         if self.follow is not None:
             config["lookat"] = self._smooth_aim(k, time, pos[self.follow])
         if self.hold is not None:
-            held = np.asarray(self.hold(sim, self.worlds[k]), float)
-            if held.shape[-1:] != (3,):
-                raise ConfigError(f"expected hold to return points of shape (n, 3), got shape {held.shape}.")
-            points = np.concatenate([pos, held.reshape(-1, 3)])
+            target = np.asarray(self.hold(sim, self.worlds[k]), float)
+            if target.shape[-1:] != (3,):
+                raise ConfigError(f"expected hold to return points of shape (n, 3), got shape {target.shape}.")
+            points = np.concatenate([pos, target.reshape(-1, 3)])
             aim = self._smooth_aim(k, time, _aim_at(points, float(sim.mj_model.vis.global_.fovy)))
             config |= {"lookat": aim[:3], "distance": aim[3]}
         return config

@@ -42,13 +42,12 @@ def page(flight: Flight, world: int | None = None, lights: NDArray | None = None
             (n, n_drones, 3)
 
     Raises:
-        ConfigError: If that world was not recorded, or the lights have another shape.
         ImportError: If viser is not installed.
     """
     k = 0 if world is None else flight.index(world)
-    needed = (len(flight.time), flight.n_drones, 3)
-    if lights is not None and np.shape(lights) != needed:
-        raise ConfigError(f"expected lights of shape {needed} = (n, n_drones, 3), got {np.shape(lights)}")
+    shape = (len(flight.time), flight.n_drones, 3)
+    if lights is not None and np.shape(lights) != shape:
+        raise ConfigError(f"expected lights of shape {shape} = (n, n_drones, 3), got {np.shape(lights)}")
     viser = import_viser()
     with contextlib.redirect_stdout(
         io.StringIO()
@@ -119,7 +118,6 @@ def serve(flight: Flight, world: int | None = None, port: int = 8080, host: str 
     """Serve a flight at a port until interrupted.
 
     Raises:
-        ConfigError: If the world was not recorded.
         ImportError: If viser is not installed.
         RenderError: If it cannot listen there.
     """
@@ -180,14 +178,14 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
     recording = server.get_scene_serializer()
     end = float(flight.time[-1])
     times = np.linspace(0, end, int(np.ceil(FPS * end)) + 1)  # viser does not interpolate
-    shown: dict[Any, NDArray] = {}
+    last_values: dict[Any, NDArray] = {}
     lit: dict[str, tuple[int, int, int]] = {}
 
     def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
-        if not np.isfinite(pose).all() or np.array_equal(shown.get(handle.name, np.inf), pose):
+        if not np.isfinite(pose).all() or np.array_equal(last_values.get(handle.name, np.inf), pose):
             return  # unchanged poses are sent once, and non-finite ones not at all
-        shown[handle.name] = pose
+        last_values[handle.name] = pose
         handle.position = pose[:3]
         if quat is not None:
             handle.wxyz = pose[3:]

@@ -96,16 +96,18 @@ class Follow(Plugin):
                 f"expected state commands for {self.name!r} to replace, got control={sim.data.controls.mode.value!r}. "
                 f"Use Sim(control='state')."
             )
-        given = self._trajectory_list()
-        n_slots = len(given) if self.n_slots is None else _check_count("n_slots", self.n_slots, len(given))
-        most = max(t.n_pieces for t in given)
-        n_pieces = most if self.max_pieces is None else _check_count("max_pieces", self.max_pieces, most)
+        trajectories = self._trajectory_list()
+        n_slots = (
+            len(trajectories) if self.n_slots is None else _check_count("n_slots", self.n_slots, len(trajectories))
+        )
+        n_needed = max(t.n_pieces for t in trajectories)
+        n_pieces = n_needed if self.max_pieces is None else _check_count("max_pieces", self.max_pieces, n_needed)
         has_room = self.n_slots is not None or self.max_pieces is not None
-        first = given[0].padded(n_pieces, MIN_SLOT_DEGREE if has_room else 0)
-        slots = Trajectory.stack([first, *given[1:], *[first] * (n_slots - len(given))])
+        first = trajectories[0].padded(n_pieces, MIN_SLOT_DEGREE if has_room else 0)
+        slots = Trajectory.stack([first, *trajectories[1:], *[first] * (n_slots - len(trajectories))])
         index = np.int32(0) if self.index is None else self.index
-        if self.index is None and len(given) > 1 and sim.n_drones > 1:
-            index = np.broadcast_to(np.arange(sim.n_drones) % len(given), (sim.n_worlds, sim.n_drones))
+        if self.index is None and len(trajectories) > 1 and sim.n_drones > 1:
+            index = np.broadcast_to(np.arange(sim.n_drones) % len(trajectories), (sim.n_worlds, sim.n_drones))
         ends, coefficients, repeats = (device_array(x, x.dtype) for x in jax.tree.leaves(slots))
         return FollowData(
             ends=ends,
@@ -142,9 +144,6 @@ class Follow(Plugin):
             data: The data of the simulation.
             slot: The slot.
             trajectory: The trajectory, for one vehicle.
-
-        Raises:
-            ConfigError: If there is no such slot, or the trajectory does not fit into it.
         """
         record = self.read(data)
         n_slots, n_pieces, _, n_coefficients = record.coefficients.shape
@@ -156,7 +155,7 @@ class Follow(Plugin):
                 f"shape {trajectory.ends.shape} and degree {trajectory.degree}. Use Follow(..., max_pieces=...)."
             )
         degrees = trajectory.degrees()
-        if any(degree > most for degree, most in zip(degrees, record.degrees, strict=True)):
+        if any(degree > max_degree for degree, max_degree in zip(degrees, record.degrees, strict=True)):
             raise ConfigError(
                 f"expected degrees of x, y, z and yaw up to {record.degrees}, those of the first trajectories, got "
                 f"{degrees}. Use Follow(..., n_slots=...) to keep room for others."
@@ -170,9 +169,6 @@ class Follow(Plugin):
         """Put another trajectory into a slot of a simulation, between two steps and without compiling it again.
 
         A full reset brings the default data's trajectories back; ``sim.build_default_data()`` makes this one theirs.
-
-        Raises:
-            ConfigError: If there is no such slot, or the trajectory does not fit into it.
         """
         with sim.lock:
             sim.data = self.uploaded(sim.data, slot, trajectory)
@@ -184,7 +180,7 @@ class Follow(Plugin):
         start: ArrayLike | None = None,
         rate: ArrayLike | None = None,
     ) -> None:
-        """Give drones other slots, starts or rates; whatever is None stays as it is.
+        """Give drones other slots, starts or rates; None leaves one unchanged.
 
         Nothing is compiled again, except where a number of all drones becomes one per drone.
 
@@ -194,9 +190,6 @@ class Follow(Plugin):
             start: Times of the worlds at which the drones start, s; may be negative. (), (n_drones,) or (n_worlds,
                 n_drones)
             rate: Speeds at which they go through their trajectories, 1. (), (n_drones,) or (n_worlds, n_drones)
-
-        Raises:
-            ConfigError: If a shape or a value is invalid.
         """
         new = {name: value for name, value in (("index", index), ("start", start), ("rate", rate)) if value is not None}
         with sim.lock:
@@ -224,11 +217,11 @@ class Follow(Plugin):
 
     def _trajectory_list(self) -> list[Trajectory]:
         """Return the given trajectories, one by one."""
-        given = self.trajectories
-        given = given.unstacked() if isinstance(given, Trajectory) else given
-        if not given or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in given):
+        trajectories = self.trajectories
+        trajectories = trajectories.unstacked() if isinstance(trajectories, Trajectory) else trajectories
+        if not trajectories or not all(isinstance(t, Trajectory) and np.ndim(t.ends) == 1 for t in trajectories):
             raise ConfigError(f"expected one or more trajectories of one vehicle each, got {self.trajectories!r}")
-        return list(given)
+        return list(trajectories)
 
 
 def _check_slot_value(sim: Simulation, name: str, value: ArrayLike, n_slots: int) -> Array:
@@ -261,7 +254,7 @@ def _future_paths(record: FollowData, of_drones: list[Array], times: Array) -> A
     """Return the positions of all drones of a world at some times. (n_drones, n_times, 3)"""
 
     def of_one(index: Array, start: Array, rate: Array) -> Array:
-        one = record.replace(index=index, start=start, rate=rate)
-        return jax.vmap(lambda t: one.setpoint(t).pos)(times)
+        vehicle = record.replace(index=index, start=start, rate=rate)
+        return jax.vmap(lambda t: vehicle.setpoint(t).pos)(times)
 
     return jax.vmap(of_one)(*of_drones)

@@ -52,11 +52,7 @@ class PluginRegistry(Mapping[str, Plugin]):
         self._checked = True
 
     def __getitem__(self, name: str) -> Plugin:
-        """Return a plugin.
-
-        Raises:
-            UnknownNameError: If there is none of that name.
-        """
+        """Return a plugin."""
         if name not in self._installed:
             raise UnknownNameError(
                 f"expected the name of an added plugin, got {name!r}. Added are: {', '.join(self) or 'none'}."
@@ -75,7 +71,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def add(self, plugin: P, name: str | None = None) -> P:
         """Add a plugin; see ``Sim.add``."""
         if not isinstance(plugin, Plugin):
-            raise ConfigError(f"expected a plugin, got {plugin!r}. Use sim.add(Wind(...)), or a Plugin of your own.")
+            raise ConfigError(f"expected a plugin, got {plugin!r}. Use sim.add(Wind(...)), or your subclass of Plugin.")
         plugin = plugin if name is None else dataclasses.replace(plugin, name=name)  # type: ignore[type-var]
         name, kind = plugin.name, type(plugin).__name__
         if not isinstance(name, str) or not name:
@@ -170,7 +166,7 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @property
     def reset_stages(self) -> tuple[str, ...]:
-        """Names of stages that do in the first step of an episode what resets have done."""
+        """Names of the stages that reset the plugin in the first step of an episode."""
         resets = self._sim.reset_pipeline
         return tuple([_reset_stage_name(p) for p in self.values() if _in_reset_pipeline(p) and p.name in resets])
 
@@ -180,40 +176,28 @@ class PluginRegistry(Mapping[str, Plugin]):
         return tuple([name for plugin in self.values() for name in self.members_of(plugin)])
 
     def _require_names(self, plugin: Plugin, taken: Collection[str]) -> None:
-        """Check that the members of a population have names of their own.
-
-        Raises:
-            ConfigError: If another has one of these names.
-        """
+        """Check that the names of a population's members are not in use."""
         taken = set(taken)
         twice = [name for name in self.members_of(plugin) if name in taken]
         if twice:
             raise ConfigError(
-                f"expected names that nothing else has, got {twice[0]!r} again. Use "
+                f"expected names that are not in use, got {twice[0]!r} again. Use "
                 f"{type(plugin).__name__}([...]) with other names."
             )
 
     @staticmethod
     def _require_terms(plugin: Plugin, others: Iterable[Plugin]) -> None:
-        """Check that no other plugin replaces the same term of the model.
-
-        Raises:
-            ConfigError: If one does.
-        """
+        """Check that no other plugin replaces the same term of the model."""
         for other in others:
-            if both := set(plugin.replaced_terms) & set(other.replaced_terms):
+            if shared := set(plugin.replaced_terms) & set(other.replaced_terms):
                 raise ConfigError(
-                    f"expected one plugin for {' and '.join(sorted(both))}, got {type(other).__name__} {other.name!r} "
-                    f"and {type(plugin).__name__} {plugin.name!r}, which would both provide it. Use one of the two: "
-                    f"sim.remove({other.name!r}) removes the first."
+                    f"expected one plugin for {' and '.join(sorted(shared))}, got {type(other).__name__} "
+                    f"{other.name!r} and {type(plugin).__name__} {plugin.name!r}, which would both provide it. "
+                    f"Use one of the two: sim.remove({other.name!r}) removes the first."
                 )
 
     def check(self) -> None:
-        """Check that the plugins have each other as they need, if they have changed since the last check.
-
-        Raises:
-            ConfigError: If one lacks another, or two do not go together.
-        """
+        """Check the plugins that each plugin requires, if the plugins have changed since the last check."""
         if not self._checked:
             for plugin in self.values():
                 plugin.check_plugins(self._sim)
@@ -239,7 +223,7 @@ class PluginRegistry(Mapping[str, Plugin]):
     def measured_states(self, data: SimData) -> SimData:
         """Return the data of one world with the states that sensors measure in place of the true ones."""
         plugins = tuple(self.values())
-        return data.replace(states=vmap_drones(lambda one: with_measured_states(plugins, one).states)(data))
+        return data.replace(states=vmap_drones(lambda drone: with_measured_states(plugins, drone).states)(data))
 
     def with_moved_objects(self, data: SimData) -> SimData:
         """Return the data with the objects of plugins at their poses, unless recorded poses are shown."""
@@ -258,7 +242,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             plugin.draw(self._sim, world)
 
     def _put_records(self, name: str, record: PyTree | None, default: PyTree | None) -> None:
-        """Put a record into the data and the default data, or remove it; nothing else of either changes.
+        """Put a record into the data and the default data, or remove it, without other changes.
 
         Both records go through ``sim.data``, which puts them on the simulation's devices.
         """
@@ -309,12 +293,7 @@ def _reset_stage_name(plugin: Plugin) -> str:
 
 
 def _add_stages(pipeline: Pipeline, plugin: Plugin, placements: object) -> tuple[Pipeline, _Installed]:
-    """Return the pipeline with the stages of a plugin, and the plugin with what it changed.
-
-    Raises:
-        ConfigError: If ``placements`` is no list of ``StagePlacement``, or the name of a stage is taken.
-        UnknownNameError: If there is no stage to go in front of.
-    """
+    """Return the pipeline with the stages of a plugin, and the plugin with its changes to the pipeline."""
     if not isinstance(placements, (list, tuple)) or not all(isinstance(x, StagePlacement) for x in placements):
         raise ConfigError(
             f"expected stages of plugin {plugin.name!r} to return a list of StagePlacement, got {placements!r}. Use "
@@ -341,11 +320,7 @@ def _add_stage(pipeline: Pipeline, placement: StagePlacement, name: str, install
 
 
 def _remove_stages(pipeline: Pipeline, installed: _Installed) -> Pipeline:
-    """Return the pipeline without the stages of a plugin, and with the stages that it had replaced.
-
-    Raises:
-        ConfigError: If one of its stages has been replaced since.
-    """
+    """Return the pipeline without the stages of a plugin, and with the stages that it had replaced."""
     for name, stage in installed.stages.items():
         if pipeline.get(name, stage) is not stage:
             raise ConfigError(
@@ -358,11 +333,7 @@ def _remove_stages(pipeline: Pipeline, installed: _Installed) -> Pipeline:
 
 
 def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | None = None) -> Pipeline:
-    """Return the pipeline whose integration applies the influences and derivatives of some plugins.
-
-    Raises:
-        ConfigError: If the one that is being added has any, and the integration is not the built-in one.
-    """
+    """Return the pipeline whose integration applies the influences and derivatives of some plugins."""
     dynamic = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
     constraining = [p.name for p in dynamic if p.constrains]
     if len(constraining) > 1:
@@ -402,14 +373,14 @@ def _continue_states(record: PyTree | None, before: PyTree | None) -> PyTree | N
     """Return a record with the states of the record before, as far as the shapes agree."""
     if record is None or type(record) is not type(before):
         return record
-    kept = {}
+    states = {}
     for f in dataclasses.fields(record):  # type: ignore[arg-type]
         new, old = getattr(record, f.name), getattr(before, f.name)
         if isinstance(new, PyTree):
-            kept[f.name] = _continue_states(new, old)
+            states[f.name] = _continue_states(new, old)
         elif not f.metadata.get("static") and f.metadata.get("scope") not in _SETTING_SCOPES:
-            kept[f.name] = old if _signature(old) == _signature(new) else new
-    return record.replace(**kept)
+            states[f.name] = old if _signature(old) == _signature(new) else new
+    return record.replace(**states)
 
 
 def _signature(tree: object) -> tuple[object, list[tuple[object, ...]]]:
@@ -421,10 +392,10 @@ def _no_observations(_data: SimData, **_: Any) -> dict[str, Array]:
 
 
 def _observations(plugins: Sequence[Plugin], data: SimData, measured: bool) -> dict[str, Array]:
-    def of_one(one: SimData) -> dict[str, Array]:
-        seen = with_measured_states(plugins, one) if measured else one
-        each = [(p, one if isinstance(p, Sensor) else seen) for p in plugins]
-        return {f"{p.name}.{key}": x for p, known in each for key, x in p.observations(known).items()}
+    def of_one(drone: SimData) -> dict[str, Array]:
+        measured_drone = with_measured_states(plugins, drone) if measured else drone
+        sources = [(p, drone if isinstance(p, Sensor) else measured_drone) for p in plugins]
+        return {f"{p.name}.{key}": x for p, values in sources for key, x in p.observations(values).items()}
 
     leaves, axes = jax.tree.leaves(data), Axes(data)
     worlds = [0 if n_batch_axes(scope) == 2 else None for scope in axes.scopes]

@@ -42,8 +42,6 @@ class BatchRenderer:
 
         Raises:
             ImportError: If warp-lang is not installed.
-            UnknownNameError: If there is no such camera.
-            ConfigError: If it is the free camera, or the size is invalid.
         """
         if not is_installed():
             raise ImportError(INSTALL_MESSAGE)

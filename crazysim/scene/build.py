@@ -1,4 +1,4 @@
-"""Construction of the scene: a base file, one mocap body per drone, and what the user adds."""
+"""Construction of the scene: a base file, one mocap body per drone, and the user's objects."""
 
 from __future__ import annotations
 
@@ -41,10 +41,11 @@ def build_spec(
     spec = xml_path if isinstance(xml_path, mujoco.MjSpec) else read_spec(xml_path)
     spec.option.timestep = 1 / freq
     spec.add_numeric(name="max_geom_pairs", data=[max_geom_pairs])
-    taken = [body.name for body in spec.bodies if body.name.startswith("drone:")]
-    if taken:
+    reserved = [body.name for body in spec.bodies if body.name.startswith("drone:")]
+    if reserved:
         raise ConfigError(
-            f"expected no bodies named 'drone:...', which are reserved for the drones, got {taken} in {str(xml_path)!r}"
+            f"expected no bodies named 'drone:...', which are reserved for the drones, got {reserved} in "
+            f"{str(xml_path)!r}"
         )
     _add_drones(spec, airframes)
     # mjx.kinematics refuses a model without any degree of freedom, and mocap bodies have none.
@@ -143,7 +144,7 @@ def use_boxes(spec: mujoco.MjSpec, n_drones: int, enable: bool) -> None:
 
 
 def _set_touching(geom: mujoco.MjsGeom, touches: bool) -> None:
-    """Let a geom of a drone touch the scene, other drones, and what only drones touch (bit 2), or nothing."""
+    """Make a geom of a drone touch the scene, other drones, and geoms that only drones touch (bit 2), or no geom."""
     geom.contype, geom.conaffinity = (3, 1) if touches else (0, 0)
 
 
@@ -173,19 +174,15 @@ def put_model(mj_model: mujoco.MjModel, device: jax.Device) -> mjx.Model:
 
 
 def make_data(mj_model: mujoco.MjModel, n_worlds: int, device: jax.Device) -> mjx.Data:
-    """Return the initial state of the scene in every world. (n_worlds, ...)
-
-    Raises:
-        ConfigError: With MJX's message, if MJX does not support the scene.
-    """
+    """Return the initial state of the scene in every world. (n_worlds, ...)"""
     with _explain_mjx_errors():
-        one = mjx.put_data(mj_model, mujoco.MjData(mj_model), device=device)
-    return _repeat_worlds(one, n_worlds)
+        world = mjx.put_data(mj_model, mujoco.MjData(mj_model), device=device)
+    return _repeat_worlds(world, n_worlds)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _repeat_worlds(one: mjx.Data, n: int) -> mjx.Data:
-    return jax.tree.map(lambda x: jnp.repeat(x[None], n, axis=0), one)
+def _repeat_worlds(world: mjx.Data, n: int) -> mjx.Data:
+    return jax.tree.map(lambda x: jnp.repeat(x[None], n, axis=0), world)
 
 
 @contextlib.contextmanager
@@ -200,17 +197,13 @@ def _explain_mjx_errors() -> Iterator[None]:
 
 
 def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> mjx.Data:
-    """Return a scene's state that a user has written poses into, with these as floats.
-
-    Raises:
-        ConfigError: If the poses are not one per world and mocap body, or come from the host and are not finite.
-    """
+    """Return a scene's state that a user has written poses into, with these as floats."""
     changes = {}
     for name, size in (("mocap_pos", 3), ("mocap_quat", 4)):
-        value, needed = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
-        if np.shape(value) != needed:
+        value, shape = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)
+        if np.shape(value) != shape:
             raise ConfigError(
-                f"expected mjx_data.{name} of shape {needed} = (n_worlds, mocap bodies, {size}), got "
+                f"expected mjx_data.{name} of shape {shape} = (n_worlds, mocap bodies, {size}), got "
                 f"{np.shape(value)}. To move some bodies use sim.mjx_data.{name}.at[:, ids].set(...)."
             )
         if not isinstance(value, jax.Array) and not np.isfinite(value).all():
@@ -228,11 +221,7 @@ def spec_mocap_ids(spec: mujoco.MjSpec) -> dict[str, int]:
 
 
 def mocap_ids(mj_model: mujoco.MjModel, names: Iterable[str]) -> list[int]:
-    """Return the mocap ids of bodies.
-
-    Raises:
-        ConfigError: If the scene has lost one of them.
-    """
+    """Return the mocap ids of bodies."""
     ids = []
     for name in names:
         body = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)

@@ -110,9 +110,6 @@ def collision_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds 
         model: Compiled scene.
         handles: Bodies with handles, in the order of ``data.objects``.
         kinds: Drones of each airframe.
-
-    Raises:
-        ConfigError: If a geom has an unsupported type.
     """
 
     def touches(geom: int) -> bool:
@@ -131,9 +128,6 @@ def visual_model(model: mujoco.MjModel, handles: Sequence[str], kinds: Kinds = (
         model: Compiled scene.
         handles: Bodies with handles, in the order of ``data.objects``.
         kinds: Drones of each airframe.
-
-    Raises:
-        ConfigError: If a geom has an unsupported type.
     """
 
     def is_seen(geom: int) -> bool:
@@ -216,24 +210,24 @@ def _shape(model: mujoco.MjModel, geom: int) -> Shape:
     if kind == "hfield":
         field = int(model.geom_dataid[geom])
         rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
-        begin = int(model.hfield_adr[field])
-        heights = model.hfield_data[begin : begin + rows * columns].reshape(rows, columns)
+        start = int(model.hfield_adr[field])
+        heights = model.hfield_data[start : start + rows * columns].reshape(rows, columns)
         return hfield(heights * model.hfield_size[field][2], tuple(map(float, model.hfield_size[field])))
     return Shape(kind, tuple(map(float, size)))
 
 
 def _hull(model: mujoco.MjModel, mesh: int) -> Shape:
-    """Return the convex hull of a mesh, by which MuJoCo too computes contacts.
+    """Return the convex hull of a mesh, with which MuJoCo computes contacts, too.
 
     MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices
     of the vertices in the mesh, edges, and three vertices for each face.
     """
     first, n = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     vertices = np.asarray(model.mesh_vert[first : first + n], np.float64)
-    at = int(model.mesh_graphadr[mesh])
-    if at < 0:
+    start = int(model.mesh_graphadr[mesh])
+    if start < 0:
         return hull(vertices)
-    graph = model.mesh_graph[at:]
+    graph = model.mesh_graph[start:]
     n_vertices, n_faces = int(graph[0]), int(graph[1])
-    begin = 2 + 2 * n_vertices + n_vertices + 3 * n_faces
-    return hull(vertices, np.asarray(graph[begin : begin + 3 * n_faces]).reshape(-1, 3))
+    face_start = 2 + 2 * n_vertices + n_vertices + 3 * n_faces
+    return hull(vertices, np.asarray(graph[face_start : face_start + 3 * n_faces]).reshape(-1, 3))

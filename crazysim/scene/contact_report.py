@@ -71,10 +71,10 @@ class ContactReport(PyTree):
     @property
     def any(self) -> Array:
         """True where a drone touches anything that was requested. (n_worlds, n_drones)"""
-        found = [x for x in (self.floor, self.drones) if x is not None]
+        masks = [x for x in (self.floor, self.drones) if x is not None]
         if self.objects is not None:
-            found.append(jnp.any(self.objects, axis=-1))
-        return functools.reduce(jnp.logical_or, found)
+            masks.append(jnp.any(self.objects, axis=-1))
+        return functools.reduce(jnp.logical_or, masks)
 
 
 ObjectSelection = Iterable[Handle | str] | Handle | str | None
@@ -98,16 +98,13 @@ def build_contact_fn(
         floor: True to report the floor.
         drones: True to report other drones. For one drone this needs a stage, and ``nearest_drone`` is None there.
         plugins: Function that returns the plugins of the simulation, which move their objects first.
-
-    Raises:
-        ConfigError: If nothing is requested, or an object does not exist.
     """
     floor, drones = check_flag("floor", floor), check_flag("drones", drones)
-    chosen = select_bodies(model, objects, in_data=False)
-    names = tuple(body.name for body in chosen)
-    if not (chosen or floor or drones):
+    bodies = select_bodies(model, objects, in_data=False)
+    names = tuple(body.name for body in bodies)
+    if not (bodies or floor or drones):
         raise ConfigError("expected floor, drones or at least one object, got a contact report of nothing")
-    groups = [list(group) for _, group in groupby(chosen, _group_key)]
+    groups = [list(group) for _, group in groupby(bodies, _group_key)]
 
     def contacts(data: SimData, mocap: MocapPoses = None) -> ContactReport:
         require_poses(model, names, mocap)
@@ -116,31 +113,33 @@ def build_contact_fn(
         pos, quat = data.states.pos, data.states.quat
         all_geoms = [geom for kind in model.drones for geom in kind.geoms]
         drone_rot = rotation.matrix(quat) if any(geom.shape.kind != "sphere" for geom in all_geoms) else None
-        own = [
+        parts = [
             (geom, pos + rotation.rotate(quat, jnp.asarray(geom.pos, pos.dtype)), present)
             for kind in model.drones
             for present in (kind.drone_mask(data.core.drone_id),)
             for geom in kind.geoms
         ]
-        found: dict[str, Array | None] = dict.fromkeys(
+        fields: dict[str, Array | None] = dict.fromkeys(
             ("floor", "floor_distance", "objects", "object_distance", "nearest_object", "drones", "drone_distance",
              "nearest_drone")
         )  # fmt: skip
         if floor:
             gaps = [
-                _mask_absent(has, _geom_distance(mine, at, drone_rot, geom))
-                for mine, at, has in own
+                _mask_absent(has, _geom_distance(mine, part_pos, drone_rot, geom))
+                for mine, part_pos, has in parts
                 for geom in model.floor
             ]
             gap = _minimum(gaps, pos)
-            found |= {"floor": gap < 0, "floor_distance": gap}
-        if chosen:
-            gap = jnp.concatenate([_group_distances(own, drone_rot, group, data) for group in groups], axis=-1)
-            found |= {"objects": gap < 0, "object_distance": gap, "nearest_object": _argmin(gap)}
+            fields |= {"floor": gap < 0, "floor_distance": gap}
+        if bodies:
+            gap = jnp.concatenate([_group_distances(parts, drone_rot, group, data) for group in groups], axis=-1)
+            fields |= {"objects": gap < 0, "object_distance": gap, "nearest_object": _argmin(gap)}
         if drones:
-            gap, nearest = (_nearest_other(own, drone_rot), None) if pos.ndim == 1 else _nearest_drones(own, drone_rot)
-            found |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
-        return ContactReport(**found, object_names=names)
+            gap, nearest = (
+                (_nearest_other(parts, drone_rot), None) if pos.ndim == 1 else _nearest_drones(parts, drone_rot)
+            )
+            fields |= {"drones": gap < 0, "drone_distance": gap, "nearest_drone": nearest}
+        return ContactReport(**fields, object_names=names)
 
     return contacts
 
@@ -152,9 +151,6 @@ def select_bodies(model: CollisionModel, objects: ObjectSelection, in_data: bool
         model: Collision model of the scene.
         objects: Handles or names; None for all, () for none.
         in_data: True to refuse bodies whose poses are not part of the data, for use in a step.
-
-    Raises:
-        ConfigError: If an object does not exist or, with ``in_data``, is moved through ``mjx_data``.
     """
     by_name = {body.name: body for body in model.objects}
     if objects is None:
@@ -201,14 +197,17 @@ def _mask_absent(present: Array | None, gap: Array) -> Array:
     return gap if present is None else jnp.where(present, gap, jnp.inf)
 
 
-def _group_distances(own: DroneParts, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
+def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[CollisionBody], data: SimData) -> Array:
     """Return the distances to objects with equal geoms, m. (..., n)"""
     geoms = group[0].geoms
     if group[0].row is None:
         if len(group) > MAX_UNROLLED_GEOMS:
             stacked = StackedGeoms.of([body.geoms[0] for body in group])
-            return _minimum([_stacked_distances(mine, at, drone_rot, stacked, has) for mine, at, has in own], own[0][1])
-        return jnp.stack([_fixed_distance(own, drone_rot, body.geoms) for body in group], axis=-1)
+            return _minimum(
+                [_stacked_distances(mine, part_pos, drone_rot, stacked, has) for mine, part_pos, has in parts],
+                parts[0][1],
+            )
+        return jnp.stack([_fixed_distance(parts, drone_rot, body.geoms) for body in group], axis=-1)
     objects = data.objects
     rows = [body.row for body in group if body.row is not None]
     run = slice(rows[0], rows[-1] + 1) if rows == list(range(rows[0], rows[-1] + 1)) else np.array(rows)
@@ -217,14 +216,14 @@ def _group_distances(own: DroneParts, drone_rot: Array | None, group: list[Colli
     if drone_rot is not None:
         rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
     gaps = []
-    for mine, at, has in own:
-        inside = rotation.rotate_inverse(quat, at[..., None, :] - pos)
+    for mine, part_pos, has in parts:
+        inside = rotation.rotate_inverse(quat, part_pos[..., None, :] - pos)
         of_each = None if has is None else has[..., None]
         gaps += [_mask_absent(of_each, _geom_distance(mine, inside, rot, geom)) for geom in geoms]
-    return _minimum(gaps, own[0][1])
+    return _minimum(gaps, parts[0][1])
 
 
-def _fixed_distance(own: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
+def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
     """Return the distance to the nearest of some geoms in the world frame, m. (...)
 
     Of many of one shape, the distances are computed side by side.
@@ -233,13 +232,15 @@ def _fixed_distance(own: DroneParts, drone_rot: Array | None, geoms: Sequence[Co
     for geom in geoms:
         kinds.setdefault((geom.shape, geom.rot is None), []).append(geom)
     gaps = []
-    for alike in kinds.values():
-        for mine, at, has in own:
-            if len(alike) > MAX_UNROLLED_GEOMS:
-                gaps.append(jnp.min(_stacked_distances(mine, at, drone_rot, StackedGeoms.of(alike), has), axis=-1))
+    for equal_geoms in kinds.values():
+        for mine, part_pos, has in parts:
+            if len(equal_geoms) > MAX_UNROLLED_GEOMS:
+                gaps.append(
+                    jnp.min(_stacked_distances(mine, part_pos, drone_rot, StackedGeoms.of(equal_geoms), has), axis=-1)
+                )
             else:
-                gaps += [_mask_absent(has, _geom_distance(mine, at, drone_rot, geom)) for geom in alike]
-    return _minimum(gaps, own[0][1])
+                gaps += [_mask_absent(has, _geom_distance(mine, part_pos, drone_rot, geom)) for geom in equal_geoms]
+    return _minimum(gaps, parts[0][1])
 
 
 class StackedGeoms(NamedTuple):
@@ -260,34 +261,34 @@ class StackedGeoms(NamedTuple):
 
 
 def _stacked_distances(
-    mine: CollisionGeom, at: Array, drone_rot: Array | None, geoms: StackedGeoms, present: Array | None
+    mine: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, present: Array | None
 ) -> Array:
     """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
-    turned = None if drone_rot is None else drone_rot[..., None, :, :]
-    gap = _geom_distance(mine, at[..., None, :], turned, geoms)
+    rot = None if drone_rot is None else drone_rot[..., None, :, :]
+    gap = _geom_distance(mine, part_pos[..., None, :], rot, geoms)
     return _mask_absent(None if present is None else present[..., None], gap)
 
 
 def _geom_distance(
-    mine: CollisionGeom, at: Array, drone_rot: Array | None, geom: CollisionGeom | StackedGeoms
+    mine: CollisionGeom, part_pos: Array, drone_rot: Array | None, geom: CollisionGeom | StackedGeoms
 ) -> Array:
     """Return the distance of a drone's geom to another geom, m. (...)
 
     Args:
         mine: Geom of the drone.
-        at: Its position in the frame in which the other is given, m. (..., 3)
+        part_pos: Its position in the frame in which the other geom is given, m. (..., 3)
         drone_rot: Attitude of the drone in that frame; None if all its geoms are spheres. (..., 3, 3)
         geom: The other geom, or several along the last batch axis.
     """
-    inside = at - jnp.asarray(geom.pos, at.dtype)
+    inside = part_pos - jnp.asarray(geom.pos, part_pos.dtype)
     rot = drone_rot
     if geom.rot is not None:
-        columns = jnp.asarray(geom.rot, at.dtype)
+        columns = jnp.asarray(geom.rot, part_pos.dtype)
         x, y, z = (inside[..., k, None] * columns[..., k, :] for k in range(3))
         inside = x + y + z
         rot = None if drone_rot is None else _product(jnp.swapaxes(columns, -1, -2), drone_rot)
     if rot is not None and mine.rot is not None:
-        rot = _product(rot, jnp.asarray(mine.rot, at.dtype))
+        rot = _product(rot, jnp.asarray(mine.rot, part_pos.dtype))
     return distance(mine.shape, geom.shape, inside, jnp.eye(3) if rot is None else rot)
 
 
@@ -297,56 +298,58 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _minimum(gaps: list[Array], pos: Array) -> Array:
-    """Return the smallest of some distances, infinite if there are none. (...)"""
+    """Return the smallest distance, infinite without any. (...)"""
     if not gaps:
         return jnp.full(pos.shape[:-1], jnp.inf, pos.dtype)
     return functools.reduce(lambda a, b: jnp.where(b < a, b, a), gaps)
 
 
-def _nearest_other(own: DroneParts, drone_rot: Array | None) -> Array:
+def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
     """Return the distance of one drone to the nearest other of its world, m. ()"""
 
     def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
         positions, theirs, rot = other
         inverse = None if rot is None else rot.T
-        turned = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
+        relative_rot = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
-        for mine, at, has in own:
-            for (geom, *_), there, other_has in zip(own, positions, theirs, strict=True):
-                inside = at - there if inverse is None else rotation.matvec(inverse, at - there)
-                both = None if has is None or other_has is None else has & other_has
-                gaps.append(_mask_absent(both, distance(mine.shape, geom.shape, inside, turned)))
-        return jnp.where(is_self, jnp.inf, _minimum(gaps, own[0][1]))
+        for mine, part_pos, has in parts:
+            for (geom, *_), other_pos, other_has in zip(parts, positions, theirs, strict=True):
+                inside = part_pos - other_pos if inverse is None else rotation.matvec(inverse, part_pos - other_pos)
+                are_present = None if has is None or other_has is None else has & other_has
+                gaps.append(_mask_absent(are_present, distance(mine.shape, geom.shape, inside, relative_rot)))
+        return jnp.where(is_self, jnp.inf, _minimum(gaps, parts[0][1]))
 
-    return reduce_over_others(between, ([at for _, at, _ in own], [has for *_, has in own], drone_rot), "min")
+    return reduce_over_others(
+        between, ([part_pos for _, part_pos, _ in parts], [has for *_, has in parts], drone_rot), "min"
+    )
 
 
-def _nearest_drones(own: DroneParts, drone_rot: Array | None) -> tuple[Array, Array]:
+def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, Array]:
     """Return the distance to the nearest other drone, m, and its index. (..., n_drones)
 
     In a large swarm the distances of ``DRONES_PER_CHUNK`` drones to all others are computed at a time, so memory grows
     linearly with the swarm.
     """
-    n = own[0][1].shape[-2]
+    n = parts[0][1].shape[-2]
     indices = jnp.arange(n, dtype=np.int32)
 
     def of_chunk(chunk: Array) -> tuple[Array, Array]:
         gaps = []
-        for mine, at, has in own:
-            here = jnp.take(at, chunk, axis=-2)[..., :, None, :]
-            for geom, other, other_has in own:
-                both = None
+        for mine, part_pos, has in parts:
+            chunk_pos = jnp.take(part_pos, chunk, axis=-2)[..., :, None, :]
+            for geom, other, other_has in parts:
+                are_present = None
                 if has is not None and other_has is not None:
-                    both = jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
-                offset = here - other[..., None, :, :]
+                    are_present = jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
+                offset = chunk_pos - other[..., None, :, :]
                 if drone_rot is None:
-                    gaps.append(_mask_absent(both, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
+                    gaps.append(_mask_absent(are_present, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
                     continue
                 inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
                 inside = rotation.matvec(inverse, offset)
                 rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
-                gaps.append(_mask_absent(both, distance(mine.shape, geom.shape, inside, rot)))
-        gap = jnp.where(chunk[:, None] == indices, jnp.inf, _minimum(gaps, own[0][1]))
+                gaps.append(_mask_absent(are_present, distance(mine.shape, geom.shape, inside, rot)))
+        gap = jnp.where(chunk[:, None] == indices, jnp.inf, _minimum(gaps, parts[0][1]))
         return jnp.min(gap, axis=-1), _argmin(gap)
 
     if n <= DRONES_PER_CHUNK:

@@ -17,11 +17,7 @@ def contact_flags(mjx_data: mjx.Data) -> Array:
 
 
 def body_contact_flags(mjx_data: mjx.Data, mj_model: mujoco.MjModel, body: str) -> Array:
-    """Return True for every contact slot whose two geoms touch and one of which is part of a body. (n_worlds, n_slots)
-
-    Raises:
-        UnknownNameError: If the scene has no such body.
-    """
+    """Return a mask of the contact slots in which a geom of the body touches another geom. (n_worlds, n_slots)"""
     is_of_body = mj_model.geom_bodyid == body_id(mj_model, body)
     contact = mjx_data._impl.contact
     return _slot_flags(contact.dist, contact.geom1, contact.geom2, is_of_body)
@@ -35,14 +31,10 @@ def _slot_flags(dist: Array, geom1: Array, geom2: Array, is_of_body: Array) -> A
 
 
 def body_id(mj_model: mujoco.MjModel, body: str) -> int:
-    """Return the id of a body.
-
-    Raises:
-        UnknownNameError: If the scene has no such body.
-    """
-    found = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
-    if found < 0:
+    """Return the id of a body."""
+    index = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, body) if isinstance(body, str) else -1
+    if index < 0:
         names = [name for name in (mj_model.body(i).name for i in range(mj_model.nbody)) if not name.startswith("_")]
         listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
         raise UnknownNameError(f"expected a body of the scene, {listed}, got {body!r}")
-    return found
+    return index

@@ -63,20 +63,16 @@ def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str])
         model: Compiled scene.
         name: Name or id.
         objects: Bodies with poses in ``data.objects``, then bodies that are moved through ``mjx_data``.
-
-    Raises:
-        UnknownNameError: If there is no such camera.
-        ConfigError: If it aims at a body.
     """
-    known = [model.camera(i).name for i in range(model.ncam)]
+    names = [model.camera(i).name for i in range(model.ncam)]
     if isinstance(name, (int, np.integer)) and 0 <= name < model.ncam:
         ids = [int(name)]
-    elif name in known:
-        ids = [known.index(name)]  # type: ignore[arg-type]
+    elif name in names:
+        ids = [names.index(name)]  # type: ignore[arg-type]
     else:
-        ids = [i for i, camera in enumerate(known) if isinstance(name, str) and camera.rpartition(":")[0] == name]
+        ids = [i for i, camera in enumerate(names) if isinstance(name, str) and camera.rpartition(":")[0] == name]
     if not ids:
-        listed = ", ".join(dict.fromkeys(camera.rpartition(":")[0] or camera for camera in known))
+        listed = ", ".join(dict.fromkeys(camera.rpartition(":")[0] or camera for camera in names))
         raise UnknownNameError(f"expected a camera of the scene, {listed or 'which has none'}, got {name!r}")
     return [_read_camera(model, i, objects) for i in ids]
 
@@ -136,11 +132,7 @@ def build_depth_fn(
     plugins: ListPlugins,
     kernels: RayKernels,
 ) -> DepthFn:
-    """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``.
-
-    Raises:
-        ConfigError: If ``along``, the width or the height is invalid.
-    """
+    """Return ``depth(data, mocap=None) -> Hits`` (n_worlds, n_cameras, height, width); see ``Scene.depth_fn``."""
     if along not in ("axis", "ray"):
         raise ConfigError(f"expected along='axis' of the camera or along='ray', got {along!r}")
     drones, hide_own = check_flag("drones", drones), check_flag("hide_own", hide_own)
@@ -163,7 +155,7 @@ def build_depth_fn(
         hits = hits.replace(distance=hits.distance * cosine)
 
         def picture(x: Array) -> Array:
-            """Return what tiles of rays found as a picture, row by row."""
+            """Return the results of tiles of rays as a picture, row by row."""
             x = x.reshape(x.shape[0], len(cameras), height // h, width // w, h, w, *x.shape[2:])
             return jnp.moveaxis(x, 4, 3).reshape(*x.shape[:2], height, width, *x.shape[6:])
 
@@ -176,8 +168,8 @@ def build_depth_fn(
         bodies = [*(body.name for body in model.objects), *(c.body for c in cameras)]
         require_poses(model, bodies, mocap)
         data = with_mocap_bodies(model, with_moved_objects(data, moving_plugins(plugins(), bodies)), mocap)
-        most = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
-        n_worlds, at_a_time = data.core.n_worlds, max(1, most // n_rays)
+        max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
+        n_worlds, at_a_time = data.core.n_worlds, max(1, max_rays // n_rays)
         if n_worlds <= at_a_time:
             return of_worlds(data)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
@@ -200,8 +192,10 @@ def _camera_pose(camera: Camera, data: SimData) -> tuple[Array, Array]:
         return jnp.broadcast_to(pos, (n, 3)), jnp.broadcast_to(rot, (n, 3, 3))
     objects = data.objects
     poses = (states.pos, states.quat) if camera.carrier == "drone" else (objects.pos[:, 0], objects.quat[:, 0])
-    at, quat = (x[:, camera.row] for x in poses)
+    camera_pos, quat = (x[:, camera.row] for x in poses)
     if not camera.turns:
-        return at + pos, jnp.broadcast_to(rot, (n, 3, 3))
+        return camera_pos + pos, jnp.broadcast_to(rot, (n, 3, 3))
     # By components: a GPU may round matrix products to 10 bits.
-    return at + rotation.rotate(quat, pos), jnp.stack([rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1)
+    return camera_pos + rotation.rotate(quat, pos), jnp.stack(
+        [rotation.rotate(quat, rot[:, k]) for k in range(3)], axis=-1
+    )

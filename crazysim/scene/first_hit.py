@@ -30,7 +30,7 @@ NOBODY, NO_DRONE = -1, -2
 """Drone that a ray passes through if it passes through none, and owner of geoms that belong to no drone."""
 
 BALL_SLACK = 1e-3
-"""Part of its radius by which a ball is larger, beside ``hierarchy.BOX_PADDING``, for rounding."""
+"""Relative enlargement of a ball for rounding, in addition to ``hierarchy.BOX_PADDING``."""
 
 Surface = Shape | str
 """A mesh or height field, or the kind of shapes that their sizes describe."""
@@ -114,19 +114,19 @@ class Targets:
             model: Model, without bodies whose poses are not part of the data.
             n_drones: Drones of a world.
             drones: True for rays to meet drones.
-            passed: Drone that all rays pass through; ``NOBODY`` if there is none.
+            passed: Drone that all rays pass through; ``NOBODY`` for no drone.
         """
-        found = [Target(geom, "world", 0, 0) for geom in model.floor]
+        targets = [Target(geom, "world", 0, 0) for geom in model.floor]
         for number, body in enumerate(model.objects, start=1):
             carrier = "world" if body.row is None else "object"
-            found += [Target(geom, carrier, body.row or 0, number) for geom in body.geoms]
+            targets += [Target(geom, carrier, body.row or 0, number) for geom in body.geoms]
         for kind in model.drones if drones else ():
             for row in range(n_drones) if kind.drones is None else kind.drones:
                 if row != passed:
-                    found += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in kind.geoms]
-        self.fixed = [x for x in found if x.carrier == "world"]
+                    targets += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in kind.geoms]
+        self.fixed = [x for x in targets if x.carrier == "world"]
         """Geoms that do not move."""
-        self.movable = [x for carrier in ("object", "drone") for x in found if x.carrier == carrier]
+        self.movable = [x for carrier in ("object", "drone") for x in targets if x.carrier == carrier]
         """Geoms of movable objects, then geoms of drones."""
         self.all = [*self.fixed, *self.movable]
         """All of them, in the order of their indices."""
@@ -161,28 +161,28 @@ class Targets:
         n_worlds = states.pos.shape[0]
         balls, geoms = [jnp.zeros((n_worlds, 0, 4), dtype)], [jnp.zeros((n_worlds, 0, 16), dtype)]
         for carrier in ("object", "drone"):
-            some = [x for x in self.movable if x.carrier == carrier]
-            if not some:
+            targets = [x for x in self.movable if x.carrier == carrier]
+            if not targets:
                 continue
             if carrier == "object" and data.objects is not None:
                 poses = data.objects.pos[:, 0], data.objects.quat[:, 0]
             else:
                 poses = states.pos, states.quat
-            pos, quat = (x[:, np.array([t.row for t in some])] for x in poses)
-            own = np.array([t.numbers(np.array(t.geom.pos)) for t in some])
-            rot = own[:, 4:13].reshape(-1, 3, 3)
-            middles = [r @ bounding_box(t.geom.shape)[0] for r, t in zip(rot, some, strict=True)]
-            radii = np.array([bounding_radius(t.geom.shape) for t in some])
-            centre = pos + rotation.rotate(quat, jnp.asarray(own[:, :3] + np.array(middles), dtype))
+            pos, quat = (x[:, np.array([t.row for t in targets])] for x in poses)
+            rows = np.array([t.numbers(np.array(t.geom.pos)) for t in targets])
+            rot = rows[:, 4:13].reshape(-1, 3, 3)
+            middles = [r @ bounding_box(t.geom.shape)[0] for r, t in zip(rot, targets, strict=True)]
+            radii = np.array([bounding_radius(t.geom.shape) for t in targets])
+            centre = pos + rotation.rotate(quat, jnp.asarray(rows[:, :3] + np.array(middles), dtype))
             radius = jnp.broadcast_to(
                 jnp.asarray(radii * (1 + BALL_SLACK) + hierarchy.BOX_PADDING, dtype), centre.shape[:2]
             )
             balls.append(jnp.concatenate([centre, radius[..., None]], axis=-1))
-            at = pos + rotation.rotate(quat, jnp.asarray(own[:, :3], dtype))
+            geom_pos = pos + rotation.rotate(quat, jnp.asarray(rows[:, :3], dtype))
             axes = jnp.stack([rotation.rotate(quat, jnp.asarray(rot[:, :, k], dtype)) for k in range(3)], axis=-1)
-            size = jnp.broadcast_to(jnp.asarray(own[:, 13:], dtype), (*at.shape[:2], 3))
-            zero = jnp.zeros_like(at[..., :1])
-            geoms.append(jnp.concatenate([at, zero, axes.reshape(*at.shape[:2], 9), size], axis=-1))
+            size = jnp.broadcast_to(jnp.asarray(rows[:, 13:], dtype), (*geom_pos.shape[:2], 3))
+            zero = jnp.zeros_like(geom_pos[..., :1])
+            geoms.append(jnp.concatenate([geom_pos, zero, axes.reshape(*geom_pos.shape[:2], 9), size], axis=-1))
         return jnp.concatenate(balls, axis=1), jnp.concatenate(geoms, axis=1)
 
     def tables(self, balls: Array, geoms: Array, eyes: Array, pixels: Array) -> Tables:
@@ -196,9 +196,9 @@ class Targets:
         """
         fixed = self.hierarchy(eyes.dtype)
         counts = np.array([[len(fixed.boxes) // hierarchy.N_ORDERS, len(self.fixed), len(self.movable)]], np.int32)
-        found = (jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], balls, geoms, eyes, pixels)
+        tables = (jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], balls, geoms, eyes, pixels)
         # No table is empty, since one of no rows has no memory.
-        flat = [x.reshape(-1, x.shape[-1]) for x in found]
+        flat = [x.reshape(-1, x.shape[-1]) for x in tables]
         return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
 
 
@@ -220,7 +220,7 @@ BestHit = tuple[Array, Array]
 def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index: Array, *tables: Array) -> BestHit:
     """Return the distance to the first geom that a ray meets, and the index of the geom; see ``Targets.all``.
 
-    Of geoms at the same distance it is the one of the lowest index.
+    Of geoms at the same distance the lowest index is returned.
 
     Args:
         surfaces: Surfaces that there are.
@@ -384,6 +384,6 @@ def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) ->
         return (k + 1, (near, far, meets & ~(parallel & (below < 0)))), None
 
     infinite = jnp.full_like(origin[0], jnp.inf)
-    begin = jnp.int32(0), (-infinite, infinite, infinite > 0)
-    (_, (near, far, meets)), _ = lax.scan(turn, begin, length=len(planes))
+    initial = jnp.int32(0), (-infinite, infinite, infinite > 0)
+    (_, (near, far, meets)), _ = lax.scan(turn, initial, length=len(planes))
     return first_distance((near, far, meets & (near <= far)))

@@ -1,7 +1,7 @@
 """Bounding volume hierarchy of geoms that do not move, as a table that a ray walks without a stack.
 
 Nodes follow each other in the order of a visit, and each has the index behind its subtree, where a ray continues that
-misses its box. There is an order for each of the eight octants of directions, so that what is nearer comes first.
+misses its box. Each of the eight octants of directions has an order, in which nearer boxes come first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from crazysim.geometry.shapes import UNBOUNDED_LENGTH
 N_ORDERS = 8
 """Orders of the nodes: one for each octant of directions."""
 BOX_PADDING = 1e-4
-"""Length by which boxes are larger on all sides, m, so that rounding makes no ray miss the box of what it meets: more
+"""Enlargement of boxes on all sides, m, so that rounding makes no ray miss the box of a geom that it meets: more
 than the spacing of numbers in float32 up to 1 km, which is 6e-5 m."""
 
 
@@ -71,14 +71,14 @@ def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
         x, y, z = np.moveaxis(high - low, -1, 0)
         return x * y + y * z + z * x
 
-    left = surfaces(np.minimum.accumulate(a), np.maximum.accumulate(b))[:-1]
+    low_side = surfaces(np.minimum.accumulate(a), np.maximum.accumulate(b))[:-1]
     right = surfaces(np.minimum.accumulate(a[::-1]), np.maximum.accumulate(b[::-1]))[::-1][1:]
     count = np.arange(1, n)[:, None]
-    cost = left * count + right * (n - count)
+    cost = low_side * count + right * (n - count)
     least = n // 8
     cost = cost[least : n - 1 - least]
-    at, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)
-    halves = np.split(geoms[order[:, axis]], [int(at) + least + 1])
+    split, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)
+    halves = np.split(geoms[order[:, axis]], [int(split) + least + 1])
     node.axis, node.geom = int(axis), -1
     node.children = _build_tree(low, high, halves[0]), _build_tree(low, high, halves[1])
     return node

@@ -11,13 +11,13 @@ from crazysim import rotation
 from crazysim.scene import mjx
 
 N_DUMMY_JOINTS = 1
-"""Number of joints of a scene without joints of its own: the one that MJX requires, of a body without geoms."""
+"""Number of joints of a scene that defines none: the one that MJX requires, of a body without geoms."""
 
 
 def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Return the scene with the poses of bodies, their centres of mass, geoms and sites.
 
-    The same as ``mjx.kinematics`` for a scene without joints of its own, which takes a fourth of the time to trace and
+    The same as ``mjx.kinematics`` for a scene that defines no joints, which takes a fourth of the time to trace and
     compile; and children of mocap bodies are at this world's poses, not at the model's as in MJX 3.17.
 
     Args:
@@ -30,21 +30,21 @@ def update_kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     mocap = np.flatnonzero(model.body_mocapid >= 0)
     if len(mocap):
         ids = model.body_mocapid[mocap]
-        turned = _to_xyzw(data.mocap_quat[:, ids])
+        mocap_quat = _to_xyzw(data.mocap_quat[:, ids])
         pos = pos.at[:, mocap].set(data.mocap_pos[:, ids])
-        quat = quat.at[:, mocap].set(turned / jnp.linalg.norm(turned, axis=-1, keepdims=True))
+        quat = quat.at[:, mocap].set(mocap_quat / jnp.linalg.norm(mocap_quat, axis=-1, keepdims=True))
     for bodies in _generations(np.asarray(model.body_parentid)):
         parents = model.body_parentid[bodies]
         pos = pos.at[:, bodies].set(rotation.rotate(quat[:, parents], pos[:, bodies], pos[:, parents]))
         quat = quat.at[:, bodies].set(rotation.multiply(quat[:, parents], quat[:, bodies]))
 
     rot = rotation.matrix(quat)
-    of = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.site_bodyid])
+    body_of_row = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.site_bodyid])
     offsets = jnp.concatenate([model.body_ipos, model.geom_pos, model.site_pos])
     turns = _to_xyzw(jnp.concatenate([model.body_iquat, model.geom_quat, model.site_quat]))
     ends = np.cumsum([model.nbody, model.ngeom])
-    positions = jnp.split(rotation.matvec(rot[:, of], offsets, pos[:, of]), ends, axis=1)
-    frames = jnp.split(rotation.matrix(rotation.multiply(quat[:, of], turns)), ends, axis=1)
+    positions = jnp.split(rotation.matvec(rot[:, body_of_row], offsets, pos[:, body_of_row]), ends, axis=1)
+    frames = jnp.split(rotation.matrix(rotation.multiply(quat[:, body_of_row], turns)), ends, axis=1)
     data = data.replace(xpos=pos, xquat=jnp.roll(quat, 1, axis=-1), xmat=rot, xipos=positions[0], ximat=frames[0])
     return data.replace(geom_xpos=positions[1], geom_xmat=frames[1], site_xpos=positions[2], site_xmat=frames[2])
 

@@ -29,7 +29,7 @@ def load_module() -> ModuleType:
 
 @contextlib.contextmanager
 def _hide_warp() -> Iterator[None]:
-    """Let imports of Warp fail, unless it has been imported."""
+    """Make imports of Warp fail, unless it has been imported."""
     if "warp" in sys.modules or "mujoco.mjx" in sys.modules:
         yield
         return

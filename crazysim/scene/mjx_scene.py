@@ -86,11 +86,11 @@ class MjxScene:
                 return pos, quat, qpos
             return fetch_rows(pos, worlds), fetch_rows(quat, worlds), fetch_rows(qpos, worlds)
         if self._rest is None:
-            rest = mujoco.MjData(self._mj_model)
-            each = (rest.mocap_pos, rest.mocap_quat, self._mj_model.qpos0)
-            self._rest = tuple(np.array(x) for x in each)
-        chosen = slice(None) if worlds is None else worlds
-        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[chosen] for x in self._rest)
+            initial_data = mujoco.MjData(self._mj_model)
+            defaults = (initial_data.mocap_pos, initial_data.mocap_quat, self._mj_model.qpos0)
+            self._rest = tuple(np.array(x) for x in defaults)
+        rows = slice(None) if worlds is None else worlds
+        pos, quat, qpos = (np.broadcast_to(x, (self._n_worlds, *x.shape))[rows] for x in self._rest)
         return pos, quat, qpos
 
     def contacts(self, body: str | None) -> Array:
@@ -98,9 +98,6 @@ class MjxScene:
 
         Returns:
             (n_worlds, n_slots), bool
-
-        Raises:
-            UnknownNameError: If the scene has no such body.
         """
         if body is None:
             return contacts.contact_flags(self.data)

@@ -24,7 +24,7 @@ def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -
     Args:
         model: Model that is queried.
         data: Simulation, one world of it, or one drone.
-        mocap: Poses of all mocap bodies; None where the data are to stay as they are.
+        mocap: Poses of all mocap bodies; None to leave them unchanged.
     """
     if mocap is None or not model.mocap_bodies:
         return data
@@ -44,11 +44,7 @@ def with_mocap_bodies(model: CollisionModel, data: SimData, mocap: MocapPoses) -
 
 
 def require_poses(model: CollisionModel, names: Iterable[str], mocap: MocapPoses) -> None:
-    """Check that the poses of bodies are given where they are moved through ``mjx_data``.
-
-    Raises:
-        ConfigError: If they are not.
-    """
+    """Check that the poses of bodies are given where they are moved through ``mjx_data``."""
     missing = [name for name in names if name in model.mocap_bodies]
     if missing and mocap is None:
         raise ConfigError(

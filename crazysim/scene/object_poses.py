@@ -28,9 +28,6 @@ def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
     """Return the data of all worlds, or of one world, with the objects of plugins at their poses.
 
     Recorded poses stay.
-
-    Raises:
-        ConfigError: If the data are of one drone, which do not contain the other drones' objects.
     """
     if not plugins or data.objects is None or data.objects.recorded:
         return data

@@ -47,7 +47,7 @@ class Handle:
 
     @property
     def movable(self) -> bool:
-        """True if they have poses of their own in every world."""
+        """True if their poses can differ between worlds."""
         return bool(self.rows)
 
     def __len__(self) -> int:
@@ -55,8 +55,8 @@ class Handle:
 
     def __getitem__(self, k: int | slice) -> Handle:
         """Return a handle of some of the objects."""
-        some = (lambda x: x[k]) if isinstance(k, slice) else (lambda x: (x[k],))
-        return Handle(self.name, some(self.numbers), some(self.rows) if self.movable else ())
+        select = (lambda x: x[k]) if isinstance(k, slice) else (lambda x: (x[k],))
+        return Handle(self.name, select(self.numbers), select(self.rows) if self.movable else ())
 
     def set_pose(
         self,
@@ -75,10 +75,6 @@ class Handle:
             vel: Velocities for contact response, world frame, m/s; they move nothing. Shapes as ``pos``; zero if left
                 out beside ``pos``.
             mask: True in the worlds to change; None for all. (n_worlds,)
-
-        Raises:
-            ConfigError: If they cannot be moved, belong to another simulation, or an argument has a wrong shape or is
-                not finite.
         """
         objects = self._objects(data)
         mask = as_mask(mask, objects.pos.shape[:-3])
@@ -122,9 +118,9 @@ def _replace_rows(
     if is_quat:
         value = value * jax.lax.rsqrt(jnp.sum(value**2, axis=-1, keepdims=True))
     value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
-    begin, end = numbers[0], numbers[0] + n
-    if numbers == tuple(range(begin, end)):  # as long to compile for thousands as for one
-        new = jnp.concatenate([old[..., :begin, :], value, old[..., end:, :]], axis=-2)
+    start, end = numbers[0], numbers[0] + n
+    if numbers == tuple(range(start, end)):  # as long to compile for thousands as for one
+        new = jnp.concatenate([old[..., :start, :], value, old[..., end:, :]], axis=-2)
     else:
         rows = [old[..., k, :] for k in range(old.shape[-2])]
         for i, k in enumerate(numbers):
@@ -140,11 +136,7 @@ def _select_rows(old: Array, numbers: tuple[int, ...]) -> Array:
 
 
 def require_pose_array(value: ArrayLike, what: str, n: int, size: int, n_worlds: int | None) -> Array | np.ndarray:
-    """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)
-
-    Raises:
-        ConfigError: If it has another shape, or comes from the host and is not finite.
-    """
+    """Return positions, attitudes or velocities of ``n`` objects, checked. (size,), (n, size) or (n_worlds, n, size)"""
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
@@ -200,10 +192,10 @@ class SceneObjects:
         name = _default_name(what) if name is None else name
         numbers = tuple(range(positive_integer("count", count, MAX_OBJECTS)))
         names = [f"{name}:{k}" for k in numbers]
-        taken = sorted({body.name for body in spec.bodies} & {name, *names})
-        if taken or name == "drone":
+        used_names = sorted({body.name for body in spec.bodies} & {name, *names})
+        if used_names or name == "drone":
             raise ConfigError(
-                f"expected a new name, got {(taken or ['drone:0'])[0]!r}, a body of the scene. Pass name=."
+                f"expected a new name, got {(used_names or ['drone:0'])[0]!r}, a body of the scene. Pass name=."
             )
         n_worlds = self._n_worlds if check_flag("mocap", mocap) else None
         poses = [
@@ -226,13 +218,13 @@ class SceneObjects:
         return sum(len(handle) for handle in self._handles if handle.name == name)
 
     def take_snapshot(self, spec: mujoco.MjSpec) -> SceneSnapshot:
-        """Return the contents of a spec as they are now, for ``restore_snapshot``."""
+        """Return the present contents of a spec, for ``restore_snapshot``."""
         return SceneSnapshot(
             [{x.name for x in elements} for elements in _elements(spec)], self._handles[:], self._initial[:]
         )
 
     def restore_snapshot(self, spec: mujoco.MjSpec, snapshot: SceneSnapshot) -> bool:
-        """Remove what was added to a spec since a snapshot, and return whether there was anything."""
+        """Remove all additions to a spec since a snapshot; return True if there were any."""
         pairs = zip(_elements(spec), snapshot.names, strict=True)
         added = [x for elements, names in pairs for x in elements if x.name not in names]
         for element in added:
@@ -244,7 +236,7 @@ class SceneObjects:
         """Return the record of the movable objects: poses of an earlier record, and initial poses of newer objects.
 
         Args:
-            before: Earlier record; None if there is none.
+            before: Earlier record, or None.
             mocap_ids: Mocap ids of the bodies, in the order of ``movable``.
         """
         if not self._initial:
@@ -277,10 +269,6 @@ def add_bodies(
         quat: Attitudes, xyzw. (n, 4)
         mocap: True if they can be moved.
         options: Settings of the primitive.
-
-    Raises:
-        ConfigError: If ``what`` is nothing that can be added, or does not compile.
-        UnknownNameError: If there is no such primitive or file.
     """
     poses = [{"pos": p, "quat": np.roll(q, 1)} for p, q in zip(pos, quat, strict=True)]
     if isinstance(what, str) and what in PRIMITIVES:

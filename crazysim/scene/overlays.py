@@ -121,11 +121,7 @@ class Overlays:
 
 
 def _printable_text(text: str, longest: int | None = None) -> str:
-    """Return text that MuJoCo's font can show.
-
-    Raises:
-        ConfigError: If it is empty, too long, or has characters that the font lacks.
-    """
+    """Return text that MuJoCo's font can show."""
     if not isinstance(text, str) or not text:
         raise ConfigError(f"expected a string that is not empty as text, got {text!r}")
     missing = sorted({letter for letter in text if letter != "\n" and not 32 <= ord(letter) < 127})

@@ -93,9 +93,6 @@ def primitive_geoms(name: str, options: dict[str, Any]) -> Geoms:
     Args:
         name: Key of ``PRIMITIVES``.
         options: Arguments of its function, and ``rgba``.
-
-    Raises:
-        ConfigError: If an option does not exist or is invalid.
     """
     make, rgba = PRIMITIVES[name]
     settings = {"rgba": rgba} | options

@@ -65,7 +65,7 @@ class SceneQueries:
         if first:
             compiled[name, *settings] = jax.jit(_as_function_of_poses(build(), data))
         states, objects = data.states, data.objects
-        # Only what the query needs: a compiled call costs by the number of its arrays.
+        # Only the arrays that the query needs, since a compiled call costs by their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
         with keep_programs(when=first):
@@ -89,8 +89,8 @@ class SceneQueries:
 
         def contacts(data: SimData, mocap: MocapPoses) -> ContactReport:
             try:
-                found = query(queries, with_mocap_bodies(model, data, mocap), platform)
-                return functools.reduce(ContactReport.merge, found)
+                reports = query(queries, with_mocap_bodies(model, data, mocap), platform)
+                return functools.reduce(ContactReport.merge, reports)
             except UnsupportedError as error:
                 if not isinstance(error, LimitError):
                     problem = f"the contact report has no kernel: {error.reason}"

@@ -1,4 +1,4 @@
-"""Rays through the scene in pure JAX: distance, surface normal and what was hit."""
+"""Rays through the scene in pure JAX: distance, surface normal and body that was hit."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def cast_rays(
     data: SimData,
     origin: Array,
     direction: Array,
-    own: np.ndarray | None = None,
+    drone_of_ray: np.ndarray | None = None,
     drones: bool = True,
     mocap: MocapPoses = None,
     kernels: RayKernels | None = None,
@@ -72,20 +72,20 @@ def cast_rays(
         data: Simulation, for the poses of objects and drones.
         origin: Origins of the rays, world frame, m. (n_worlds, n_rays, 3), without n_worlds in one world or drone
         direction: Unit directions, world frame. The same shape
-        own: Index of the drone that a ray passes through; None for no drone. (n_rays,)
+        drone_of_ray: Index of the drone that a ray passes through; None for no drone. (n_rays,)
         drones: True for rays to meet drones; a stage of one drone has no access to the others.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
         kernels: Kernels that may cast the rays of all worlds; None for XLA.
-        limit: Distance beyond which rays of one world or drone need not meet what does not move, m.
-
-    Raises:
-        ConfigError: If the scene has such bodies and their poses are not given.
+        limit: Distance beyond which rays of one world or drone may miss fixed geoms, m.
     """
     require_poses(model, [body.name for body in model.objects], mocap)
     data = with_mocap_bodies(model, data, mocap)
     if origin.ndim == 3:
         # A camera for each ray, whose first axis is its direction.
-        zero, passes = jnp.zeros((*direction.shape, 2), direction.dtype), NOBODY if own is None else own
+        zero, passes = (
+            jnp.zeros((*direction.shape, 2), direction.dtype),
+            NOBODY if drone_of_ray is None else drone_of_ray,
+        )
         axes = jnp.concatenate([direction[..., None], zero], axis=-1).reshape(*direction.shape[:2], 9)
         ahead = np.zeros((origin.shape[1], 1, 4))
         ahead[..., 0], ahead[:, 0, 3] = 1.0, passes
@@ -116,7 +116,7 @@ def cast_rays(
         for kind in model.drones:
             rows = np.arange(data.core.n_drones) if kind.drones is None else np.asarray(kind.drones)
             group = np.stack([rows, rows + 1 + len(model.objects)], axis=-1)
-            best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, own)
+            best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, drone_of_ray)
     return best
 
 
@@ -128,7 +128,7 @@ def _hit_bodies(
     group: np.ndarray,
     origin: Array,
     direction: Array,
-    own: np.ndarray | None,
+    row_of_ray: np.ndarray | None,
 ) -> Hits:
     """Return earlier hits, or nearer hits of movable bodies with equal geoms.
 
@@ -140,7 +140,7 @@ def _hit_bodies(
         group: Row of each body of the group in ``pos``, and its number in ``Hits.number``. (k, 2)
         origin: Origins of the rays. (..., n_rays, 3)
         direction: Their directions. (..., n_rays, 3)
-        own: Row of the body that a ray passes through. (n_rays,)
+        row_of_ray: Row of the body that a ray passes through. (n_rays,)
     """
 
     def with_one(best: Hits, row: Array, number: Array) -> Hits:
@@ -148,7 +148,7 @@ def _hit_bodies(
         start, along = rotation.rotate_inverse(q, origin - p), rotation.rotate_inverse(q, direction)
         for geom in geoms:
             far, normal = _hit_geom(geom, start, along)
-            far = far if own is None else jnp.where(own == row, jnp.inf, far)
+            far = far if row_of_ray is None else jnp.where(row_of_ray == row, jnp.inf, far)
             best = _nearer_hits(best, far, rotation.rotate(q, normal), number)
         return best
 
@@ -188,14 +188,14 @@ def _hit_fixed_geoms(
 ) -> tuple[Array, Array, Array]:
     """Return the first fixed geoms that rays of one world or drone meet, in a hierarchy.
 
-    A loop over the rays finds the geoms without a derivative. The distance is that to the one geom that was found, with
+    A loop over the rays finds the geoms without a derivative. The distance is to the geom that was found, with
     its derivative.
 
     Args:
         targets: The geoms.
         origin: Origins of the rays, world frame, m. (n_rays, 3)
         direction: Unit directions, world frame. (n_rays, 3)
-        limit: Distance beyond which nothing needs to be found, m.
+        limit: Distance beyond which geoms may be missed, m.
 
     Returns:
         Distance, m, infinite for none. (n_rays,)
@@ -205,13 +205,13 @@ def _hit_fixed_geoms(
     tables = targets.hierarchy(origin.dtype)
     surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed), 0].max()]
     starts, ways = jax.lax.stop_gradient((origin, direction))
-    begin = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
+    initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
 
     def of_some(starts: Array, ways: Array) -> Array:
         def turn(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             k, which = carry
             ray = Ray(components(starts[k]), components(ways[k]), jnp.int32(NOBODY))
-            return (k + 1, which.at[k].set(first_fixed_hit(surfaces, tables, ray, begin)[1])), None
+            return (k + 1, which.at[k].set(first_fixed_hit(surfaces, tables, ray, initial)[1])), None
 
         none = jnp.int32(0), jnp.full(len(starts), -1, jnp.int32)
         return jax.lax.scan(turn, none, length=len(starts))[0][1]
@@ -239,25 +239,25 @@ def _hit_rows(
     """
     row = [rows[..., k] for k in range(16)]
     start, along = ray_in_frame(row, components(origin), components(direction))
-    begin, way = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
+    ray_start, ray_direction = jnp.stack(start, axis=-1), jnp.stack(along, axis=-1)
     code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(which, 0))
-    found = []
+    hits = []
     exact = jnp.full_like(start[0], jnp.inf)
     for number, surface in enumerate(surfaces):
         mine = (which >= 0) & (code == number)
         # A size for geoms of other kinds, so that their slopes are finite.
         shape = geom_shape(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
         if isinstance(shape, Shape) and shape.kind == "hfield":
-            far, normal = ray_distance(shape, begin, way)
+            far, normal = ray_distance(shape, ray_start, ray_direction)
         else:
             far, normal = hit_distance(shape, start, along), None
         exact = jnp.where(mine, far, exact)
-        found.append((mine, shape, normal))
+        hits.append((mine, shape, normal))
 
     def normal_at(distance: Array) -> Array:
         across = jnp.zeros_like(origin)
-        for mine, shape, normal in found:
-            normal = hit_normal(shape, begin, way, distance) if normal is None else normal
+        for mine, shape, normal in hits:
+            normal = hit_normal(shape, ray_start, ray_direction, distance) if normal is None else normal
             across = jnp.where(mine[..., None], normal, across)
         return jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
 
@@ -311,14 +311,14 @@ def cast_rays_in_worlds(
 
 @dataclasses.dataclass
 class RayKernels:
-    """Choice of what casts rays: kernels of the engine, or XLA where there are none."""
+    """Kernels of the engine that cast rays, with XLA where they are not available."""
 
     platform: str | None = None
     """Platform of the kernels, ``"cpu"`` or ``"gpu"``; None for XLA."""
     strict: bool = False
     """True to raise an error where XLA would be used with an ``EngineWarning``."""
     used: str = ""
-    """Description of what cast rays last, for ``Sim.explain``."""
+    """Description of the kernels that cast rays last, for ``Sim.explain``."""
     reported: set[str] = dataclasses.field(default_factory=set)
     """Warnings that were given."""
 
@@ -340,9 +340,9 @@ class RayKernels:
         where = f"{len(targets.fixed)} fixed geoms in a hierarchy, {len(targets.movable)} movable geoms in a list"
         if self.platform is not None:
             try:
-                found = map_indices(fn, n, tables, self.platform)
+                hits = map_indices(fn, n, tables, self.platform)
                 self.used = f"one kernel with a lane for each ray; {where}"
-                return found
+                return hits
             except UnsupportedError as error:
                 problem, remedy = f"rays have no kernel: {error.reason}", "Leave out the geoms that need it"
                 report_unsupported([problem], self.strict, self.reported, remedy)

@@ -16,7 +16,7 @@ from crazysim.scene.scene_window import SceneWindow
 from crazysim.scene.software import rendering_quality
 
 MAX_SIZES = 4
-"""Most image sizes that keep a context of their own."""
+"""Most image sizes whose contexts are kept."""
 
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 """Modes of ``Sim.render``."""
@@ -127,11 +127,7 @@ class ModelRenderer:
 
 
 def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
-    """Return the id of a camera, -1 for the free camera.
-
-    Raises:
-        UnknownNameError: If there is no camera of that name or id.
-    """
+    """Return the id of a camera, -1 for the free camera."""
     if isinstance(camera, str):
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         if number < 0:
@@ -146,11 +142,7 @@ def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
 
 
 def require_size(width: ArrayLike, height: ArrayLike) -> None:
-    """Check the size of an image.
-
-    Raises:
-        ConfigError: If width or height is not a positive integer.
-    """
+    """Check the size of an image."""
     if not all(isinstance(n, (int, np.integer)) and n > 0 for n in (width, height)):
         raise ConfigError(f"expected positive integers as width and height of an image, got {width} x {height} pixels")
 

@@ -1,4 +1,4 @@
-"""The scene of a simulation: its spec, the compiled model, and what follows from the simulation's data."""
+"""The scene of a simulation: its spec, the compiled model, and queries on the simulation's data."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Scene:
     plugins: ListPlugins
     """Function that returns the plugins of the simulation."""
     ray_kernels: RayKernels
-    """Choice of what casts rays and answers contact reports."""
+    """Kernels that cast rays and answer contact reports."""
     revision: int
     """Number of edits of the spec. The compiled model belongs to one of them, as do the objects and mocap ids in
     the data."""
@@ -77,7 +77,7 @@ class Scene:
             device: Device of the scene of all worlds.
             mesh: Devices over which the worlds are spread instead; None for one device.
             plugins: Function that returns the plugins of the simulation.
-            ray_kernels: Choice of what casts rays and answers contact reports.
+            ray_kernels: Kernels that cast rays and answer contact reports.
 
         Raises:
             ConfigError: If the scene cannot be read or compiled.
@@ -117,9 +117,6 @@ class Scene:
             quat: Initial attitudes, body to world, xyzw. The same shapes with 4
             mocap: True for objects that can be moved, in each world on their own; others stay at ``pos`` everywhere.
             **options: Settings of a primitive: lengths in m, ``rgba``. ``crazysim.scene.primitives`` lists them.
-
-        Raises:
-            ConfigError: If a name is taken, MJCF does not compile (with the compiler's words), or a setting is invalid.
         """
         with self.unchanged_on_error():
             handle = self.added.add(self.spec, what, name, count, pos, quat, mocap, options)
@@ -127,18 +124,14 @@ class Scene:
         return handle
 
     def add_once(self, what: Source, name: str, count: int) -> None:
-        """Add objects, unless there are as many of that name. Objects of a plugin stay when it is removed or replaced.
-
-        Raises:
-            ConfigError: If there are others.
-        """
-        there = self.added.number_of(name)
-        if there not in (0, count):
+        """Add ``count`` objects unless they exist: objects of a plugin stay when it is removed or replaced."""
+        n_existing = self.added.number_of(name)
+        if n_existing not in (0, count):
             raise ConfigError(
-                f"expected {there} objects {name!r}, which are in the scene already, got {count}: objects stay there "
-                f"when a plugin is removed. Use another name=, or a new simulation."
+                f"expected {n_existing} objects {name!r}, which are in the scene already, got {count}: objects stay "
+                f"there when a plugin is removed. Use another name=, or a new simulation."
             )
-        if not there:
+        if not n_existing:
             self.add(what, name, count=count)
 
     @contextlib.contextmanager
@@ -207,11 +200,7 @@ class Scene:
         return self.added.record(before, self._ids(movable) if self._is_edited else self._object_ids)
 
     def _ids(self, names: Sequence[str]) -> list[int]:
-        """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled.
-
-        Raises:
-            ConfigError: If the spec lacks one of the bodies.
-        """
+        """Return mocap ids in the spec, which equal the ids in the compiled model; nothing is compiled."""
         ids = build.spec_mocap_ids(self.spec)
         lost = [name for name in names if name not in ids]
         if lost:
@@ -244,7 +233,7 @@ class Scene:
     def contact_fn(
         self, objects: contact_report.ObjectSelection = None, floor: bool = True, drones: bool = True
     ) -> contact_report.ContactFn:
-        """Return ``contacts(data, mocap=None) -> ContactReport``, pure, for the scene as it is now.
+        """Return ``contacts(data, mocap=None) -> ContactReport``, pure, for the present scene.
 
         The function takes all worlds or, in a stage, one world or one drone; for a stage of one drone pass
         ``drones=False``. Fields that were not requested are None and are not computed.
@@ -257,9 +246,6 @@ class Scene:
             objects: Handles, or names of bodies; None for all, () for none.
             floor: True to report the floor: planes and height fields of the world body.
             drones: True to report the other drones of a world.
-
-        Raises:
-            ConfigError: If nothing is requested, or an object does not exist.
         """
         return contact_report.build_contact_fn(self.collision_model, objects, floor, drones, self.plugins)
 
@@ -275,7 +261,7 @@ class Scene:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
         ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), with ``normal`` and ``number`` (the
-        body that was hit) beside it. Inside jit, fields that are not used are not computed. Objects of plugins, such as
+        body that was hit) with it. Inside jit, fields that are not used are not computed. Objects of plugins, such as
         loads, are where the plugins' records in ``data`` have them.
 
         Args:
@@ -287,10 +273,6 @@ class Scene:
             hide_own: True for a drone to be invisible to its own camera.
             along: ``"axis"`` for the distance along the camera's axis, as ``Sim.render`` has it, ``"ray"`` for the
                 distance from the camera.
-
-        Raises:
-            ConfigError: If the resolution is invalid, or the camera aims at a body.
-            UnknownNameError: If there is no such camera.
         """
         objects = (*self.added.movable, *self.visual_model.mocap_bodies)
         cameras = depth.find_cameras(self.mj_model, camera, objects)
@@ -343,11 +325,7 @@ class Scene:
             return self._mjx.sync(data)
 
     def sync_one(self, data: SimData, world: int) -> None:
-        """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used.
-
-        Raises:
-            ConfigError: If the world does not exist.
-        """
+        """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""
         if not 0 <= world < self.n_worlds:
             raise ConfigError(f"expected a world from 0 to {self.n_worlds - 1}, got {world}")
         self.compile_if_edited()
@@ -360,9 +338,6 @@ class Scene:
 
         Returns:
             (n_worlds, n_slots), bool
-
-        Raises:
-            UnknownNameError: If the scene has no such body.
         """
         return self._mjx.contacts(body)
 
@@ -377,7 +352,6 @@ class Scene:
 
         Raises:
             ImportError: If MuJoCo Warp is not installed.
-            ConfigError: If the camera is the free one or does not exist, or the size is invalid.
         """
         self.compile_if_edited()
         poses = with_data_poses(data, worlds, self._mjx.poses(worlds))
@@ -390,7 +364,7 @@ class Scene:
 
 def _airframe_groups(airframes: Sequence[Airframe]) -> tuple[tuple[int, ...] | None, ...]:
     """Return the indices of the drones of each airframe; None for all."""
-    found: dict[int, list[int]] = {}
+    groups: dict[int, list[int]] = {}
     for k, airframe in enumerate(airframes):
-        found.setdefault(id(airframe), []).append(k)
-    return (None,) if len(found) == 1 else tuple([tuple(drones) for drones in found.values()])
+        groups.setdefault(id(airframe), []).append(k)
+    return (None,) if len(groups) == 1 else tuple([tuple(drones) for drones in groups.values()])

@@ -22,13 +22,13 @@ KEY_NAMES = {
 """Names of keys that are not named by their character, by GLFW's names."""
 
 Tile = tuple[mujoco.MjData, Overlays]
-"""State of one world, with its kinematics up to date, and what is drawn over it."""
+"""State of one world, with its kinematics up to date, and its overlays."""
 
 
 class SceneWindow:
     """A window that shows one model, in one or several states.
 
-    MuJoCo's passive viewer draws in a thread of its own, and sometimes crashes the process when it is closed.
+    MuJoCo's passive viewer draws in another thread, and sometimes crashes the process when it is closed.
     """
 
     def __init__(self, model: mujoco.MjModel, max_geom: int, width: int, height: int):
@@ -39,7 +39,7 @@ class SceneWindow:
         """
         self._model = model
         self._glfw = glfw = _glfw()
-        # A thread cannot use an EGL context for images in memory beside one of another kind.
+        # A thread cannot use an EGL context for images in memory and a context of another kind.
         egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
         glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
         glfw.window_hint(glfw.VISIBLE, True)
@@ -112,7 +112,7 @@ class SceneWindow:
         glfw.swap_buffers(self._window)
 
     def look_at(self, point: NDArray) -> None:
-        """Let the free camera look at a point from now on, m, from where the mouse has put it. (3,)"""
+        """Aim the free camera at a point, m, from its present direction and distance. (3,)"""
         self._camera.lookat[:] = point
 
     @property
@@ -128,7 +128,7 @@ class SceneWindow:
         return glfw.get_mouse_button(self._window, number) == glfw.PRESS
 
     def pick(self, n: int, tile: Callable[[int], Tile]) -> tuple[int, int, NDArray] | None:
-        """Return tile, geom and point, world frame, m, below the cursor; None if there is nothing.
+        """Return tile, geom and point, world frame, m, below the cursor, or None.
 
         Args:
             n: Number of tiles.

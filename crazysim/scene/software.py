@@ -27,15 +27,11 @@ images.
 
 
 def is_fast() -> bool:
-    """Return True where images are drawn with the settings of CPUs.
-
-    Raises:
-        ConfigError: If the environment variable is neither ``full`` nor ``fast``.
-    """
-    chosen = os.environ.get(QUALITY_VARIABLE, "")
-    if chosen not in ("", "full", "fast"):
-        raise ConfigError(f"expected full or fast in {QUALITY_VARIABLE}, got {chosen!r}. Correct it, or unset it.")
-    return chosen == "fast" or (not chosen and is_software())
+    """Return True where images are drawn with the settings of CPUs."""
+    quality = os.environ.get(QUALITY_VARIABLE, "")
+    if quality not in ("", "full", "fast"):
+        raise ConfigError(f"expected full or fast in {QUALITY_VARIABLE}, got {quality!r}. Correct it, or unset it.")
+    return quality == "fast" or (not quality and is_software())
 
 
 @functools.cache

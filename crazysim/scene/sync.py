@@ -83,7 +83,7 @@ def _model_with_mocap_poses(mjx_model: mjx.Model, world: mjx.Data) -> mjx.Model:
 
 @jit_unless_traced()
 def with_data_poses(data: SimData, worlds: NDArray, poses: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """Return poses of bodies and joints in some worlds, with those of drones and handles as the data have them.
+    """Return poses of bodies and joints in some worlds, with the poses of drones and handles from the data.
 
     Args:
         data: Simulation.

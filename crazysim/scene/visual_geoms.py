@@ -88,8 +88,8 @@ def _color(model: mujoco.MjModel, geom: int) -> NDArray:
     texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
     if texture >= 0:
         channels = int(model.tex_nchannel[texture])
-        begin, n = model.tex_adr[texture], model.tex_width[texture] * model.tex_height[texture] * channels
-        texels = model.tex_data[begin : begin + n].reshape(-1, channels)
+        start, n = model.tex_adr[texture], model.tex_width[texture] * model.tex_height[texture] * channels
+        texels = model.tex_data[start : start + n].reshape(-1, channels)
         color[:3] *= texels[:, :3].mean(0) / 255
     return color
 

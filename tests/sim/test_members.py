@@ -119,7 +119,7 @@ def test_wrong_names_and_shapes_are_refused():
         sim["Bumblebee_0"].command(np.zeros(3))
     with pytest.raises(ValueError, match="expected finite numbers as pos of Mass_0"):
         sim["Mass_0"].set(pos=[np.nan, 0, 0])
-    with pytest.raises(ConfigError, match=r"names that nothing else has, got 'Mass_0' again. Use Springs\(\[...\]\)"):
+    with pytest.raises(ConfigError, match=r"names that are not in use, got 'Mass_0' again. Use Springs\(\[...\]\)"):
         sim.add(Springs(1, name="others"))
     with pytest.raises(ConfigError, match="got 'Crazyflie_0' again"):
         sim.add(Springs(["Crazyflie_0"], name="others"))

@@ -43,19 +43,12 @@ class FittedModel(PyTree):
             airframe: Airframe.
             dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
             mass: Mass, kg; None for the airframe's.
-
-        Raises:
-            ConfigError: If the airframe has no fit of that model.
         """
         params = fitted.Params.create(airframe, Dynamics(dynamics))
         return FittedModel(params if mass is None else params.replace(mass=jnp.asarray([mass], jnp.float32)))
 
     def prepared(self, log: Log) -> Log:
-        """Return the log with attitudes relative to the first 0.1 s, and the lagged thrust as its rotor speeds.
-
-        Raises:
-            ConfigError: If the log has no attitude commands or has gaps.
-        """
+        """Return the log with attitudes relative to the first 0.1 s, and the lagged thrust as its rotor speeds."""
         columns = _columns(log)
         thrust = columns["cmd_f"]
         if self.params.thrust_dyn_coef is not None:
@@ -70,11 +63,7 @@ class FittedModel(PyTree):
         return window.rotor_vel[PADDING]
 
     def inputs(self, window: Windows, dt: float) -> Array:
-        """Return the commands, held from sample to sample. (n - 1, 3, 4)
-
-        Raises:
-            ConfigError: If the window has no commands.
-        """
+        """Return the commands, held from sample to sample. (n - 1, 3, 4)"""
         del dt  # an argument of every predictor
         cmd = window.attitude_command
         if cmd is None:
@@ -89,11 +78,7 @@ class FittedModel(PyTree):
 
 
 def _columns(log: Log) -> dict[str, NDArray]:
-    """Return a log under Crazyflow's names.
-
-    Raises:
-        ConfigError: If the log has no attitude commands or has gaps.
-    """
+    """Return a log under Crazyflow's names."""
     cmd = log.attitude_command
     if cmd is None:
         raise ConfigError(
@@ -123,11 +108,11 @@ def identify_attitude(
         mass: Mass in the flights, kg; None for the airframe's.
 
     Raises:
-        ConfigError: If a log has no attitude commands or has gaps, or the fit is no airframe.
+        ConfigError: If a log has no attitude commands or has gaps, or the fitted numbers are not valid.
     """
     base = load_airframe(airframe)
-    known = float(base.value("rigid_body.mass"))
-    weight = known if mass is None else float(mass)
+    mass_of_base = float(base.value("rigid_body.mass"))
+    weight = mass_of_base if mass is None else float(mass)
     check_turning(logs)
     data = [derivatives_svf(preprocessing(_columns(log))) for log in logs]
     force, force_spread = fit_translation(dynamics, weight, data)
@@ -140,7 +125,7 @@ def identify_attitude(
     table |= {name: x.tolist() for name, x in turn.items()}
     tables: dict = {"name": f"{base.name}_identified", "base": str(airframe), "fitted": {dynamics: table}}
     lines = [f"base = {json.dumps(str(airframe))}", "", "[sources]", f"flights = {json.dumps(source)}"]
-    if weight != known:
+    if weight != mass_of_base:
         tables["rigid_body"] = {"mass": weight}
         lines += ["", "[rigid_body]", f'mass = {{ value = {weight}, unit = "kg", source = "flights" }}']
     lines += ["", f"[fitted.{dynamics}]"]

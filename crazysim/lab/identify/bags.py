@@ -38,7 +38,7 @@ MAX_METADATA = 2**24
 
 
 class _BagFile(io.BufferedReader):
-    """File whose ``read`` allocates no more bytes than are left, whatever size a damaged record states."""
+    """File whose ``read`` allocates at most the remaining bytes, even if a damaged record states a larger size."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Return at most ``size`` bytes; all that are left by default."""
@@ -56,7 +56,7 @@ class _BagPath(type(Path())):
         return _BagFile(io.FileIO(self))
 
     def read_text(self, *args: Any, **kwargs: Any) -> str:
-        """Return the text of ``metadata.yaml``, in UTF-8 whatever the locale."""
+        """Return the text of ``metadata.yaml``, in UTF-8 in every locale."""
         del args, kwargs
         return read_text(self, MAX_METADATA)
 
@@ -99,7 +99,7 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
             columns = _default(path.name, topics)
         streams: dict[str, Stream] = {}
         for topic in {topic for topic, _ in columns.values()}:
-            fields = {name: field for name, (other, field) in columns.items() if other == topic}
+            fields = {name: field for name, (column_topic, field) in columns.items() if column_topic == topic}
             streams[topic] = _stream(path.name, bag, topic, topics[topic], fields)
     if not names:
         streams = {topic: _turned(stream) for topic, stream in streams.items()}
@@ -110,10 +110,10 @@ def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
     """Return topic and field of a column."""
     fitting = [topic for topic in topics if column.startswith(f"{topic}/")]
     if not fitting:
-        known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
         raise ConfigError(
             f"{name}: expected a topic and a field, such as /odom/pose/pose/position/x, got {column!r}. "
-            f"The bag has {known}."
+            f"The bag has {listed}."
         )
     topic = max(fitting, key=len)
     return topic, column[len(topic) + 1 :]
@@ -124,22 +124,22 @@ def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
 
     def only(kinds: Sequence[str]) -> tuple[str, str] | None:
         for kind in kinds:
-            found = sorted(topic for topic, other in topics.items() if other == kind)
-            if len(found) > 1:
+            matches = sorted(topic for topic, topic_kind in topics.items() if topic_kind == kind)
+            if len(matches) > 1:
                 raise ConfigError(
-                    f"{name}: expected one topic of {kind}, got {', '.join(found)}. "
-                    f"Name the columns, such as pos={found[0]}/..."
+                    f"{name}: expected one topic of {kind}, got {', '.join(matches)}. "
+                    f"Name the columns, such as pos={matches[0]}/..."
                 )
-            if found:
-                return found[0], kind
+            if matches:
+                return matches[0], kind
         return None
 
-    known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
     columns = {}
     pose, imu, rotors = only(list(POSES)), only(["sensor_msgs/msg/Imu"]), only(list(ROTORS))
     if pose is None:
         raise ConfigError(
-            f"{name}: expected a topic of {', '.join(POSES)}, got {known}. Name the columns, such as "
+            f"{name}: expected a topic of {', '.join(POSES)}, got {listed}. Name the columns, such as "
             "pos=/topic/x,/topic/y,/topic/z."
         )
     topic, kind = pose
@@ -163,8 +163,8 @@ def _stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) 
     for connection, stamp, raw in bag.messages([c for c in bag.connections if c.topic == topic]):
         message = bag.deserialize(raw, connection.msgtype)
         header = getattr(message, "header", None)
-        at = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
-        times.append(at or 1e-9 * stamp)
+        seconds = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
+        times.append(seconds or 1e-9 * stamp)
         try:
             rows.append([get[column](message) for column in fields])
         except (AttributeError, IndexError, TypeError) as error:

@@ -23,10 +23,10 @@ def header_of(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
     """Return number and cells of the line that names the columns, and the settings before it; None for other files."""
     settings: dict[str, str] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
-        for at, line in zip(range(HEADER_WITHIN), file, strict=False):
+        for number, line in zip(range(HEADER_WITHIN), file, strict=False):
             cells = [x.strip().strip('"') for x in line.split(",")]
             if any(x.startswith("time") for x in cells) and any(x.startswith("gyroADC[") for x in cells):
-                return at, cells, settings
+                return number, cells, settings
             settings[cells[0]] = cells[-1]
     return None
 
@@ -50,13 +50,13 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Raises:
         ConfigError: If columns are missing, or most rows are damaged.
     """
-    found = header_of(path)
-    if found is None:
+    header = header_of(path)
+    if header is None:
         raise ConfigError(
             f"{path.name}: expected columns time and gyroADC[0] in the first {HEADER_WITHIN} lines, got none. "
             "Convert the log with blackbox_decode or the Blackbox Explorer."
         )
-    start, names, settings = found
+    start, names, settings = header
     unit = {}
     for name in names:
         key, _, rest = name.partition(" (")
@@ -64,14 +64,14 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     keys = list(unit)
     if len(keys) != len(names):
         raise ConfigError(f"{path.name}: expected columns of different names, got some twice. Export the log again.")
-    wanted = [
+    names_read = [
         key for key in keys if key in ("time", "vbatLatest") or key.startswith(("gyroADC", "motor[", "eRPM[", "imuQua"))
     ]
     n_rotors = sum(key.startswith("motor[") for key in keys)
-    needed = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
+    required = ["time", *(f"gyroADC[{k}]" for k in range(3)), *(f"motor[{k}]" for k in range(n_rotors))]
     if "imuQuaternion[0]" in keys:
-        needed += ["imuQuaternion[1]", "imuQuaternion[2]"]
-    missing = [key for key in needed if key not in keys]
+        required += ["imuQuaternion[1]", "imuQuaternion[2]"]
+    missing = [key for key in required if key not in keys]
     if missing:
         raise ConfigError(
             f"{path.name}: expected columns {', '.join(missing)}, got {', '.join(keys)[:300]}. "
@@ -80,9 +80,9 @@ def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = [*file][start + 1 :]
     cells = split_rows(path.name, lines, len(keys), start + 2, repairs, "Decode the log again.")
-    at = [keys.index(key) for key in wanted]
-    rows = [[parse_number(row[k]) for k in at] for row in cells]
-    data = dict(zip(wanted, without_huge_numbers(np.array(rows)).T, strict=True))
+    indices = [keys.index(key) for key in names_read]
+    rows = [[parse_number(row[k]) for k in indices] for row in cells]
+    data = dict(zip(names_read, without_huge_numbers(np.array(rows)).T, strict=True))
 
     high = 10.0 if parse_number(settings.get("blackbox_high_resolution", "0")) == 1 else 1.0
     per_unit = {"rad/s": 1.0, "deg/s": math.pi / 180}.get(unit["gyroADC[0]"], math.pi / 180 / high)

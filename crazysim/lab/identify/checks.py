@@ -49,14 +49,14 @@ class Pair(NamedTuple):
     """Change below which an axis does not move, in the unit of the changes."""
 
     def sizes(self) -> NDArray:
-        """Return medians of both where the expected one is largest, its own sign being positive. (3, 2)"""
-        found = np.zeros((3, 2))
+        """Return medians of measured and expected changes where the expected ones are largest, and positive. (3, 2)"""
+        sizes = np.zeros((3, 2))
         for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
-            most = np.abs(y) >= np.quantile(np.abs(y), 0.75)
-            along, size = np.median(x[most] * np.sign(y[most])), np.median(np.abs(y[most]))
-            if max(size, np.median(np.abs(x[most]))) > self.floor:
-                found[k] = (along, size) if size > 0 else (np.inf, 1.0)
-        return found
+            is_large = np.abs(y) >= np.quantile(np.abs(y), 0.75)
+            along, size = np.median(x[is_large] * np.sign(y[is_large])), np.median(np.abs(y[is_large]))
+            if max(size, np.median(np.abs(x[is_large]))) > self.floor:
+                sizes[k] = (along, size) if size > 0 else (np.inf, 1.0)
+        return sizes
 
     def ratios(self) -> NDArray:
         """Return the ratio of both on each axis, NaN for axes that do not move. (3,)"""
@@ -64,7 +64,7 @@ class Pair(NamedTuple):
         return np.divide(along, size, out=np.full(3, np.nan), where=size > 0)
 
     def agrees(self) -> bool:
-        """Return True if measured and expected motion agree on every axis that moves, but for half of the floor."""
+        """Return True if measured and expected motion agree on every axis that moves, within half of the floor."""
         along, size = self.sizes().T
         slack = self.floor / 2
         return bool(np.all((along >= RATIOS[0] * size - slack) & (along <= RATIOS[1] * size + slack)))
@@ -87,7 +87,7 @@ def check_motion(
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
-        ConfigError: If they do not, with the change of the columns that mends it, if one does.
+        ConfigError: If the columns contradict each other; the message names a change that would help, if any.
     """
     keep = np.ones(len(t), bool)
     for pair, width in _rates(t, data, derived):
@@ -107,15 +107,15 @@ def check_motion(
             f"{name}: expected {fault}. The position spans {span:.2g} m: take a log of a flight that moves by "
             f"{MIN_SPAN:g} m or more, or give metres_per_unit."
         )
-    remedy, least = "", len(broken)
+    remedy, n_faults = "", len(broken)
     for words, changed in _alternatives(data, derived):
         after = _laws(t, changed, derived)
         # Another law may be broken by another mistake. A factor that makes a motion vanish explains nothing.
         worse = any((y.fault and not x.fault) or (x.moves and not y.moves) for x, y in zip(laws, after, strict=True))
-        left = sum(bool(law.fault) for law in after)
-        if left < least and not worse and not after[broken[0]].fault:
-            remedy, least = words, left
-            if not left:
+        n_left = sum(bool(law.fault) for law in after)
+        if n_left < n_faults and not worse and not after[broken[0]].fault:
+            remedy, n_faults = words, n_left
+            if not n_left:
                 break
     if remedy:
         raise ConfigError(f"{name}: expected {fault}. {remedy}.")
@@ -126,11 +126,7 @@ def check_motion(
 
 
 def check_turning(logs: Sequence[Log]) -> None:
-    """Check that some log turns about the x and y axes, so that a rotation can be fitted to it.
-
-    Raises:
-        ConfigError: If none does.
-    """
+    """Check that some log turns about the x and y axes, so that a rotation can be fitted to it."""
     rates = np.max([np.std(log.ang_vel[:, :2], axis=0) for log in logs], axis=0, initial=0.0)
     if np.any(rates < MIN_TURN_RATE):
         raise ConfigError(
@@ -143,19 +139,19 @@ class Law(NamedTuple):
     """A law of mechanics, in a log."""
 
     fault: str
-    """Description of what breaks it, empty if nothing does."""
+    """Description of the violation; empty for none."""
     moves: bool
-    """True if it is about a motion that the log has."""
+    """True if the log contains the motion that the law describes."""
 
 
 def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> list[Law]:
     """Return the laws that the columns must follow."""
-    up, found = float(np.median(_thrust_axis(data["quat"])[:, 2])), "a thrust that points up in most samples, got"
-    laws = [Law("" if up > 0 else f"{found} {up:.2f} as the median of its z component", True)]
+    up, problem = float(np.median(_thrust_axis(data["quat"])[:, 2])), "a thrust that points up in most samples, got"
+    laws = [Law("" if up > 0 else f"{problem} {up:.2f} as the median of its z component", True)]
     for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
         ratios = pair.ratios()
-        shown = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
-        text = f"{pair.what}, got ratios of measured to expected changes of {shown} on x, y, z, where 1 is right"
+        listed = ", ".join("no motion" if np.isnan(x) else f"{x:.3g}" for x in ratios)
+        text = f"{pair.what}, got ratios of measured to expected changes of {listed} on x, y, z, where 1 is right"
         laws.append(Law("" if pair.agrees() else text, not np.all(np.isnan(ratios))))
     return laws
 
@@ -163,21 +159,21 @@ def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> 
 def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
     """Yield each measured rate with the changes of its integral, and the samples of a window."""
     if "vel" not in derived:
-        width, (moved, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
-        yield Pair("a velocity that moves the position", moved, expected, 0.01), width
+        width, (change, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
+        yield Pair("a velocity that moves the position", change, expected, 0.01), width
     if "ang_vel" not in derived:
-        turned = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
-        turned = np.concatenate([np.zeros((1, 3)), turned])
-        width, (moved, expected) = _changes(t, 0.1, turned, integral(data["ang_vel"], t))
-        yield Pair("an angular velocity that turns the attitude", moved, expected, 0.01), width
+        angles = np.cumsum(body_rates(t, data["quat"]) * np.diff(t)[:, None], axis=0)
+        angles = np.concatenate([np.zeros((1, 3)), angles])
+        width, (change, expected) = _changes(t, 0.1, angles, integral(data["ang_vel"], t))
+        yield Pair("an angular velocity that turns the attitude", change, expected, 0.01), width
 
 
 def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     """Return measured changes of the acceleration, and expected ones from attitude, rotor speeds and gravity.
 
     The thrust over the mass is proportional to the squares of the speeds, with the weight as its median along z;
-    without speeds it balances the weight. Changes between windows leave out what is
-    constant, such as the drag of a cruise.
+    without speeds it balances the weight. Changes between windows leave out constant accelerations, such as the drag of
+    a cruise.
     """
     axis = _thrust_axis(data["quat"])
     if data["rotor_vel"].shape[1]:
@@ -224,7 +220,7 @@ def _thrust_axis(quat: NDArray) -> NDArray:
 
 
 def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
-    """Yield columns as they would be if a common mistake were mended, with the change that mends it."""
+    """Yield the correction of each common mistake, and the columns after it."""
 
     def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}
@@ -276,7 +272,7 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
         scaled(pos=down, vel=down, quat=(*down, 1), ang_vel=down),
     )
     yield "z seems to point down: give the signs pos=x,y,-z vel=vx,vy,-vz", scaled(pos=(1, 1, -1), vel=(1, 1, -1))
-    for key, word, unit, given in (
+    for key, word, unit, factor in (
         ("vel", "velocity", 1.0, ""),
         ("ang_vel", "angular velocity", 1.0, ""),
         ("ang_vel", "angular velocity", degrees, f" and rad_per_unit={degrees:.6g}"),
@@ -288,6 +284,6 @@ def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iter
             fields = getattr(Columns(), key)
             names = ",".join(("-" if sign < 0 else "") + fields[k] for k, sign in zip(order, signs, strict=True))
             yield (
-                f"The {word} fits as {key}={names}{given}, with names of your columns",
+                f"The {word} fits as {key}={names}{factor}, with names of your columns",
                 {**data, key: data[key][:, order] * signs * unit},
             )

@@ -124,11 +124,7 @@ def unsigned_name(name: str) -> str:
 
 
 def stack_columns(name: str, table: Mapping[str, NDArray], names: Sequence[str], factor: float = 1.0) -> NDArray:
-    """Return columns side by side, with their signs, times a factor. (n, len(names))
-
-    Raises:
-        ConfigError: If columns are missing, are not numbers, or differ in length.
-    """
+    """Return columns side by side, with their signs, times a factor. (n, len(names))"""
     if absent := [unsigned_name(x) for x in names if unsigned_name(x) not in table]:
         raise ConfigError(
             f"{name}: expected columns {', '.join(absent)}, got {', '.join(sorted(table))}. Name them in a Columns."
@@ -167,9 +163,11 @@ def missing_columns(table: Mapping[str, NDArray], columns: Columns) -> list[str]
     """Return the columns that a log lacks; a field with default names may be absent as a whole."""
     names = [columns.time, *columns.pos, *(columns.rpy or columns.quat)]
     for key in OPTIONAL_FIELDS:
-        given = getattr(columns, key)
-        if given != getattr(KNOWN_COLUMNS["crazysim"], key) or any(unsigned_name(x) in table for x in given):
-            names += given
+        column_names = getattr(columns, key)
+        if column_names != getattr(KNOWN_COLUMNS["crazysim"], key) or any(
+            unsigned_name(x) in table for x in column_names
+        ):
+            names += column_names
     return [unsigned_name(x) for x in names if unsigned_name(x) not in table]
 
 
@@ -178,12 +176,12 @@ def with_rotor_count(table: Mapping[str, NDArray], columns: Columns) -> Columns:
 
     Logs of fewer rotors than four are left to the check for missing columns.
     """
-    found = {}
+    sized = {}
     for key in ("rotor_vel", "command"):
         names = getattr(columns, key)
         if names == getattr(KNOWN_COLUMNS["crazysim"], key):
             stem, n = names[0][:-1], len(names)
             while f"{stem}{n + 1}" in table:
                 n += 1
-            found[key] = tuple(f"{stem}{k + 1}" for k in range(n))
-    return replace(columns, **found)
+            sized[key] = tuple(f"{stem}{k + 1}" for k in range(n))
+    return replace(columns, **sized)

@@ -64,17 +64,14 @@ def split_rows(
         first: Number of the first of these lines in the file, from 1.
         repairs: List that descriptions of repairs are appended to.
         remedy: Last sentence of the error.
-
-    Raises:
-        ConfigError: If over 5% of the rows have another number of cells, or no row has that number.
     """
     rows, damaged = [], []
-    for at, line in enumerate(lines, first):
+    for number, line in enumerate(lines, first):
         cells = line.split(",")
         if len(cells) == width:
             rows.append(cells)
         elif line.strip():
-            damaged.append(f"{len(cells)} in line {at}")
+            damaged.append(f"{len(cells)} in line {number}")
     if len(damaged) > MAX_REPAIRED_SHARE * (len(rows) + len(damaged)) or not rows:
         raise ConfigError(
             f"{name}: expected rows of {width} cells, as in the header, got {len(rows)} such rows and {len(damaged)} "

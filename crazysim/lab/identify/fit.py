@@ -144,10 +144,6 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
         logs: Logs of the same sample time.
         airframe: Name or path of the airframe to start from.
         mass: Mass in the flights, kg; None for the airframe's.
-
-    Raises:
-        ConfigError: If the mass is not positive, if sample times, lengths or rotors of the logs do not fit, or if a
-            factor is below 1/10 or above 10.
     """
     base = load_airframe(airframe)
     if mass is not None and not 0 < mass < np.inf:
@@ -197,7 +193,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
     try:
         identified = load_airframe(_nested_tables(str(airframe), base.name, changes))
     except ConfigError as error:
-        raise ConfigError(f"the fit is no airframe: {error} Add flights that turn and climb more.") from error
+        raise ConfigError(f"the fitted numbers are not valid: {error} Add flights that turn and climb more.") from error
     return Identification(
         base=str(airframe),
         airframe=identified,
@@ -243,11 +239,11 @@ def _torques(
         momentum = log.ang_vel @ inertia + spin
         rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
         # Everything known, integrated, goes to the left side.
-        known = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
+        impulse = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
         vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
         columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
         columns += [vel[:, b : b + 1] * axes[a] for a in range(3) for b in range(3)]
-        return np.stack(columns, axis=-1), momentum - known
+        return np.stack(columns, axis=-1), momentum - impulse
 
     return _regression(logs, terms, np.zeros(len(TORQUES), bool))
 
@@ -279,34 +275,34 @@ def _regression(
     x, y, block = np.concatenate(rates), np.concatenate(changes), np.concatenate(blocks)
     k = x.shape[-1]
     weights = np.ones(y.shape)
-    found, free = np.zeros(k), np.ones(k, bool)
+    coefficients, free = np.zeros(k), np.ones(k, bool)
     for _ in range(10):
         normal = np.einsum("wri,wr,wrj->ij", x, weights, x)
         vector = np.einsum("wri,wr,wr->i", x, weights, y)
         free = np.ones(k, bool)
         while True:
-            found = np.zeros(k)
-            found[free] = np.linalg.lstsq(normal[np.ix_(free, free)], vector[free], rcond=None)[0]
-            wrong = not_positive & (found > 0)
+            coefficients = np.zeros(k)
+            coefficients[free] = np.linalg.lstsq(normal[np.ix_(free, free)], vector[free], rcond=None)[0]
+            wrong = not_positive & (coefficients > 0)
             if not np.any(wrong):
                 break
             free &= ~wrong
-        rest = y - x @ found
-        scale = 1.4826 * np.median(np.abs(rest), axis=0)  # of a normal distribution with that median
-        weights = 1 / np.maximum(scale, np.abs(rest) / 2) / np.maximum(scale, 1e-30)
+        residual = y - x @ coefficients
+        scale = 1.4826 * np.median(np.abs(residual), axis=0)  # of a normal distribution with that median
+        weights = 1 / np.maximum(scale, np.abs(residual) / 2) / np.maximum(scale, 1e-30)
     # Deviations by leaving each block out (jackknife), without bounds, which hide what other coefficients may be.
     numbers = np.unique(block)
     if len(numbers) < MIN_BLOCKS:
-        return found, np.full(k, np.nan)
+        return coefficients, np.full(k, np.nan)
     without = []
     for b in numbers:
         keep = block != b
         normal = np.einsum("wri,wr,wrj->ij", x[keep], weights[keep], x[keep])
         vector = np.einsum("wri,wr,wr->i", x[keep], weights[keep], y[keep])
         without.append(np.linalg.lstsq(normal, vector, rcond=None)[0])
-    each = np.array(without) - np.mean(without, axis=0)
+    deviations = np.array(without) - np.mean(without, axis=0)
     n = len(numbers)
-    return found, deviation_factor(n) * np.sqrt((n - 1) / n * np.sum(each**2, axis=0))
+    return coefficients, deviation_factor(n) * np.sqrt((n - 1) / n * np.sum(deviations**2, axis=0))
 
 
 def _smooth(x: NDArray, size: int = 9) -> NDArray:
@@ -341,11 +337,11 @@ def _check(logs: Sequence[Log], airframe: Airframe) -> None:
                 "Name their columns as rotor_vel; or log commands, as shares of the voltage, and the voltage, for an "
                 "airframe with battery.thrust_over_voltage; or fit a model of attitude commands (--dynamics so_rpy)."
             )
-        found = np.median(log.rotor_vel, axis=0)
-        if np.any((found < 0.4 * hover) | (found > 2.5 * hover)):
+        medians = np.median(log.rotor_vel, axis=0)
+        if np.any((medians < 0.4 * hover) | (medians > 2.5 * hover)):
             raise ConfigError(
                 f"{log.name}: expected each rotor near {hover.mean():.0f} rpm, as in hover, got medians of "
-                f"{', '.join(f'{x:.0f}' for x in found)}. Correct the column of a rotor that does not turn, or "
+                f"{', '.join(f'{x:.0f}' for x in medians)}. Correct the column of a rotor that does not turn, or "
                 f"give rpm_per_unit: {60 / (2 * np.pi):.4g} for rad/s, 1 over the pole pairs for electrical rpm."
             )
 
@@ -360,21 +356,24 @@ def _check_order(logs: Sequence[Log], airframe: Airframe) -> None:
     def explained(order: tuple[int, ...]) -> float:
         total = 0.0
         for axis in range(2):
-            rest = np.c_[vel, np.ones(len(vel))]
+            regressors = np.c_[vel, np.ones(len(vel))]
             torque = thrust[:, order] @ mixing[axis]
-            full = np.linalg.lstsq(np.c_[torque, rest], ang_acc[:, axis], rcond=None)[0]
-            alone = np.linalg.lstsq(rest, ang_acc[:, axis], rcond=None)[0]
-            gain = np.var(ang_acc[:, axis] - rest @ alone) - np.var(ang_acc[:, axis] - np.c_[torque, rest] @ full)
-            total += np.sign(full[0]) * gain / np.var(ang_acc[:, axis])
+            all_coefficients = np.linalg.lstsq(np.c_[torque, regressors], ang_acc[:, axis], rcond=None)[0]
+            without_torque = np.linalg.lstsq(regressors, ang_acc[:, axis], rcond=None)[0]
+            gain = np.var(ang_acc[:, axis] - regressors @ without_torque) - np.var(
+                ang_acc[:, axis] - np.c_[torque, regressors] @ all_coefficients
+            )
+            total += np.sign(all_coefficients[0]) * gain / np.var(ang_acc[:, axis])
         return total
 
-    given = tuple(range(airframe.n_rotors))
-    best = max(itertools.permutations(given), key=explained)
-    if explained(best) > explained(given) + 0.2:
+    index_order = tuple(range(airframe.n_rotors))
+    best = max(itertools.permutations(index_order), key=explained)
+    if explained(best) > explained(index_order) + 0.2:
         raise ConfigError(
             f"expected rotors in the order of airframe {airframe.name!r}; the angular accelerations fit "
-            f"the order {[k + 1 for k in best]} much better ({explained(best):.2f} against {explained(given):.2f}, "
-            "of at most 2). Name the columns of rotor_vel, and of command, in that order."
+            f"the order {[k + 1 for k in best]} much better "
+            f"({explained(best):.2f} against {explained(index_order):.2f}, of at most 2). Name the columns of "
+            "rotor_vel, and of command, in that order."
         )
 
 

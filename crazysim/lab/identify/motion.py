@@ -1,4 +1,4 @@
-"""Motion capture that is added to a log with another clock."""
+"""Motion capture with another clock, added to a log."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def join_motion_capture(
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
-        ConfigError: If both do not move alike.
+        ConfigError: If log and motion capture do not agree.
     """
     time, quat = columns.time, [unsigned_name(x) for x in columns.quat]
     ang_vel = stack_columns(name, table, columns.ang_vel, columns.rad_per_unit)
@@ -48,21 +48,21 @@ def join_motion_capture(
             f"{name}: expected columns {', '.join(missing)} in its motion capture, got {', '.join(sorted(motion))}. "
             "Give the names as time= and quat=."
         )
-    t, other = (np.asarray(x[time], np.float64) for x in (table, motion))
-    turned = body_rates(other, stack_columns(name, motion, columns.quat))
+    t, motion_time = (np.asarray(x[time], np.float64) for x in (table, motion))
+    motion_rates = body_rates(motion_time, stack_columns(name, motion, columns.quat))
     size = round(DERIVATIVE_DURATION / LAG_STEP)
     series = []
-    for at, rates in ((t, ang_vel), ((other[1:] + other[:-1]) / 2, turned)):
-        good = np.isfinite(at) & np.all(np.isfinite(rates), axis=-1)
-        order = np.unique(at[good], return_index=True)[1]
-        span = np.ptp(at[good]) if len(order) > 1 else 0.0
+    for times, rates in ((t, ang_vel), ((motion_time[1:] + motion_time[:-1]) / 2, motion_rates)):
+        is_valid = np.isfinite(times) & np.all(np.isfinite(rates), axis=-1)
+        order = np.unique(times[is_valid], return_index=True)[1]
+        span = np.ptp(times[is_valid]) if len(order) > 1 else 0.0
         if not 0 < span < MAX_SPAN * LAG_STEP * len(order):
             raise ConfigError(
                 f"{name}: expected samples of one flight, got {len(order)} with times and angular velocities, over "
                 f"{span:.3g} s. Cut the log and its motion capture to the flight."
             )
-        grid = np.arange(at[good].min(), at[good].max(), LAG_STEP)
-        speed = np.interp(grid, at[good][order], np.linalg.norm(rates[good][order], axis=-1))
+        grid = np.arange(times[is_valid].min(), times[is_valid].max(), LAG_STEP)
+        speed = np.interp(grid, times[is_valid][order], np.linalg.norm(rates[is_valid][order], axis=-1))
         series.append((grid[0], np.convolve(speed, np.ones(size) / size, "same")))
     (first, a), (second, b) = series
     lag, agreement = _lag(a, b)
@@ -75,10 +75,10 @@ def join_motion_capture(
     repairs.append(f"moved the clock of the motion capture by {shift:.3f} s (agreement {agreement:.2f} of 1)")
     streams = {
         "the log": Stream(t, _numbers(table, len(t), (time,))),
-        "motion capture": Stream(other + shift, _numbers(motion, len(other), (time, *table))),
+        "motion capture": Stream(motion_time + shift, _numbers(motion, len(motion_time), (time, *table))),
     }
-    both = resample(name, streams, repairs, columns)
-    return both | {time: both.pop("t")}
+    merged = resample(name, streams, repairs, columns)
+    return merged | {time: merged.pop("t")}
 
 
 def _numbers(table: Mapping[str, NDArray], n: int, without: Sequence[str]) -> dict[str, NDArray]:
@@ -88,18 +88,18 @@ def _numbers(table: Mapping[str, NDArray], n: int, without: Sequence[str]) -> di
 
 
 def _lag(a: NDArray, b: NDArray) -> tuple[float, float]:
-    """Return the samples by which b must move to agree with a, and the correlation there, 0 to 1."""
+    """Return the number of samples by which b is shifted to agree best with a, and the correlation there, 0 to 1."""
     n = len(a) + len(b)
 
     def product(x: NDArray, y: NDArray) -> NDArray:
         return np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
 
-    one, other = np.ones(len(a)), np.ones(len(b))
-    count = np.round(product(one, other))
+    ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
+    count = np.round(product(ones_a, ones_b))
     safe = np.maximum(count, 1)
-    mean_a, mean_b = product(a, other) / safe, product(one, b) / safe
+    mean_a, mean_b = product(a, ones_b) / safe, product(ones_a, b) / safe
     covariance = product(a, b) / safe - mean_a * mean_b
-    variance = (product(a * a, other) / safe - mean_a**2) * (product(one, b * b) / safe - mean_b**2)
+    variance = (product(a * a, ones_b) / safe - mean_a**2) * (product(ones_a, b * b) / safe - mean_b**2)
     overlap = count >= 0.5 * min(len(a), len(b))
     agreement = np.where(overlap, covariance / np.sqrt(np.maximum(variance, 1e-12)), -1.0)
     k = int(np.argmax(agreement))

@@ -39,33 +39,30 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     Args:
         log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.
         airframe: Airframe; without ``battery.thrust_over_voltage`` the log comes back unchanged.
-
-    Raises:
-        ConfigError: If commands are not from 0 to 1.
     """
     command, voltage = log.command, log.voltage
     if log.rotor_vel.shape[1] or command is None or voltage is None or command.shape[1] != airframe.n_rotors:
         return log
     if "battery.thrust_over_voltage" not in airframe.values:
         return log
-    good = (command >= 0) & (command <= 1)
-    if np.sum(~good) > MAX_REPAIRED_SHARE * good.size:
+    is_valid = (command >= 0) & (command <= 1)
+    if np.sum(~is_valid) > MAX_REPAIRED_SHARE * is_valid.size:
         raise ConfigError(
             f"{log.name}: expected commands from 0 to 1, shares of the battery's voltage, got {command.min():.4g} to "
             f"{command.max():.4g}. Give share_per_command, such as 1.5259e-05 for 0 to 65535."
         )
-    command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, good.T, strict=True)], axis=-1)
+    command = np.stack([np.interp(log.t, log.t[g], c[g]) for c, g in zip(command.T, is_valid.T, strict=True)], axis=-1)
     half = max(1, round(VOLTAGE_WINDOW / log.dt / 2))
     window = np.hanning(2 * half + 3)[1:-1]
     volts = np.convolve(np.pad(voltage, half, mode="edge"), window / window.sum(), "valid")[:, None] * command
     thrust = np.maximum(np.polynomial.polynomial.polyval(volts, airframe.value("battery.thrust_over_voltage")), 0.0)
     total = thrust.sum(axis=1)
     means = thrust[total > np.median(total) / 2].mean(axis=0)
-    wanted = np.asarray(airframe.rotor_vel(thrust * means.mean() / means), np.float64)
+    commanded = np.asarray(airframe.rotor_vel(thrust * means.mean() / means), np.float64)
     repairs = [*log.repairs, "modelled the rotor speeds from commands and voltage"]
-    if not np.all(good):
-        repairs.append(f"interpolated {np.sum(~good)} commands that were not from 0 to 1")
-    speeds = _lagged_speeds(wanted, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
+    if not np.all(is_valid):
+        repairs.append(f"interpolated {np.sum(~is_valid)} commands that were not from 0 to 1")
+    speeds = _lagged_speeds(commanded, np.diff(log.t), np.atleast_2d(airframe.value("rotors.lag")))
     flying, margin = np.flatnonzero(total > 0.75 * np.median(total)), round(GROUND_MARGIN / log.dt)
     air = slice(flying[0] + margin, max(flying[-1] - margin, flying[0] + margin))
     repairs.append(f"left out {air.start} samples at the start and {len(log.t) - air.stop} at the end, near the ground")
@@ -75,7 +72,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     return replace(log, **data, modelled=True, gaps=gaps, repairs=tuple(repairs))
 
 
-def _lagged_speeds(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
+def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
     """Return the speeds of rotors behind held commands, rpm. (n, n_rotors)"""
 
     def step(speed: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -85,9 +82,9 @@ def _lagged_speeds(wanted: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
         new = speed - gap * jnp.expm1(-rate * duration)
         return new, new
 
-    first = jnp.asarray(wanted[0])
-    _, path = jax.jit(lambda *x: jax.lax.scan(step, first, x))(jnp.asarray(wanted[:-1]), jnp.asarray(dt))
-    return np.concatenate([wanted[:1], np.asarray(path, np.float64)])
+    first = jnp.asarray(commanded[0])
+    _, path = jax.jit(lambda *x: jax.lax.scan(step, first, x))(jnp.asarray(commanded[:-1]), jnp.asarray(dt))
+    return np.concatenate([commanded[:1], np.asarray(path, np.float64)])
 
 
 def motor_lag(logs: Sequence[Log]) -> NDArray:
@@ -102,16 +99,16 @@ def motor_lag(logs: Sequence[Log]) -> NDArray:
     Returns:
         Rates, NaN where no rate from 2 to 200 1/s is best. (n_logs with both, n_rotors)
     """
-    found = []
+    lags = []
     for log in logs:
         if log.modelled or log.command is None or not log.rotor_vel.shape[1]:
             continue
         if log.command.shape != log.rotor_vel.shape:
             continue
         t = np.arange(log.t[0], log.t[-1], log.dt)
-        at = [[np.interp(t, log.t, c) for c in x.T] for x in (log.command, log.rotor_vel)]
-        found.append([_rate(u, r, log.dt) for u, r in zip(*at, strict=True)])
-    return np.array(found)
+        series = [[np.interp(t, log.t, c) for c in x.T] for x in (log.command, log.rotor_vel)]
+        lags.append([_rate(u, r, log.dt) for u, r in zip(*series, strict=True)])
+    return np.array(lags)
 
 
 def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
@@ -126,10 +123,10 @@ def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
         for d in delays:
             for k, r in enumerate(rates):
                 # The response is shifted, not the speed, whose noise an interpolation would make smaller.
-                late = [np.interp(index - d / dt, index, c)[inner] for c in responses[:, k].T]
-                x = np.c_[late[0], late[1], np.ones(len(late[0]))]
-                rest = speed[inner] - x @ np.linalg.lstsq(x, speed[inner], rcond=None)[0]
-                if (cost := float(rest @ rest)) < best:
+                shifted = [np.interp(index - d / dt, index, c)[inner] for c in responses[:, k].T]
+                x = np.c_[shifted[0], shifted[1], np.ones(len(shifted[0]))]
+                residual = speed[inner] - x @ np.linalg.lstsq(x, speed[inner], rcond=None)[0]
+                if (cost := float(residual @ residual)) < best:
                     best, rate, delay = cost, float(r), float(d)
         ratio, width = rates[1] / rates[0], delays[1] - delays[0]
         rates, delays = np.geomspace(rate / ratio, rate * ratio, 9), np.linspace(delay - width, delay + width, 7)

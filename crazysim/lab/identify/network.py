@@ -55,7 +55,6 @@ def fit_residual(
         seed: Seed of the first weights and of the batches.
 
     Raises:
-        ConfigError: If a number is not positive.
         ImportError: If optax is not installed.
     """
     try:
@@ -98,8 +97,8 @@ def fit_residual(
 
     @jax.jit
     def update(weights: dict[str, Array], state: Any, key: Array) -> tuple[Any, Any]:
-        chosen = jax.random.choice(key, len(data.pos), (batch_size,))
-        grads = jax.grad(loss)(weights, jax.tree.map(lambda x: x[chosen], data))
+        rows = jax.random.choice(key, len(data.pos), (batch_size,))
+        grads = jax.grad(loss)(weights, jax.tree.map(lambda x: x[rows], data))
         grads = jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), grads)
         updates, state = optimizer.update(grads, state, weights)
         return optax.apply_updates(weights, updates), state
@@ -112,13 +111,13 @@ def fit_residual(
         "output": jnp.zeros((6, n_hidden)),
     }
     state, judge = optimizer.init(weights), jax.jit(loss)
-    best, least = weights, np.inf
+    best, least_loss = weights, np.inf
     for k in range(iterations):
         weights, state = update(weights, state, jax.random.fold_in(key, k))
         if held_out is not None and (k % 100 == 99 or k == iterations - 1):
-            found = float(judge(weights, held_out))
-            if found < least:
-                best, least = weights, found
+            held_out_loss = float(judge(weights, held_out))
+            if held_out_loss < least_loss:
+                best, least_loss = weights, held_out_loss
     return Model(params=params, residual=residual(weights if held_out is None else best))
 
 
@@ -126,12 +125,12 @@ def scaled_errors(model: Model, window: Windows, dt: float) -> Array:
     """Return the errors of the prediction of one window at ten times, over ``SCALES``. (120,)"""
     pos, quat, vel, ang_vel = predict(model, window, dt)
     n = window.pos.shape[0]
-    at = np.unique(np.linspace(0, n - 1, 11).round().astype(int))[1:]
+    samples = np.unique(np.linspace(0, n - 1, 11).round().astype(int))[1:]
     parts = [
-        (pos - window.pos)[at] / SCALES["pos"],
-        attitude_error(quat[at], window.quat[at]) / SCALES["attitude"],
-        (vel - window.vel)[at] / SCALES["vel"],
-        (ang_vel - window.ang_vel)[at] / SCALES["ang_vel"],
+        (pos - window.pos)[samples] / SCALES["pos"],
+        attitude_error(quat[samples], window.quat[samples]) / SCALES["attitude"],
+        (vel - window.vel)[samples] / SCALES["vel"],
+        (ang_vel - window.ang_vel)[samples] / SCALES["ang_vel"],
     ]
     return jnp.concatenate([x.ravel() for x in parts])
 

@@ -34,10 +34,10 @@ def plot_errors(logs: Sequence[Log], models: Mapping[str, Predictor], path: str 
     axes = figure.subplots(1, 2)
     naive = {"position": "at constant velocity", "attitude": "unchanged"}
     for ax, (key, other), unit in zip(axes, naive.items(), ("m", "degrees"), strict=True):
-        for name, found in errors.items():
-            ax.plot(horizons, found[key], label=name)
+        for name, values in errors.items():
+            ax.plot(horizons, values[key], label=name)
         for kind, style in ((other, "k:"), ("at constant body rates", "k--")):
-            ax.plot(horizons, found[f"{key} {kind}"], style, label=kind)
+            ax.plot(horizons, values[f"{key} {kind}"], style, label=kind)
         ax.set(xlabel="horizon, s", ylabel=f"RMSE of {key}, {unit}", xlim=(0, None), ylim=(0, None))
         ax.grid(alpha=0.3)
         ax.legend()

@@ -76,7 +76,7 @@ class Model(PyTree):
     params: first_principles.Params
     """Parameters of the first-principles model."""
     residual: ResidualData
-    """Forces and torques beside it."""
+    """Forces and torques that are added to those of the first-principles model."""
 
     @staticmethod
     def create(airframe: Airframe, mass: float | None = None) -> Model:
@@ -89,8 +89,8 @@ class Model(PyTree):
         params = first_principles.Params.create(airframe)
         if mass is not None:
             params = params.replace(mass=jnp.asarray([mass], jnp.float32))
-        known = "residual.linear" in airframe.values
-        residual = ResidualData.create(airframe) if known else ResidualData(jnp.zeros((6, N_INPUTS)), None, None)
+        has_residual = "residual.linear" in airframe.values
+        residual = ResidualData.create(airframe) if has_residual else ResidualData(jnp.zeros((6, N_INPUTS)), None, None)
         return Model(params=params, residual=residual)
 
     def prepared(self, log: Log) -> Log:
@@ -104,12 +104,14 @@ class Model(PyTree):
     def inputs(self, window: Windows, dt: float) -> Array:
         """Return rotor speeds, interpolated linearly, rpm, and accelerations, rpm/s. (n - 1, 3, 2, n_rotors)"""
         n = window.pos.shape[0]
-        at = jnp.arange(2 * n - 1) / 2 + PADDING
-        index = jnp.arange(n + 2 * PADDING, dtype=at.dtype)
-        speeds = jax.vmap(lambda x: jnp.interp(at, index, x), 1, 1)(window.rotor_vel)
+        sample = jnp.arange(2 * n - 1) / 2 + PADDING
+        index = jnp.arange(n + 2 * PADDING, dtype=sample.dtype)
+        speeds = jax.vmap(lambda x: jnp.interp(sample, index, x), 1, 1)(window.rotor_vel)
         accelerations = jnp.asarray(jnp.gradient(speeds, axis=0)) / (dt / 2)
-        both = jnp.stack([speeds, accelerations], axis=1)
-        return jnp.stack([both[:-1:2], both[1::2], both[2::2]], axis=1)
+        speed_and_acceleration = jnp.stack([speeds, accelerations], axis=1)
+        return jnp.stack(
+            [speed_and_acceleration[:-1:2], speed_and_acceleration[1::2], speed_and_acceleration[2::2]], axis=1
+        )
 
     def derivative(self, state: State, inputs: Array) -> State:
         """Return the time derivatives of a state under rotor speeds and their accelerations."""
@@ -167,17 +169,17 @@ def predict(
     """
 
     def derivative(state: State, inputs: Array) -> State:
-        vel, ang_vel, acc, ang_acc, more = model.derivative(state, inputs)
-        return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc, more
+        vel, ang_vel, acc, ang_acc, more_rates = model.derivative(state, inputs)
+        return vel, ang_vel, acc, jnp.zeros_like(ang_acc) if constant_rates else ang_acc, more_rates
 
     def moved(state: State, rates: State, duration: float) -> State:
-        pos, quat, vel, ang_vel, more = state
+        pos, quat, vel, ang_vel, more_states = state
         return (
             pos + duration * rates[0],
             rotation.turn(quat, rates[1], duration, normalize=True),
             vel + duration * rates[2],
             ang_vel + duration * rates[3],
-            more + duration * rates[4],
+            more_states + duration * rates[4],
         )
 
     def step(state: State, inputs: Array) -> tuple[State, State]:
@@ -223,25 +225,25 @@ def prediction_errors(
     batch, dt = windows([model.prepared(log) for log in logs], max(horizons), 0.05), logs[0].dt
     pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)
     pos_turning, quat_turning, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt, constant_rates=True)))(batch)
-    at = np.asarray([round(h / dt) for h in horizons])
-    times = jnp.asarray(at * dt, jnp.float32)[:, None]
-    truth, turned = batch.pos[:, at], batch.quat[:, at]
+    samples = np.asarray([round(h / dt) for h in horizons])
+    times = jnp.asarray(samples * dt, jnp.float32)[:, None]
+    true_pos, true_quat = batch.pos[:, samples], batch.quat[:, samples]
     positions = {
-        "position": pos[:, at],
-        "position at constant body rates": pos_turning[:, at],
+        "position": pos[:, samples],
+        "position at constant body rates": pos_turning[:, samples],
         "position at constant velocity": batch.pos[:, :1] + times * batch.vel[:, :1],
     }
     attitudes = {
-        "attitude": quat[:, at],
-        "attitude at constant body rates": quat_turning[:, at],
-        "attitude unchanged": jnp.broadcast_to(batch.quat[:, :1], turned.shape),
+        "attitude": quat[:, samples],
+        "attitude at constant body rates": quat_turning[:, samples],
+        "attitude unchanged": jnp.broadcast_to(batch.quat[:, :1], true_quat.shape),
     }
     errors: dict[str, NDArray] = {}
     for name, x in positions.items():
-        size = np.linalg.norm(np.asarray(x - truth, np.float64), axis=-1)
+        size = np.linalg.norm(np.asarray(x - true_pos, np.float64), axis=-1)
         errors |= {name: np.sqrt(np.mean(size**2, axis=0)), f"{name} (mean)": np.mean(size, axis=0)}
     for name, x in attitudes.items():
-        size = np.linalg.norm(np.asarray(attitude_error(x, turned), np.float64), axis=-1)
+        size = np.linalg.norm(np.asarray(attitude_error(x, true_quat), np.float64), axis=-1)
         angle = 2 * np.arcsin(np.minimum(size / 2, 1.0))
         rmse, mean = np.sqrt(np.mean(size**2, axis=0)), np.mean(angle, axis=0)
         errors |= {name: np.degrees(rmse), f"{name} (mean)": np.degrees(mean)}

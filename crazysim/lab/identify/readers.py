@@ -22,7 +22,7 @@ MAX_HOLD = 3.0
 VARIABLE_PATTERN = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
 """Name and type of a variable of a micro-SD log, such as ``gyro.x(f)``."""
 MAX_RATE = 250.0
-"""Rate to which faster logs are averaged, Hz: above some 50 Hz nothing is identified."""
+"""Rate to which faster logs are averaged, Hz: above about 50 Hz nothing is identified."""
 
 
 class Stream(NamedTuple):
@@ -54,22 +54,22 @@ def resample(
     """
     columns = columns or Columns()
     quat, angles = ([unsigned_name(x) for x in names] for names in (columns.quat, columns.rpy))
-    needed, slowly = {*map(unsigned_name, columns.pos), *quat, *angles}, set(map(unsigned_name, columns.voltage))
+    required, slowly = {*map(unsigned_name, columns.pos), *quat, *angles}, set(map(unsigned_name, columns.voltage))
     sorted_streams = {}
     for key, stream in streams.items():
         order = np.unique(stream.t, return_index=True)[1]
         order = order[np.isfinite(stream.t[order])]
         if len(order) < len(stream.t) or np.any(np.diff(stream.t) <= 0):
-            repairs.append(f"sorted {key}, of which {len(stream.t) - len(order)} samples have no time of their own")
+            repairs.append(f"sorted {key} and left out {len(stream.t) - len(order)} samples with the time of another")
         if len(order) < 2:
             raise ConfigError(f"{name}: expected at least two samples of {key}, got {len(order)}. Log it more often.")
         values = {c: without_huge_numbers(x[order]) for c, x in stream.columns.items()}
         step = float(np.median(np.diff(stream.t[order])))
         if step > PERIOD_RANGE[1] and not set(values) <= slowly:
-            wanted = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
-            if needed & set(values):
-                raise ConfigError(f"{name}: expected {wanted}. Log it faster.")
-            repairs.append(f"left out a slow stream: expected {wanted}")
+            interval = f"{key} every {PERIOD_RANGE[1]:g} s or more often, got every {step:.2g} s"
+            if required & set(values):
+                raise ConfigError(f"{name}: expected {interval}. Log it faster.")
+            repairs.append(f"left out a slow stream: expected {interval}")
             continue
         if quat and all(c in values for c in quat):
             turned = align_signs(np.stack([values[c] for c in quat], axis=-1))
@@ -127,7 +127,7 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
         wanted: Names of the columns. Events that have none of them are left out, unless all have none.
 
     Raises:
-        ConfigError: If the file is no such log.
+        ConfigError: If the file is not a log of this format.
     """
     data = path.read_bytes()
     if len(data) < 9 or data[0] != 0xBC:
@@ -146,7 +146,7 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
         repairs.append("the checksum does not match: read up to the last whole record")
         end = len(data)
     try:
-        kinds, at = _kinds(data, n_kinds)
+        kinds, offset = _kinds(data, n_kinds)
     except (struct.error, ValueError) as error:
         raise ConfigError(
             f"{path.name}: expected names of log variables in the header, got {error}. Copy the file again."
@@ -154,14 +154,14 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
     head = struct.Struct("<HI" if version == 1 else "<HQ")
     unit = 1e-3 if version == 1 else 1e-6
     rows: dict[int, list[tuple[float, ...]]] = {key: [] for key in kinds}
-    while at + head.size <= end:
-        kind, time = head.unpack_from(data, at)
-        if kind not in kinds or at + head.size + kinds[kind][2].size > end:
+    while offset + head.size <= end:
+        kind, time = head.unpack_from(data, offset)
+        if kind not in kinds or offset + head.size + kinds[kind][2].size > end:
             break
-        rows[kind].append((time * unit, *kinds[kind][2].unpack_from(data, at + head.size)))
-        at += head.size + kinds[kind][2].size
-    if at < end and not repairs:
-        repairs.append(f"left out {end - at} bytes at the end that are no record")
+        rows[kind].append((time * unit, *kinds[kind][2].unpack_from(data, offset + head.size)))
+        offset += head.size + kinds[kind][2].size
+    if offset < end and not repairs:
+        repairs.append(f"left out {end - offset} bytes at the end that are not a record")
     times = Counter(variable for key, (_, variables, _) in kinds.items() if rows[key] for variable in variables)
     streams = {}
     for key, (name, variables, _) in kinds.items():
@@ -192,10 +192,10 @@ def decompress_quat(packed: NDArray) -> NDArray:
     """
     largest, quat = packed >> 30, np.zeros((len(packed), 4))
     for k in (3, 2, 1, 0):
-        other = largest != k
+        is_small = largest != k
         size = (packed & 511) / 511 * np.sqrt(0.5)
-        quat[:, k] = np.where(other, np.where(packed & 512, -size, size), 0.0)
-        packed = np.where(other, packed >> 10, packed)
+        quat[:, k] = np.where(is_small, np.where(packed & 512, -size, size), 0.0)
+        packed = np.where(is_small, packed >> 10, packed)
     rest = np.sqrt(np.clip(1 - np.sum(quat**2, axis=1), 0, 1))
     quat[np.arange(len(quat)), largest] = rest
     return quat
@@ -203,23 +203,23 @@ def decompress_quat(packed: NDArray) -> NDArray:
 
 def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
     """Return name, variables and layout of each kind of record, and the place of the first record."""
-    kinds, at = {}, 5
+    kinds, offset = {}, 5
 
-    def text(at: int) -> tuple[str, int]:
-        stop = data.index(0, at)
-        return data[at:stop].decode(), stop + 1
+    def text(offset: int) -> tuple[str, int]:
+        stop = data.index(0, offset)
+        return data[offset:stop].decode(), stop + 1
 
     for _ in range(n_kinds):
-        (key,) = struct.unpack_from("<H", data, at)
-        name, at = text(at + 2)
-        (count,) = struct.unpack_from("<H", data, at)
-        at += 2
+        (key,) = struct.unpack_from("<H", data, offset)
+        name, offset = text(offset + 2)
+        (count,) = struct.unpack_from("<H", data, offset)
+        offset += 2
         variables, layout = [], "<"
         for _ in range(count):
-            entry, at = text(at)
-            if (found := VARIABLE_PATTERN.fullmatch(entry)) is None:
+            entry, offset = text(offset)
+            if (match := VARIABLE_PATTERN.fullmatch(entry)) is None:
                 raise struct.error(f"{entry[:60]!r} in place of one such as 'gyro.x(f)'")
-            variables.append(found[1])
-            layout += found[2]
+            variables.append(match[1])
+            layout += match[2]
         kinds[key] = (name, variables, struct.Struct(layout))
-    return kinds, at
+    return kinds, offset

@@ -23,7 +23,7 @@ UNITS_OF_TIME = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MIN_SAMPLES = 20
 """Least number of samples of a log."""
 GROUND_DURATION = 1.0
-"""Shortest stay on the ground within a log that is found, and the time beside each stay that is left out, too, s."""
+"""Shortest stay on the ground that is left out of a log, and the time left out before and after it, s."""
 CARRIED_SHARE, IDLE_SHARE = 0.75, 0.4
 """Shares of the typical thrust. A drone is on the ground where its thrust is below the first for longer than
 ``GROUND_DURATION`` and falls below the second: flight controllers raise the thrust slowly before they take off."""
@@ -32,25 +32,25 @@ N_NEIGHBOURS = 10
 
 
 def check_period(name: str, t: NDArray) -> None:
-    """Check that samples follow each other as in a log of a flight.
+    """Check that the interval between samples is that of a log of a flight.
 
     Args:
         name: Name of the log, for messages.
         t: Time, s. (n,)
 
     Raises:
-        ConfigError: If they do not, with the unit that the time seems to have.
+        ConfigError: If the interval is too short or too long; the message names the probable unit of the time.
     """
     steps = np.diff(t[np.isfinite(t)])
     steps = steps[steps > 0]
-    period, (least, most) = float(np.median(steps)) if len(steps) else 0.0, PERIOD_RANGE
-    if not len(steps) or least <= period <= most:
+    period, (low, high) = float(np.median(steps)) if len(steps) else 0.0, PERIOD_RANGE
+    if not len(steps) or low <= period <= high:
         return
-    units = [(unit, x) for unit, x in UNITS_OF_TIME.items() if least <= period * x <= most]
+    units = [(unit, x) for unit, x in UNITS_OF_TIME.items() if low <= period * x <= high]
     hint = f"The times seem to be in {units[0][0]}: give seconds_per_unit={units[0][1]:g}" if units else (
         "Give seconds_per_unit, the factor from the logged times to s"
     )  # fmt: skip
-    raise ConfigError(f"{name}: expected samples every {least:g} to {most:g} s, got every {period:.4g} s. {hint}.")
+    raise ConfigError(f"{name}: expected samples every {low:g} to {high:g} s, got every {period:.4g} s. {hint}.")
 
 
 def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
@@ -62,12 +62,14 @@ def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     if not np.all(np.diff(t[keep]) > 0):
         keep = _longest_increasing_sequence(t)
     if np.sum(keep) > 2:  # A clock that is set at the start, or garbage at the end.
-        at, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
-        keep[[at[k] for k, step in ((0, 0), (-1, -2)) if t[at[step + 1]] - t[at[step]] > 100 * dt]] = False
+        indices, dt = np.flatnonzero(keep), np.median(np.diff(t[keep]))
+        keep[[indices[k] for k, step in ((0, 0), (-1, -2)) if t[indices[step + 1]] - t[indices[step]] > 100 * dt]] = (
+            False
+        )
     lost = int(np.sum(~keep))
-    if len(t) >= MIN_SAMPLES and 2 * (different := len(np.unique(t))) < len(t):
+    if len(t) >= MIN_SAMPLES and 2 * (n_different := len(np.unique(t))) < len(t):
         raise ConfigError(
-            f"{name}: expected a time of its own for each sample, got {different} times of {len(t)} samples. "
+            f"{name}: expected a different time for each sample, got {n_different} times of {len(t)} samples. "
             "Export the time with more digits, or name another column as time."
         )
     if len(t) < MIN_SAMPLES or lost > MAX_REPAIRED_SHARE * len(t):
@@ -99,15 +101,15 @@ def _longest_increasing_sequence(t: NDArray) -> NDArray:
 def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
     """Return the indices of samples that follow a gap. (n_gaps,)
 
-    A gap is an interval of over 1.5 times the median for which the next ones do not make up: time that only jitters
-    leaves none.
+    A gap is an interval of over 1.5 times the median, after which the samples stay late. If the next intervals are
+    shorter, the times only jitter.
     """
     steps = np.diff(t)
     dt = float(np.median(steps))
     wide = 1 + np.flatnonzero(steps > 1.5 * dt)
     over = min(5 * N_NEIGHBOURS, len(t) - 1)
-    late = t - t[0] - np.median(t[over:] - t[:-over]) / over * np.arange(len(t))
-    sides = [(late[max(k - N_NEIGHBOURS, 0) : k], late[k : k + N_NEIGHBOURS]) for k in wide]
+    lateness = t - t[0] - np.median(t[over:] - t[:-over]) / over * np.arange(len(t))
+    sides = [(lateness[max(k - N_NEIGHBOURS, 0) : k], lateness[k : k + N_NEIGHBOURS]) for k in wide]
     lost = [np.median(b) - np.median(a) > dt / 2 and np.min(b) > np.max(a) for a, b in sides]
     gaps = wide[np.array(lost, bool)]
     if len(wide) > len(gaps):
@@ -135,38 +137,40 @@ def interpolate_missing(
     """
     keep, lost, whole = np.ones(len(t), bool), [], {}
     for key, x in data.items():
-        good = np.all(np.isfinite(x), axis=-1)
+        is_valid = np.all(np.isfinite(x), axis=-1)
         if key == "quat":
-            good &= np.linalg.norm(np.where(np.isfinite(x), x, 0.0), axis=-1) > NORM_TOLERANCE
-        if 2 * np.sum(good) < len(t):
+            is_valid &= np.linalg.norm(np.where(np.isfinite(x), x, 0.0), axis=-1) > NORM_TOLERANCE
+        if 2 * np.sum(is_valid) < len(t):
             raise ConfigError(
-                f"{name}: expected finite {key}{' that is not zero' if key == 'quat' else ''}, got {np.sum(~good)} "
+                f"{name}: expected finite {key}{' that is not zero' if key == 'quat' else ''}, got {np.sum(~is_valid)} "
                 f"samples of {len(t)} that are not. Cut the log to where it is whole."
             )
         if key == "quat":
             x = x.copy()
-            x[good] = normalise_quats(name, x[good], repairs)
-            if not np.all(good):
-                x[good] = align_signs(x[good])
-        at = np.flatnonzero(good)
-        pauses = np.flatnonzero((np.diff(at) > 1) & (np.diff(t[at]) > MAX_INTERPOLATION))
-        known = np.zeros(len(t), bool)
-        known[at[0] : at[-1] + 1] = True
+            x[is_valid] = normalise_quats(name, x[is_valid], repairs)
+            if not np.all(is_valid):
+                x[is_valid] = align_signs(x[is_valid])
+        indices = np.flatnonzero(is_valid)
+        pauses = np.flatnonzero((np.diff(indices) > 1) & (np.diff(t[indices]) > MAX_INTERPOLATION))
+        is_known = np.zeros(len(t), bool)
+        is_known[indices[0] : indices[-1] + 1] = True
         for k in pauses:
-            known[at[k] + 1 : at[k + 1]] = False
-        if not np.all(known):
+            is_known[indices[k] + 1 : indices[k + 1]] = False
+        if not np.all(is_known):
             lost.append(key)
-            keep &= known
-        few = int(np.sum(known & ~good))
-        if few > MAX_REPAIRED_SHARE * len(t):
+            keep &= is_known
+        n_filled = int(np.sum(is_known & ~is_valid))
+        if n_filled > MAX_REPAIRED_SHARE * len(t):
             raise ConfigError(
-                f"{name}: expected finite {key}, got {few} samples of {len(t)} that are not. "
+                f"{name}: expected finite {key}, got {n_filled} samples of {len(t)} that are not. "
                 "Cut the log to where it is whole, or leave the column out."
             )
-        if few:
-            repairs.append(f"interpolated {few} samples of {key} that were not finite{' or zero' * (key == 'quat')}")
-        if not np.all(good):
-            x = np.stack([np.interp(t, t[good], c[good]) for c in x.T], axis=-1)
+        if n_filled:
+            repairs.append(
+                f"interpolated {n_filled} samples of {key} that were not finite{' or zero' * (key == 'quat')}"
+            )
+        if not np.all(is_valid):
+            x = np.stack([np.interp(t, t[is_valid], c[is_valid]) for c in x.T], axis=-1)
             x = x / np.linalg.norm(x, axis=-1, keepdims=True) if key == "quat" else x
         whole[key] = x
     if lost:
@@ -184,9 +188,6 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
         t: Time, s. (n,)
         thrust: Sum of the squares of the rotor speeds, or the commanded thrust, in any unit. (n,)
         repairs: List that descriptions of repairs are appended to.
-
-    Raises:
-        ConfigError: If the rotors are at rest.
     """
     from scipy.ndimage import median_filter  # a fifth of a second to import
 
@@ -224,8 +225,8 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
 
 def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
     """Return rotor speeds, interpolated where they are negative or more than three times their median. (n, n_rotors)"""
-    good = (x >= 0) & (x <= 3 * np.median(x, axis=0))
-    bad = int(np.sum(~good))
+    is_valid = (x >= 0) & (x <= 3 * np.median(x, axis=0))
+    bad = int(np.sum(~is_valid))
     if bad > MAX_REPAIRED_SHARE * x.size:
         raise ConfigError(
             f"{name}: expected rotor speeds from 0 to three times their median, got {bad} others. "
@@ -235,7 +236,7 @@ def remove_spikes(name: str, x: NDArray, repairs: list[str]) -> NDArray:
         return x
     repairs.append(f"interpolated {bad} rotor speeds that were negative or more than three times the median")
     index = np.arange(len(x))
-    return np.stack([np.interp(index, index[g], c[g]) for c, g in zip(x.T, good.T, strict=True)], axis=-1)
+    return np.stack([np.interp(index, index[g], c[g]) for c, g in zip(x.T, is_valid.T, strict=True)], axis=-1)
 
 
 def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
@@ -261,9 +262,9 @@ def normalise_quats(name: str, quat: NDArray, repairs: list[str]) -> NDArray:
 
 def unwrap_angles(angles: NDArray, period: float = 2 * np.pi) -> NDArray:
     """Return angles that do not jump by a period, as interpolation needs; missing ones stay NaN. (n,)"""
-    good = np.isfinite(angles)
-    angles = np.where(good, angles, np.nan)
-    angles[good] = np.unwrap(angles[good], period=period)
+    is_valid = np.isfinite(angles)
+    angles = np.where(is_valid, angles, np.nan)
+    angles[is_valid] = np.unwrap(angles[is_valid], period=period)
     return angles
 
 

@@ -25,11 +25,11 @@ from crazysim.errors import ConfigError
 from crazysim.lab.identify.logs import Log
 
 FAST_WIDTH, SLOW_WIDTH, YAW_SLOW_WIDTH = 0.05, 0.33, 1.0
-"""Widths of the Hann windows whose difference is the band-pass, s: some 3 to 20 Hz, and 1 to 20 Hz about z."""
+"""Widths of the Hann windows whose difference is the band-pass, s: about 3 to 20 Hz, and 1 to 20 Hz about z."""
 RESPONSE_DURATION = 0.15
 """Duration of the response from commands to rotor speeds, s."""
 BLOCK_DURATION = 10.0
-"""Duration of the blocks of a log that are solved for themselves, each with a delay of its own, s."""
+"""Duration of the blocks of a log that are solved separately, each with its delay, s."""
 MIN_BLOCKS = 3
 """Fewest blocks whose scatter gives a standard deviation."""
 MAX_DELAY = 0.04
@@ -41,7 +41,7 @@ DELAY_DEVIATION = 0.02
 """Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there, of
 which quadrature makes a delay of dt^2 / (12 time constant): 0.04 samples of 0.01 s for a time constant of 0.02 s."""
 N_ITERATIONS = 3
-"""Fits, each with the gyroscopic torques of the moments of inertia of the one before."""
+"""Number of fits, each with gyroscopic torques from the moments of inertia of the last."""
 
 
 class FastRotation(NamedTuple):
@@ -56,7 +56,7 @@ class FastRotation(NamedTuple):
 
 
 def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_factor: float = 1.0) -> FastRotation:
-    """Return what fast rotation shows.
+    """Return moments of inertia, torque curve and delays that explain the fast rotation of logs.
 
     About x and y, thrust and arms give the torque, and so the scale. About z neither the drag torque nor the rotors'
     inertia is known, so that only their ratios to the moment of inertia are: that moment is in proportion to the other
@@ -75,12 +75,12 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     values, blocks = np.ones(5), []
     for _ in range(N_ITERATIONS):
         blocks = [_blocks(_LogTerms.create(log, params, thrust_factor, values)) for log in logs]
-        found = np.concatenate(blocks)
-        if not len(found):
+        estimates = np.concatenate(blocks)
+        if not len(estimates):
             raise ConfigError(
                 f"expected logs of over {YAW_SLOW_WIDTH + 1:g} s without gaps, got none. Use longer logs."
             )
-        medians = [weighted_median(found[:, k], found[:, k + 5]) for k in range(4)]
+        medians = [weighted_median(estimates[:, k], estimates[:, k + 5]) for k in range(4)]
         (roll, pitch, drag, reaction), deviations = zip(*medians, strict=True)
         if not (roll > 0 and pitch > 0):
             raise ConfigError(
@@ -100,7 +100,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
     spread = np.hypot(
         [*tilt * [x, y], turn * z, *inertia[2] * np.hypot(deviations[2:], turned)], SAMPLING_ERROR * values
     )
-    every = weighted_median(found[:, 4], np.ones(len(found)))[0]
+    every = weighted_median(estimates[:, 4], np.ones(len(estimates)))[0]
     delays = [weighted_median(b[:, 4], b[:, 5])[0] if len(b) else every for b in blocks]
     return FastRotation(values, spread, np.array(delays))
 
@@ -128,7 +128,7 @@ def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
 
 
 def deviation_factor(n: int) -> float:
-    """Return the factor of a standard deviation from n numbers with which three hold as often as if it were known.
+    """Return the factor by which a standard deviation from n numbers must be larger for the same confidence.
 
     Student's t distribution with n - 1 degrees of freedom over the normal one, by the expansion of Abramowitz and
     Stegun, Handbook of Mathematical Functions, 26.7.5, at three standard deviations.
@@ -138,7 +138,7 @@ def deviation_factor(n: int) -> float:
 
 
 class _LogTerms(NamedTuple):
-    """One log as the regression uses it, with changes over the two intervals around each sample."""
+    """Terms of the regression for one log, over the two intervals around each sample."""
 
     dt: float
     gaps: NDArray
@@ -153,7 +153,7 @@ class _LogTerms(NamedTuple):
 
     @staticmethod
     def create(log: Log, params: first_principles.Params, thrust_factor: float, values: NDArray) -> _LogTerms:
-        """Return a log with the factors ``values`` of moments of inertia, torque curve and rotor inertia in force."""
+        """Return the terms of a log, with factors ``values`` of moments of inertia, torque curve and rotor inertia."""
         mixing, arm = np.asarray(params.mixing_matrix, np.float64), float(params.L[0])
         root = np.sqrt(values[:3])
         inertia = np.asarray(params.J, np.float64) * np.outer(root, root)
@@ -245,25 +245,25 @@ def _blocks(d: _LogTerms, late: float = 0.0) -> NDArray:
     """
     n, margin = len(d.turned), round(YAW_SLOW_WIDTH / d.dt / 2)
     keep = np.ones(n, bool)
-    for at in (0, *d.gaps, n):
-        keep[max(0, at - margin) : at + margin] = False
-    size, found = max(1, round(BLOCK_DURATION / d.dt)), []
+    for gap in (0, *d.gaps, n):
+        keep[max(0, gap - margin) : gap + margin] = False
+    size, blocks = max(1, round(BLOCK_DURATION / d.dt)), []
     for k in range(0, n, size):
-        at = np.flatnonzero(keep[k : k + size]) + k
-        if len(at) * d.dt < 1:
+        indices = np.flatnonzero(keep[k : k + size]) + k
+        if len(indices) * d.dt < 1:
             continue
         delay = 0.0
         for _ in range(6):
-            tilt = [_solve(d, axis, delay, at) for axis in (0, 1)]
+            tilt = [_solve(d, axis, delay, indices) for axis in (0, 1)]
             # Torque and its rate over time: torque(t - e) = torque - e rate.
             delay -= float(np.mean([x[1] / x[0] for x, _ in tilt]))
             delay = float(np.clip(delay, -MAX_DELAY, MAX_DELAY))
-        turn, variance = _solve(d, 2, delay + late * d.dt, at)
-        found.append([*(x[0] for x, _ in tilt), *turn[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
-    return np.reshape(found, (-1, 9))
+        turn, variance = _solve(d, 2, delay + late * d.dt, indices)
+        blocks.append([*(x[0] for x, _ in tilt), *turn[:2], delay, *(v[0] for _, v in tilt), *variance[:2]])
+    return np.reshape(blocks, (-1, 9))
 
 
-def _solve(d: _LogTerms, axis: int, delay: float, at: NDArray) -> tuple[NDArray, NDArray]:
+def _solve(d: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
     """Return the coefficients of the regressors and their variances, at some samples.
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
@@ -279,12 +279,12 @@ def _solve(d: _LogTerms, axis: int, delay: float, at: NDArray) -> tuple[NDArray,
 
     slow = YAW_SLOW_WIDTH if axis == 2 else SLOW_WIDTH
     regressors, instruments, turned = (
-        _band(x, d.dt, slow)[at] for x in (terms(d.rotors), terms(d.instruments), d.turned[:, axis : axis + 1])
+        _band(x, d.dt, slow)[samples] for x in (terms(d.rotors), terms(d.instruments), d.turned[:, axis : axis + 1])
     )
     inverse = np.linalg.pinv(instruments.T @ regressors)
     x = inverse @ instruments.T @ turned[:, 0]
-    rest = turned[:, 0] - regressors @ x
-    return x, np.mean(rest**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
+    residual = turned[:, 0] - regressors @ x
+    return x, np.mean(residual**2) * np.diag(inverse @ (instruments.T @ instruments) @ inverse.T)
 
 
 def shift_series(x: NDArray, samples: float) -> NDArray:
@@ -293,10 +293,10 @@ def shift_series(x: NDArray, samples: float) -> NDArray:
     A straight line between two samples would lower a sine of 20 Hz at 100 Hz by up to 19%; this lowers it by 1.5%.
     """
     whole = math.floor(samples)
-    part, at = samples - whole, np.arange(-2, 4)
+    part, taps = samples - whole, np.arange(-2, 4)
     late, n = np.zeros_like(x), len(x)
-    for k in at:
-        others = at[at != k]
+    for k in taps:
+        others = taps[taps != k]
         weight = np.prod((part - others) / (k - others))
         late += weight * x[np.clip(np.arange(n) - whole - k, 0, n - 1)]
     return late

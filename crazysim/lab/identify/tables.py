@@ -35,16 +35,16 @@ def read_table(
         columns: Names of the columns, None for the default ones.
 
     Raises:
-        ConfigError: If the file cannot be read, or the interval of its samples is none of a flight.
+        ConfigError: If the file cannot be read, or its samples are too close or too far apart for a flight.
     """
     name, table = _read(source, repairs, columns)
     if columns is None or not columns.rpy or any(unsigned_name(x) not in table for x in columns.rpy):
         return name, table
     angles = stack_columns(name, table, columns.rpy, columns.rad_per_angle)
-    if (most := np.nanmax(np.abs(angles[:, 1]), initial=0.0)) > 1.01 * np.pi / 2:
+    if (max_angle := np.nanmax(np.abs(angles[:, 1]), initial=0.0)) > 1.01 * np.pi / 2:
         raise ConfigError(
-            f"{name}: expected a pitch of at most pi/2 rad, got {most:.3g}. Name roll, pitch and yaw in this order, "
-            f"and give rad_per_angle={np.pi / 180:.6g} for degrees."
+            f"{name}: expected a pitch of at most pi/2 rad, got {max_angle:.3g}. Name roll, pitch and yaw in this "
+            f"order, and give rad_per_angle={np.pi / 180:.6g} for degrees."
         )
     quat = np.asarray(rotation.from_rpy(jnp.asarray(angles)))
     return name, {**table, **dict(zip(columns.quat, quat.T.astype(np.float64), strict=True))}

@@ -1,7 +1,7 @@
 """Logs of PX4, in its format ULog.
 
 The format is described at https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data,
-which PX4 writes after a crash, follow the others without a mark of their own.
+which PX4 writes after a crash, follow the others without a mark.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SCALARS = {
 MAX_MESSAGE = 2**16 - 1
 """Largest message, bytes, which its 16 bits of length can state."""
 MAX_DEPTH = 8
-"""Most formats within each other; PX4 has two."""
+"""Largest depth of nested formats; PX4 has two."""
 FIELD = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
 
 
@@ -61,13 +61,13 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
     Raises:
         ConfigError: If the log lacks position or attitude, or is damaged.
     """
-    found = _topics(path, TOPICS, repairs)
-    if missing := [key for key in TOPICS[:2] if key not in found]:
-        others = ", ".join(found) or "none"
+    topics = _topics(path, TOPICS, repairs)
+    if missing := [key for key in TOPICS[:2] if key not in topics]:
+        others = ", ".join(topics) or "none"
         raise ConfigError(
             f"{path.name}: expected messages {' and '.join(missing)}, got {others}. Add them to PX4's logged topics."
         )
-    place, turn = found["vehicle_local_position"], found["vehicle_attitude"]
+    place, turn = topics["vehicle_local_position"], topics["vehicle_attitude"]
     # PX4's quaternions are wxyz.
     columns = {
         "vehicle_local_position": {
@@ -76,33 +76,33 @@ def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         },
         "vehicle_attitude": {"qw": turn["q[0]"], "qx": turn["q[1]"], "qy": -turn["q[2]"], "qz": -turn["q[3]"]},
     }  # fmt: skip
-    if "vehicle_angular_velocity" in found:
-        rates = [found["vehicle_angular_velocity"][f"xyz[{k}]"] for k in range(3)]
+    if "vehicle_angular_velocity" in topics:
+        rates = [topics["vehicle_angular_velocity"][f"xyz[{k}]"] for k in range(3)]
         columns["vehicle_angular_velocity"] = {"wx": rates[0], "wy": -rates[1], "wz": -rates[2]}
     elif "rollspeed" in turn:
         columns["vehicle_attitude"] |= {"wx": turn["rollspeed"], "wy": -turn["pitchspeed"], "wz": -turn["yawspeed"]}
-    escs = found.get("esc_status", {})
+    escs = topics.get("esc_status", {})
     n_rotors = int(np.max(escs["esc_count"])) if escs else 0
     if n_rotors:
         speeds = [np.abs(escs[f"esc[{k}].esc_rpm"]) for k in range(n_rotors)]
         columns["esc_status"] = {f"rpm{k + 1}": x for k, x in enumerate(speeds)}
-    if "actuator_motors" in found:
-        outputs = [found["actuator_motors"][f"control[{k}]"] for k in range(12)]
-        used = [x for x in outputs if np.any(np.isfinite(x))]
-        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(used)}
-    elif "actuator_outputs" in found and n_rotors:
-        outputs = [found["actuator_outputs"][f"output[{k}]"] for k in range(n_rotors)]
+    if "actuator_motors" in topics:
+        outputs = [topics["actuator_motors"][f"control[{k}]"] for k in range(12)]
+        active = [x for x in outputs if np.any(np.isfinite(x))]
+        columns["actuator_motors"] = {f"command{k + 1}": x for k, x in enumerate(active)}
+    elif "actuator_outputs" in topics and n_rotors:
+        outputs = [topics["actuator_outputs"][f"output[{k}]"] for k in range(n_rotors)]
         columns["actuator_outputs"] = {f"command{k + 1}": x for k, x in enumerate(outputs)}
-    wanted = found.get("vehicle_attitude_setpoint", {})
-    if "q_d[0]" in wanted and "thrust_body[2]" in wanted:
-        aim = np.stack([wanted[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
+    setpoint = topics.get("vehicle_attitude_setpoint", {})
+    if "q_d[0]" in setpoint and "thrust_body[2]" in setpoint:
+        aim = np.stack([setpoint[f"q_d[{k}]"] for k in (1, 2, 3, 0)], axis=-1) * [1, -1, -1, 1]
         angles = np.asarray(jax.jit(rotation.to_rpy)(aim), np.float64)
         names = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
-        values = [*map(unwrap_angles, angles.T), -wanted["thrust_body[2]"]]
+        values = [*map(unwrap_angles, angles.T), -setpoint["thrust_body[2]"]]
         columns["vehicle_attitude_setpoint"] = dict(zip(names, values, strict=True))
-    if "battery_status" in found:
-        columns["battery_status"] = {"voltage": found["battery_status"]["voltage_v"]}
-    streams = {key: Stream(found[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}
+    if "battery_status" in topics:
+        columns["battery_status"] = {"voltage": topics["battery_status"]["voltage_v"]}
+    streams = {key: Stream(topics[key]["timestamp"] * 1e-6, x) for key, x in columns.items()}
     return resample(path.name, streams, repairs)
 
 
@@ -139,18 +139,18 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
             f"{path.name}: expected a ULog, which begins with 'ULog', got another file. Copy the file again."
         )
     head, formats, ids, parts = struct.Struct("<HB"), {}, {}, {}
-    at, skipped, dropouts = HEADER_SIZE, 0, 0
-    while at + head.size <= len(data):
-        size, kind = head.unpack_from(data, at)
-        start, end = at + head.size, at + head.size + size
+    offset, skipped, dropouts = HEADER_SIZE, 0, 0
+    while offset + head.size <= len(data):
+        size, kind = head.unpack_from(data, offset)
+        start, end = offset + head.size, offset + head.size + size
         if kind not in KINDS or end > len(data):
-            found = data.find(SYNC, at + 1)
-            skipped += (len(data) if found < 0 else found) - at
-            if found < 0:
+            sync = data.find(SYNC, offset + 1)
+            skipped += (len(data) if sync < 0 else sync) - offset
+            if sync < 0:
                 break
-            at = found + len(SYNC)
+            offset = sync + len(SYNC)
             continue
-        at = end
+        offset = end
         if kind == ord("D") and size > 2:
             key = data[start] | data[start + 1] << 8
             if key in parts:
@@ -169,7 +169,7 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
         repairs.append(f"left out {skipped} damaged bytes")
     if dropouts:
         repairs.append(f"{dropouts} dropouts of the logger")
-    found = {}
+    tables: dict[str, Topic] = {}
     for name, key in ids.items():
         layout = np.dtype(_layout(path.name, formats, name))
         whole = [part[: layout.itemsize] for part in parts[key] if len(part) >= layout.itemsize]
@@ -178,8 +178,8 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
         if whole:
             table = np.frombuffer(b"".join(whole), layout)
             columns = {field: without_huge_numbers(table[field]) for field in layout.names or ()}
-            found[name] = Topic(f"{path.name}: {name}", columns)
-    return found
+            tables[name] = Topic(f"{path.name}: {name}", columns)
+    return tables
 
 
 def _layout(
@@ -188,30 +188,29 @@ def _layout(
     """Return names and types of the fields of a format, with nested formats unrolled.
 
     Padding at the end, which PX4 does not log, is left out.
-
-    Raises:
-        DamagedFileError: If a format is missing, malformed, without an end, or larger than a message.
     """
-    shown, remedy = repr(name[:60]), "Copy the file again."
+    quoted, remedy = repr(name[:60]), "Copy the file again."
     if name not in formats or depth > MAX_DEPTH:
         got = f"over {MAX_DEPTH} within each other" if name in formats else "none"
-        raise DamagedFileError(f"{file}: expected a format of {shown}, got {got}. {remedy}")
+        raise DamagedFileError(f"{file}: expected a format of {quoted}, got {got}. {remedy}")
     fields = []
     for text in filter(None, formats[name].split(";")):
-        found = FIELD.fullmatch(text)
-        if found is None:
+        match = FIELD.fullmatch(text)
+        if match is None:
             raise DamagedFileError(f"{file}: expected a field such as 'float[4] q', got {text[:60]!r}. {remedy}")
-        kind, count, field = found.groups()
+        kind, count, field = match.groups()
         for index in [""] if count is None else [f"[{k}]" for k in range(int(count))]:
             path = f"{prefix}{field}{index}"
-            own = [(path, SCALARS[kind])] if kind in SCALARS else _layout(file, formats, kind, f"{path}.", depth + 1)
-            fields += own
-            if not own or len(fields) > MAX_MESSAGE:
+            field_layout = (
+                [(path, SCALARS[kind])] if kind in SCALARS else _layout(file, formats, kind, f"{path}.", depth + 1)
+            )
+            fields += field_layout
+            if not field_layout or len(fields) > MAX_MESSAGE:
                 raise DamagedFileError(
-                    f"{file}: expected a format of 1 to {MAX_MESSAGE} bytes, got another of {shown}. {remedy}"
+                    f"{file}: expected a format of 1 to {MAX_MESSAGE} bytes, got another of {quoted}. {remedy}"
                 )
     while not depth and fields and fields[-1][0].startswith("_padding"):
         fields.pop()
     if len({field for field, _ in fields}) < len(fields):
-        raise DamagedFileError(f"{file}: expected fields of different names in {shown}, got some twice. {remedy}")
+        raise DamagedFileError(f"{file}: expected fields of different names in {quoted}, got some twice. {remedy}")
     return fields

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 
 class Browser(Viewer[Live]):
-    """Viewer in any number of browsers, by viser, which runs in threads of its own.
+    """Viewer in any number of browsers, by viser, which runs in other threads.
 
         browser = live.show(Browser(port=8080))
         print(browser.url)
@@ -72,9 +72,6 @@ class Browser(Viewer[Live]):
             wind: True to draw the wind at every drone.
             follow: True to keep the followed body in the middle at first.
             plot: Quantity plotted at first.
-
-        Raises:
-            ConfigError: If a number is invalid.
         """
         for name, value in (("trail", trail), ("spacing", 1.0 if spacing is None else spacing)):
             if not np.isfinite(value) or value < 0:
@@ -92,7 +89,6 @@ class Browser(Viewer[Live]):
 
     @property
     def is_open(self) -> bool:
-        """True while the server runs."""
         return self._server is not None
 
     @property
@@ -101,13 +97,6 @@ class Browser(Viewer[Live]):
         return 0 if self._server is None else len(self._server.get_clients())
 
     def open(self, live: Live) -> None:
-        """Start the server.
-
-        Raises:
-            ConfigError: If a world does not exist.
-            ImportError: If viser is not installed.
-            RenderError: If the port is in use.
-        """
         viser, sim = import_viser(), live.sim
         worlds = world_indices(sim, range(min(sim.n_worlds, MAX_WORLDS)) if self._worlds is None else self._worlds)
         access = self._access
@@ -154,7 +143,6 @@ class Browser(Viewer[Live]):
                 live.post(lambda live: live.click(number, point))
 
     def update(self, live: Live) -> None:
-        """Send the poses to all browsers."""
         if not self._server.get_clients():
             return
         self._picture = picture = self._source.take(live, self._panel.plot)

@@ -1,4 +1,4 @@
-"""The panel beside a live simulation in the browser: time, selection, layers, plots, buttons and sliders."""
+"""The panel of a live simulation in the browser: time, selection, layers, plots, buttons and sliders."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class BrowserPanel:
                     self.plot = choice.value
 
     def update(self, picture: Picture, now: float) -> None:
-        """Show text and plot, at rates of their own.
+        """Show text and plot, each at its rate.
 
         Args:
             picture: Picture that is shown.
@@ -178,12 +178,12 @@ class BrowserPanel:
 
     def _add_body(self, gui: Any, live: Live, worlds: Any, bodies: SceneBodies) -> None:
         """Add the choice of the followed body, which may be a vehicle, a load or an object."""
-        named = {body.name: body for body in bodies.items}
-        self._body = choice = gui.add_dropdown("body", ("", *named))
+        body_of_name = {body.name: body for body in bodies.items}
+        self._body = choice = gui.add_dropdown("body", ("", *body_of_name))
 
         @choice.on_update
         def _(event: Any) -> None:
-            body = named.get(choice.value)
+            body = body_of_name.get(choice.value)
             if event.client is not None and body is not None:  # a change by a user
                 world = int(worlds.value)
                 live.post(lambda live: live.follow(world, body.kind, body.index))
@@ -215,7 +215,7 @@ class BrowserPanel:
 
 
 def _post(button: Any, live: Live, call: Callable[[Live], object]) -> None:
-    """Let a button post a function to the loop."""
+    """Make a button post a function to the loop."""
     button.on_click(lambda _: live.post(call))
 
 

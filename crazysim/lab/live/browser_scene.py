@@ -19,7 +19,7 @@ from crazysim.scene.visual_geoms import VisualGeom
 SETPOINT_RADIUS = 0.025
 """Radius of a setpoint's sphere, m."""
 CLICK_SIZE = 0.02
-"""Smallest half size of what a click picks, as a multiple of the distance from the camera."""
+"""Smallest half size of a body for clicks, as a multiple of the distance from the camera."""
 HIDDEN_SCALE = 1e-6
 """Scale of a mark that is not shown."""
 CONTACT_COLOR, FOLLOWED_COLOR, WIND_COLOR = (230, 40, 30), (60, 150, 255), (90, 150, 200)
@@ -198,8 +198,8 @@ class BrowserScene:
     def _show_wind(self, drones: NDArray, picture: Picture) -> None:
         if not picture.wind.size:
             return
-        begin = finite_rows(drones.reshape(-1, 3))
-        ends = np.stack([begin, begin + WIND_SCALE * finite_rows(picture.wind.reshape(-1, 3))], axis=1)
+        arrow_start = finite_rows(drones.reshape(-1, 3))
+        ends = np.stack([arrow_start, arrow_start + WIND_SCALE * finite_rows(picture.wind.reshape(-1, 3))], axis=1)
         ends = ends.astype(np.float32)
         if self._wind is None:
             self._wind = self._scene.add_arrows(

@@ -18,7 +18,7 @@ CLIMB = 2.0
 
 
 class Circles:
-    """Process that lets drones rise and fly circles around where they stood."""
+    """Process in which drones rise and fly circles above their initial positions."""
 
     def __init__(self, live: Live, piloted: bool):
         """Create circles around the drones' present positions.
@@ -42,7 +42,7 @@ class Circles:
 
 
 def circle_commands(places: NDArray, time: float) -> NDArray:
-    """Return state commands of drones that rise above places, and circle. (n_worlds, n_drones, 16)
+    """Return state commands of drones that rise above positions, and circle. (n_worlds, n_drones, 16)
 
     Args:
         places: Positions, m. (n_worlds, n_drones, 3)

@@ -20,10 +20,10 @@ class _Client(Closing):
         self._timeout = timeout
 
     def send(self, message: bytes) -> None:
-        """Send a message as it is, and wait for its ``ACK``.
+        """Send a message unchanged, and wait for its ``ACK``.
 
         Raises:
-            ConfigError: If the answer is another one, or there is none in time.
+            ConfigError: If the answer is not ``ACK``, or does not arrive in time.
         """
         try:
             self._socket.sendall(message)
@@ -46,7 +46,6 @@ class _Client(Closing):
         return answer
 
     def close(self) -> None:
-        """Disconnect."""
         self._socket.close()
 
 

@@ -1,4 +1,4 @@
-"""Commands to drones: immutable records, and what messages mean."""
+"""Commands to drones as immutable records, and their parsing from messages."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def command_of(frame: Message | ShowFile, drone: int | None = None) -> Command:
         drone: ID of the drone if the message has none; None for all.
 
     Raises:
-        ConfigError: If there is no such command, or its argument is invalid.
+        ConfigError: If the command does not exist, or its argument is invalid.
     """
     if isinstance(frame, ShowFile):
         return LoadShow(parse_show(frame.content, "a received show"))

@@ -34,15 +34,15 @@ log = logging.getLogger(__name__)
 
 
 class Fleet:
-    """The drones of a simulation of one world, each with a trajectory of its own that commands exchange.
+    """The drones of a simulation of one world, each with a trajectory, which commands replace.
 
         sim = Sim(n_drones=3, control="state")
         fleet = Fleet(sim)
         fleet.apply([TakeOff(None, 0.5)])
         sim.step(500)
 
-    Commands take effect between two steps; nothing is compiled again. One that cannot be carried out is logged, and the
-    drone continues what it was doing. IDs of drones that are not yet in use go to the next free drone.
+    Commands take effect between two steps; nothing is compiled again. A command that cannot be carried out is logged,
+    and the drone continues its trajectory. A new ID is given to the next free drone.
     """
 
     parameters: list[dict[str, float]]
@@ -56,7 +56,7 @@ class Fleet:
         teleport: bool = True,
         name: str = "fleet",
     ):
-        """Let every drone hover where it is.
+        """Add the plugin that moves the drones to a simulation; every drone hovers at its position.
 
         Args:
             sim: Simulation of one world with state commands.
@@ -65,9 +65,6 @@ class Fleet:
             teleport: True to move a drone to the start of the first trajectory that it receives before any other
                 command, as the lab's simulator does.
             name: Name of the plugin that follows the trajectories.
-
-        Raises:
-            ConfigError: If the simulation has several worlds or other commands, or an ID has no drone.
         """
         if sim.n_worlds != 1:
             raise ConfigError(f"expected one world, got {sim.n_worlds}. Use Follow.upload for trajectories of many.")
@@ -107,7 +104,7 @@ class Fleet:
         return n
 
     def reset(self) -> None:
-        """Let every drone hover where it is again, as after ``sim.reset()``; trajectories that it received stay."""
+        """Make every drone hover at its position, as after ``sim.reset()``; received trajectories stay."""
         self._untouched = [True] * self.sim.n_drones
         self._show_start = None
         for drone, pos in enumerate(np.asarray(self.sim.data.states.pos[0], float)):
@@ -116,11 +113,11 @@ class Fleet:
 
     def colors(self) -> NDArray:
         """Return the present colours of the LEDs, from the received show once it has started. (n_drones, 3)"""
-        found = np.zeros((self.sim.n_drones, 3))
+        colors = np.zeros((self.sim.n_drones, 3))
         if self._lights is not None and self._show_start is not None:
-            shown = self._lights.colors([self._now() - self._show_start])[0]
-            found[: len(shown)] = shown
-        return found
+            show_colors = self._lights.colors([self._now() - self._show_start])[0]
+            colors[: len(show_colors)] = show_colors
+        return colors
 
     def setpoint(self, drone: int) -> NDArray:
         """Return the present setpoint of a drone: position, m, and yaw, rad. (4,)"""
@@ -164,15 +161,15 @@ class Fleet:
             self.parameters[drone][command.name] = command.value
             log.info("drone %d: %s = %g", drone, command.name, command.value)
             return
-        here = self.setpoint(drone)
+        setpoint = self.setpoint(drone)
         if isinstance(command, Start):
             self._start(drone, command.relative)
         elif isinstance(command, Hover):
-            self._fly(drone, _hover(here))
+            self._fly(drone, _hover(setpoint))
         elif isinstance(command, TakeOff):
-            self._fly(drone, _move(here, command.height))
+            self._fly(drone, _move(setpoint, command.height))
         elif isinstance(command, Land):
-            self._fly(drone, _move(here, 0.0))
+            self._fly(drone, _move(setpoint, 0.0))
 
     def _drones(self, identity: int | None) -> list[int]:
         """Return the drones of an ID; a new one gets the next free drone."""
@@ -197,12 +194,12 @@ class Fleet:
     def _receive(self, drone: int, trajectory: Trajectory) -> None:
         self._uploaded[drone] = trajectory
         if self.teleport and self._untouched[drone]:
-            begin = HostTrajectory.of(trajectory).at(0.0)
+            start_point = HostTrajectory.of(trajectory).at(0.0)
             states = self.sim.data.states
-            pos = states.pos.at[0, drone].set(jnp.asarray(begin[:3], states.pos.dtype))
-            quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(begin[3]), states.quat.dtype))
+            pos = states.pos.at[0, drone].set(jnp.asarray(start_point[:3], states.pos.dtype))
+            quat = states.quat.at[0, drone].set(jnp.asarray(from_yaw(start_point[3]), states.quat.dtype))
             self.sim.data = self.sim.data.replace(states=states.replace(pos=pos, quat=quat))
-            self._fly(drone, _hover(begin))
+            self._fly(drone, _hover(start_point))
         self._untouched[drone] = False
 
     def _start(self, drone: int, relative: bool) -> None:
@@ -212,7 +209,7 @@ class Fleet:
         self._fly(drone, trajectory)
 
     def _fly(self, drone: int, trajectory: Trajectory) -> None:
-        """Let a drone follow a trajectory from now on."""
+        """Make a drone follow a trajectory from now on."""
         data = self.follow.uploaded(self.sim.data, drone, trajectory)
         record, now = self.follow.read(data), self._now()
         start = record.start.at[0, drone, 0].set(jnp.asarray(now, record.start.dtype))
@@ -240,7 +237,7 @@ def _without_padding(trajectory: Trajectory) -> Trajectory:
 
 
 class RemoteCommands:
-    """Process that carries out what has arrived in a queue: ``live.add(RemoteCommands(fleet, server))``."""
+    """Process that carries out the commands in a queue: ``live.add(RemoteCommands(fleet, server))``."""
 
     def __init__(self, fleet: Fleet, queue: CommandQueue):
         self._fleet, self._queue = fleet, queue
@@ -251,5 +248,5 @@ class RemoteCommands:
         live.lights[0] = self._fleet.colors()
 
     def reset(self, live: Live) -> None:
-        """Let the drones hover at their positions after a reset or a jump in time."""
+        """Make the drones hover at their positions after a reset or a jump in time."""
         self._fleet.reset()

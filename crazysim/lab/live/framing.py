@@ -27,7 +27,7 @@ SPACE_BYTES = b" \r\n\t\0"
 
 
 class FramingError(ValueError):
-    """Bytes that are no message; the stream cannot be read on."""
+    """Bytes that are not a message; the rest of the stream cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class Message:
     """A command in text."""
 
     drone: int | None
-    """ID of the drone; None if there is none."""
+    """ID of the drone, or None."""
     command: str
     """Name of the command."""
     argument: str
-    """Argument; empty if there is none."""
+    """Argument; may be empty."""
     payload: bytes | None = None
-    """JSON object; None if there is none."""
+    """JSON object, or None."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Frames:
         self._reset_scan()
 
     def _reset_scan(self) -> None:
-        """Forget how far the message at the front has been searched for its end."""
+        """Restart the search for the end of the message at the front."""
         self._at = self._depth = 0
         self._in_string = False
 
@@ -86,7 +86,7 @@ class Frames:
         """Yield the messages that are complete with these bytes.
 
         Raises:
-            FramingError: If something else than a message follows, or a message is too long. The stream is lost then.
+            FramingError: If bytes that are not a message follow, or a message is too long. The stream is lost then.
         """
         self._buffer += received
         while (message := self._next()) is not None:
@@ -170,7 +170,7 @@ class Frames:
                 if token.end() >= len(self._buffer):
                     self._at = token.start()
                     return None
-                self._at = token.end() + 1  # whatever is escaped
+                self._at = token.end() + 1  # the escaped character
                 continue
             self._at = token.end()
             if kind == b'"':
@@ -183,7 +183,7 @@ class Frames:
         return None
 
     def _ended(self) -> int:
-        """Return the end that was found; it is found again if the message is still incomplete."""
+        """Return the end of the JSON object; the next search finds it again if the message is still incomplete."""
         end = self._at
         self._at, self._depth = end - 1, 1
         return end
@@ -191,19 +191,19 @@ class Frames:
     def _show(self) -> ShowFile | None:
         """Return the show at the front of the buffer: an archive ends with its directory, and then comes SKYC."""
         buffer = self._buffer
-        while (at := buffer.find(ZIP_END, self._at)) >= 0:
-            if at + 22 > len(buffer):
-                self._at = at
+        while (zip_end := buffer.find(ZIP_END, self._at)) >= 0:
+            if zip_end + 22 > len(buffer):
+                self._at = zip_end
                 break
-            end = at + 22 + struct.unpack_from("<H", buffer, at + 20)[0]
+            end = zip_end + 22 + struct.unpack_from("<H", buffer, zip_end + 20)[0]
             if buffer[end : end + 4] == b"SKYC":
                 content = bytes(buffer[:end])
                 self._take(end + 4)
                 return ShowFile(content)
             if end + 4 > len(buffer):
-                self._at = at
+                self._at = zip_end
                 break
-            self._at = at + 4
+            self._at = zip_end + 4
         else:
             self._at = max(len(buffer) - 3, 0)
         if len(buffer) > MAX_SHOW:

@@ -34,14 +34,14 @@ class Gamepad:
             glfw: Module with the functions of GLFW; None for ``glfw``.
 
         Raises:
-            ConfigError: If there is none.
+            ConfigError: If no gamepad is connected.
         """
         self._glfw = _glfw() if glfw is None else glfw
         numbers = range(N_JOYSTICKS) if number is None else [number]
-        found = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
-        if not found:
+        gamepads = [k for k in numbers if 0 <= k < N_JOYSTICKS and self._glfw.joystick_is_gamepad(k)]
+        if not gamepads:
             raise ConfigError("expected a gamepad, got none. Connect it before the program starts.")
-        self._number = found[0]
+        self._number = gamepads[0]
         self._calls: dict[int, Callable[[Live], object]] = {}
         self._before: list[int] = []
 
@@ -52,15 +52,12 @@ class Gamepad:
         return name.decode(errors="replace") if isinstance(name, bytes) else str(name or "disconnected")
 
     def bind(self, button: str, call: Callable[[Live], object]) -> None:
-        """Let a button call a function of the loop.
+        """Make a button call a function of the loop.
 
         Args:
             button: ``"a"``, ``"b"``, ``"x"``, ``"y"``, ``"left_bumper"``, ``"right_bumper"``, ``"back"``, ``"start"``,
                 ``"guide"``, ``"dpad_up"``, ...: GLFW's names.
             call: Function of the loop.
-
-        Raises:
-            ConfigError: If there is no such button.
         """
         index = getattr(self._glfw, f"GAMEPAD_BUTTON_{button.upper()}", None)
         if index is None:

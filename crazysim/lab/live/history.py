@@ -19,7 +19,7 @@ class Snapshot:
     data: SimData
     """Data of the simulation; immutable, so that a snapshot costs the memory of its arrays only."""
     commands: NDArray | None
-    """Commands that processes had written; None if none had. (n_worlds, n_drones, k)"""
+    """Commands that processes had written; None before the first. (n_worlds, n_drones, k)"""
 
 
 class History:
@@ -29,20 +29,20 @@ class History:
         """Create an empty history.
 
         Args:
-            length: Most snapshots to keep beside the first.
+            length: Most snapshots to keep in addition to the first.
         """
         self._first: Snapshot | None = None
         self._latest: deque[Snapshot] = deque(maxlen=length)
 
     def add(self, snapshot: Snapshot) -> None:
-        """Add a snapshot; one at the step of the last, after a jump back to it, is left out."""
+        """Add a snapshot, unless there is one of that step, as after a jump back."""
         if self._first is None:
             self._first = snapshot
         elif snapshot.step > (self._latest[-1] if self._latest else self._first).step:
             self._latest.append(snapshot)
 
     def before(self, step: int) -> Snapshot | None:
-        """Return the latest snapshot at or before a control step, and forget those after it; None if there is none."""
+        """Return the latest snapshot at or before a control step, or None, and remove the later ones."""
         while self._latest and self._latest[-1].step > step:
             self._latest.pop()
         if self._latest:
@@ -50,6 +50,6 @@ class History:
         return self._first if self._first is not None and self._first.step <= step else None
 
     def clear(self) -> None:
-        """Forget all snapshots."""
+        """Remove all snapshots."""
         self._first = None
         self._latest.clear()

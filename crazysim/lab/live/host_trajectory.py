@@ -46,9 +46,9 @@ class HostTrajectory(NamedTuple):
         inside = t >= 0 and (self.repeats or t <= last)
         t = t % last if self.repeats and t > 0 else min(max(t, 0.0), last)
         k = min(bisect_right(self.ends, t), len(self.ends) - 1)  # type: ignore[arg-type]
-        begin = float(self.ends[k - 1]) if k else 0.0
-        length = float(self.ends[k]) - begin
-        u, rate = ((t - begin) / length, 1 / length) if length > 0 else (1.0, 0.0)
+        start = float(self.ends[k - 1]) if k else 0.0
+        length = float(self.ends[k]) - start
+        u, rate = ((t - start) / length, 1 / length) if length > 0 else (1.0, 0.0)
         factors, exponents, orders = _powers(n, self.coefficients.shape[2])
         scale = (rate if inside else 0.0) ** orders
         return (factors * u**exponents * scale[:, None]) @ self.coefficients[k].T

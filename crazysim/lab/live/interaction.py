@@ -54,11 +54,7 @@ class Interaction:
             self.keyboard.bind(key, call)
 
     def slider(self, name: str, low: float, high: float, value: float, call: Callable[[Self, float], object]) -> None:
-        """Add a slider to viewers that are shown from now on; the function is called with the loop and the value.
-
-        Raises:
-            ConfigError: If the limits are not ``low <= value <= high`` with ``low < high``.
-        """
+        """Add a slider to viewers that are shown from now on; the function is called with the loop and the value."""
         if not (np.isfinite([low, high]).all() and low < high and low <= value <= high):
             raise ConfigError(f"expected low <= value <= high of slider {name!r}, got {low!r}, {value!r}, {high!r}")
         if name in self.values:
@@ -67,23 +63,19 @@ class Interaction:
         self.values[name] = float(value)
 
     def set_value(self, name: str, value: float) -> None:
-        """Move a slider, clipped to its limits, and call its function.
-
-        Raises:
-            ConfigError: If there is no such slider, or the value is not finite.
-        """
-        found = next((slider for slider in self._sliders if slider.name == name), None)
-        if found is None or not np.isfinite(value):
+        """Move a slider, clipped to its limits, and call its function."""
+        control = next((slider for slider in self._sliders if slider.name == name), None)
+        if control is None or not np.isfinite(value):
             raise ConfigError(f"expected a slider of {list(self.values)} and a finite value, got {name!r}, {value!r}")
-        self.values[name] = float(np.clip(value, found.low, found.high))
-        found.call(self.values[name])
+        self.values[name] = float(np.clip(value, control.low, control.high))
+        control.call(self.values[name])
 
     @property
     def control_lines(self) -> tuple[str, ...]:
         """Buttons with their keys, and sliders with their values, for viewers without a panel."""
-        chosen = self._sliders[self._slider].name if self._sliders else None
+        selected_name = self._sliders[self._slider].name if self._sliders else None
         return tuple(
-            f"{c.name}: {self.values[c.name]:.3g}" + ("  [ ]" if c.name == chosen else "")
+            f"{c.name}: {self.values[c.name]:.3g}" + ("  [ ]" if c.name == selected_name else "")
             if isinstance(c, Slider)
             else f"{c.name}  {c.key or ''}".rstrip()
             for c in self.controls
@@ -104,11 +96,7 @@ class Interaction:
         self._slider = (self._slider + 1) % max(len(self._sliders), 1)
 
     def select(self, world: int, drone: int) -> None:
-        """Select a drone to follow, plot and pilot.
-
-        Raises:
-            ConfigError: If it does not exist.
-        """
+        """Select a drone to follow, plot and pilot."""
         if world not in range(self.sim.n_worlds) or drone not in range(self.sim.n_drones):
             raise ConfigError(
                 f"expected a world below {self.sim.n_worlds} and a drone below {self.sim.n_drones}, got "
@@ -129,15 +117,12 @@ class Interaction:
         return self.selected[0], DRONE, self.selected[1]
 
     def follow(self, world: int, kind: str, index: int) -> None:
-        """Let viewers mark and follow a body, as a click on it does. A drone becomes the selected drone as well.
+        """Make viewers mark and follow a body, as a click on it does. A drone becomes the selected drone as well.
 
         Args:
             world: Index of the world.
             kind: ``"drone"``, or the name of the objects in the scene: ``"cars"``, ``"load"`` or a handle's name.
             index: Number among the bodies of its kind.
-
-        Raises:
-            ConfigError: If it does not exist.
         """
         if kind == DRONE:
             self.select(world, index)
@@ -159,5 +144,5 @@ class Interaction:
             self.on_click(self, world, point)
 
     def post(self, call: Callable[[Self], object]) -> None:
-        """Let the loop call a function between two steps; may be called from any thread."""
+        """Make the loop call a function between two steps; may be called from any thread."""
         self._posted.append(call)

@@ -1,4 +1,4 @@
-"""Keys of a viewer: which are held, and the functions that they call."""
+"""Keys of a viewer: the keys that are held, and the functions that keys call."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Keyboard(Generic[L]):
         self._calls: dict[str, Callable[[L], object]] = {}
 
     def press(self, key: str) -> None:
-        """Note that a key is pressed."""
+        """Press a key."""
         self._held[key] = math.inf
         self._pressed.append(key)
 
@@ -37,11 +37,11 @@ class Keyboard(Generic[L]):
         self._held[key] = time.monotonic() + seconds
 
     def release(self, key: str) -> None:
-        """Note that a key is released."""
+        """Release a key."""
         self._held.pop(key, None)
 
     def release_all(self) -> None:
-        """Note that no key is held any more, as when a viewer closes or loses the focus."""
+        """Release all keys, as when a viewer closes or loses the focus."""
         self._held.clear()
 
     def is_held(self, key: str) -> bool:
@@ -53,11 +53,7 @@ class Keyboard(Generic[L]):
         return float(self.is_held(positive)) - float(self.is_held(negative))
 
     def bind(self, key: str, call: Callable[[L], object]) -> None:
-        """Let a key call a function of the loop when it is pressed, in place of what it did before.
-
-        Raises:
-            ConfigError: If there is no such key.
-        """
+        """Make a key call a function of the loop when it is pressed, instead of its previous function."""
         if key not in KEY_NAMES and (len(key) != 1 or key != key.lower()):
             raise ConfigError(f"expected a lower-case character or one of {', '.join(KEY_NAMES)} as a key, got {key!r}")
         self._calls[key] = call

@@ -30,7 +30,7 @@ class Link(Protocol):
         ...
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass, s: simulated for a simulated drone."""
+        """Wait for a time, s: simulated time for a simulated drone."""
         ...
 
     def stop(self) -> None:
@@ -47,11 +47,7 @@ class SimLink:
         self.name = swarm.names[self.drone]
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command of one drone.
-
-        Raises:
-            ConfigError: If the simulation has another command level, or a number is not finite.
-        """
+        """Send a command of one drone."""
         with self.swarm.lock:
             self.swarm.commanders[self.drone].command(level, values)
 
@@ -60,7 +56,7 @@ class SimLink:
         return self.swarm.state(self.drone)
 
     def sleep(self, seconds: float) -> None:
-        """Let simulated time pass, s."""
+        """Advance by a simulated time, s."""
         self.swarm.sleep(seconds)
 
     def stop(self) -> None:
@@ -117,9 +113,6 @@ class TrainedPolicy:
             policy: Function of the observations that returns an action from -1 to 1.
             meta: Description of its inputs and outputs (``crazysim.train.export.describe``).
             goal: Position to fly to, m. (3,)
-
-        Raises:
-            ConfigError: If it needs other observations.
         """
         self.policy, self.goal = policy, np.asarray(goal, float)
         self._names = list(meta["observations"])
@@ -132,8 +125,8 @@ class TrainedPolicy:
 
     def __call__(self, state: DroneState) -> NDArray:
         """Return the command for a state. (k,)"""
-        found = self._observations(state)
-        action = np.asarray(self.policy({name: found[name].astype(np.float32) for name in self._names}), float)
+        obs = self._observations(state)
+        action = np.asarray(self.policy({name: obs[name].astype(np.float32) for name in self._names}), float)
         return self._centre + self._scale * np.clip(action, -1.0, 1.0)
 
     def _observations(self, state: DroneState) -> dict[str, NDArray]:

@@ -1,4 +1,4 @@
-"""The live loop: control steps, pictures and recordings at their own rates, at a chosen speed of time."""
+"""The live loop: control steps, pictures and recordings, each at its rate, in real time or at another speed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from crazysim.sim.sim import Sim
 from crazysim.storage import Closing
 
 SLICE = 0.01
-"""Longest sleep, s: the time after which a click or a key is noticed."""
+"""Longest sleep, s, after which clicks and keys are handled."""
 ALARM = 0.02
 """Lateness of a control step that is logged, s."""
 ALARM_PERIOD = 10.0
@@ -47,7 +47,7 @@ class Live(Interaction, Closing):
             live.record("flight.journal")
             print(live.run(seconds=20))
 
-    The loop calls processes, timed events and whatever viewers have requested between two steps, in one thread, so
+    The loop calls processes, timed events and requests of viewers between two steps, in one thread, so
     that they may read and write ``live.sim``. Other threads use ``post``.
     """
 
@@ -68,15 +68,12 @@ class Live(Interaction, Closing):
         """Prepare; ``run`` starts.
 
         Args:
-            sim: Simulation, which continues from where it is.
+            sim: Simulation, which continues from its present state.
             control_freq: Rate of control steps, Hz; a divisor of ``sim.freq``.
             speed: Simulated seconds per second, or ``"max"`` for as fast as possible.
             fps: Pictures per second, at any speed.
             snapshot_s: Simulated time between snapshots for ``go_to``, s.
             n_snapshots: Most snapshots to keep.
-
-        Raises:
-            ConfigError: If a setting is invalid.
         """
         control_freq = positive_integer("control_freq", control_freq)
         if sim.freq % control_freq:
@@ -148,9 +145,6 @@ class Live(Interaction, Closing):
         """Go to a time since the last reset, s: forwards as fast as possible, backwards from the snapshot before it.
 
         Processes and events take part; the method ``reset(live)`` of processes is called after a jump backwards.
-
-        Raises:
-            ConfigError: If the time is negative, not finite, or before the first snapshot.
         """
         if not np.isfinite(time) or time < 0:
             raise ConfigError(f"expected a time of 0 s or more, got {time!r}")
@@ -182,9 +176,6 @@ class Live(Interaction, Closing):
             name: Name in messages; None for the name of the function.
             on_error: ``"raise"`` to end ``run`` with its errors, ``"report"`` to log them and continue, for sources
                 outside, such as motion capture.
-
-        Raises:
-            ConfigError: If a setting is invalid.
         """
         if not callable(process):
             raise ConfigError(f"expected a function of the loop, got {process!r}")
@@ -197,11 +188,7 @@ class Live(Interaction, Closing):
         return self._processes[-1]
 
     def at(self, time: float, call: Callable[[Live], object], name: str | None = None) -> None:
-        """Call a function of the loop once the simulation reaches a time, again after every reset.
-
-        Raises:
-            ConfigError: If the time is not finite or has passed.
-        """
+        """Call a function of the loop once the simulation reaches a time, again after every reset."""
         step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
         if step < self.step:
             raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
@@ -256,9 +243,6 @@ class Live(Interaction, Closing):
 
         Args:
             seconds: Simulated time, s; None for no end.
-
-        Raises:
-            ConfigError: If the time is not positive.
         """
         if seconds is not None and (not np.isfinite(seconds) or seconds <= 0):
             raise ConfigError(f"expected a positive duration, s, got {seconds!r}")
@@ -266,53 +250,52 @@ class Live(Interaction, Closing):
         self._stopped = False
         self._warm_up()
         self._pace = Pace(self._dt, self._pace.speed)
-        first, pictures, paused_s, begin = self.flown, self._viewers.n_pictures, 0.0, perf_counter()
+        first, pictures, paused_s, start_time = self.flown, self._viewers.n_pictures, 0.0, perf_counter()
         with protect_loop(), contextlib.suppress(KeyboardInterrupt):
             while not self._stopped and (end is None or self.flown < end):
                 paused_s += self._turn()
         jax.block_until_ready(self.sim.data.states.pos)
-        wall = perf_counter() - begin - paused_s
+        wall = perf_counter() - start_time - paused_s
         simulated = (self.flown - first) * self._dt
         failures = self._refused + self._viewers.failures + self._recordings.failures
-        drawn = self._viewers.n_pictures - pictures
-        return self._pace.report(self._processes, simulated, wall, drawn, failures)
+        n_pictures = self._viewers.n_pictures - pictures
+        return self._pace.report(self._processes, simulated, wall, n_pictures, failures)
 
     def close(self) -> None:
-        """Finish the recording and close the viewers."""
         self._recordings.close()
         self._viewers.close()
 
     @property
     def status(self) -> str:
         """State of the loop for viewers: time, speed, pause, recording."""
-        now, (then, flown, factor) = perf_counter(), self._factor
-        if now - then > 0.5:
-            factor = (self.flown - flown) * self._dt / (now - then)
+        now, (last_time, flown, factor) = perf_counter(), self._factor
+        if now - last_time > 0.5:
+            factor = (self.flown - flown) * self._dt / (now - last_time)
             self._factor = (now, self.flown, factor)
         marks = [f"{self.time:.2f} s", f"{factor:.2f} x real time"]
         marks += ["paused"] * self._paused + ["recording"] * self.is_recording
         return ", ".join(marks)
 
     def _turn(self) -> float:
-        """Do what is due, or sleep; return the time spent in a pause, s."""
+        """Run the tasks that are due, or sleep; return the time spent in a pause, s."""
         viewers = self._viewers
         self._run_posted()
         if self._stopped:
             return 0.0
         if self._paused:
-            begin = perf_counter()
+            start_time = perf_counter()
             viewers.draw(self, viewers.next_at)
             sleep(SLICE)
-            return perf_counter() - begin
+            return perf_counter() - start_time
         wait = self._pace.due_in()
         if wait > 0:
             if not viewers.draw(self, viewers.next_at):
                 until_picture = viewers.next_at - perf_counter() if viewers else SLICE
                 sleep(max(min(wait, until_picture, SLICE), 0.0))
             return 0.0
-        late = self._pace.record_step(self.time)
-        if late > ALARM and self._may_warn():
-            log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * late)
+        lateness = self._pace.record_step(self.time)
+        if lateness > ALARM and self._may_warn():
+            log.warning("real time missed at %.2f s: %.0f ms late", self.time, 1e3 * lateness)
         self._control_step()
         # At real-time speeds a picture waits for idle time, but at most until the next picture is due.
         viewers.draw(self, viewers.next_at + (0.0 if self.speed == "max" else viewers.period))
@@ -384,7 +367,7 @@ class Live(Interaction, Closing):
         self._pace.restart()
 
     def _warm_up(self) -> None:
-        """Compile what a control step needs, before time begins to run."""
+        """Compile the functions of a control step before the clock starts."""
         self._commands.stage()
         compile_step(self.sim, self.n_substeps)
         self._viewers.update(self)

@@ -18,9 +18,9 @@ from crazysim.lab.live.process import Process
 Speed = float | Literal["max"]
 """Simulated seconds per second, or ``"max"`` for as fast as possible."""
 TOLERANCE = 2e-3
-"""Lateness from which a control step counts as late, s."""
+"""Delay above which a control step counts as late, s."""
 MAX_LAG = 0.25
-"""Lag from which the lost time is given up instead of caught up, s."""
+"""Lag above which the loop drops the lost time instead of catching up, s."""
 BIN_WIDTH = 1e-4
 """Resolution of the statistics of lateness, s."""
 SWITCH_INTERVAL = 5e-4
@@ -32,11 +32,7 @@ N_LISTED = 3
 
 
 def check_speed(speed: Speed) -> Speed:
-    """Return a speed, checked.
-
-    Raises:
-        ConfigError: If it is neither a positive number nor ``"max"``.
-    """
+    """Return a speed, checked."""
     if speed == "max":
         return "max"
     if isinstance(speed, (bool, str)) or not np.isfinite(speed) or speed <= 0:

@@ -91,8 +91,8 @@ class PictureSource:
         data = sim.data
         pos, quat = mocap_poses(sim, worlds)
         drones = np.asarray(data.states.pos, float)[worlds]
-        none = np.zeros((len(worlds), 0, 3))
-        state, setpoint, air = data.controls.state, none, none
+        no_rows = np.zeros((len(worlds), 0, 3))
+        state, setpoint, air = data.controls.state, no_rows, no_rows
         if state is not None:
             setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
         if self._wind and _winds(data):
@@ -100,8 +100,12 @@ class PictureSource:
         touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
         values = np.zeros(0)
         if plot and live.selected is not None:
-            own = live.quantities.get(plot)
-            values = quantity(data, plot, *live.selected) if own is None else np.ravel(np.asarray(own(live), float))
+            quantity_fn = live.quantities.get(plot)
+            values = (
+                quantity(data, plot, *live.selected)
+                if quantity_fn is None
+                else np.ravel(np.asarray(quantity_fn(live), float))
+            )
         followed = live.followed
         body = None if followed is None else self._bodies.get(followed[1:])
         return Picture(
@@ -135,13 +139,13 @@ def _air(data: SimData) -> jax.Array:
 
 def quantities(sim: Sim) -> list[str]:
     """Return the paths of everything in the data that changes: ``states.vel`` of drones, ``plugins.cars.pos[1]``."""
-    found = []
+    names = []
     for path, scope, x in _leaves(sim.data):
         if scope in ("drone", "world"):
-            found.append(path)
+            names.append(path)
         elif has_members(scope) and scope not in ("shared", "opaque", "batched"):
-            found += [f"{path}[{k}]" for k in range(x.shape[1])]
-    return found
+            names += [f"{path}[{k}]" for k in range(x.shape[1])]
+    return names
 
 
 def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
@@ -152,13 +156,10 @@ def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
         path: One of ``quantities``.
         world: Index of the world.
         drone: Index of the drone, for quantities of drones.
-
-    Raises:
-        KeyError: If there is no such quantity.
     """
-    wanted, _, member = path.rstrip("]").partition("[")
-    for found, scope, x in _leaves(data):
-        if found == wanted:
+    leaf, _, member = path.rstrip("]").partition("[")
+    for leaf_path, scope, x in _leaves(data):
+        if leaf_path == leaf:
             index = (world,) if scope == "world" else (world, int(member) if member else drone)
             return np.asarray(x)[index].ravel().astype(float)
     raise KeyError(path)
@@ -167,8 +168,8 @@ def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
 def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
     """Return path, scope and value of every leaf that holds numbers."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(data)
-    named = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
-    return [(_path(path), scope, x) for (path, x), scope in named if getattr(x.dtype, "kind", "O") in "fiub"]
+    leaf_scopes = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
+    return [(_path(path), scope, x) for (path, x), scope in leaf_scopes if getattr(x.dtype, "kind", "O") in "fiub"]
 
 
 def _path(path: jax.tree_util.KeyPath) -> str:

@@ -69,9 +69,6 @@ class Pilot:
             yaw_rate: Yaw rate at full deflection, rad/s.
             low: Least position of the setpoint, m. (3,)
             high: Greatest position, m. (3,)
-
-        Raises:
-            ConfigError: If a speed is not positive, or a limit is above another.
         """
         for name, value in (("speed", speed), ("yaw_rate", yaw_rate)):
             if not np.isfinite(value) or value <= 0:
@@ -82,20 +79,16 @@ class Pilot:
         self._sticks, self._speed, self._yaw_rate = tuple(sticks), float(speed), float(yaw_rate)
 
     def __call__(self, live: Live) -> None:
-        """Move the setpoint of the selected drone by one control step.
-
-        Raises:
-            ConfigError: If the simulation has no state commands.
-        """
+        """Move the setpoint of the selected drone by one control step."""
         require_state_control(live)
         sticks = np.clip(sum(source(live) for source in self._sticks), -1.0, 1.0)
         if live.selected is None or not np.any(sticks):
             return
         command = live.command[live.selected]
         point = move_setpoint(setpoint_of(command), sticks, 1.0 / live.control_freq, self._speed, self._yaw_rate)
-        here = np.asarray(live.sim.data.states.pos, float)[live.selected]
+        pos = np.asarray(live.sim.data.states.pos, float)[live.selected]
         reach = MAX_LEAD * self._speed
-        point[:3] = np.clip(np.clip(point[:3], here - reach, here + reach), self._low, self._high)
+        point[:3] = np.clip(np.clip(point[:3], pos - reach, pos + reach), self._low, self._high)
         hold_setpoint(command, point)
 
     def go_to(self, live: Live, world: int, point: ArrayLike) -> None:
@@ -118,11 +111,7 @@ class Pilot:
 
 
 def require_state_control(live: Live) -> None:
-    """Check that setpoints can be commanded.
-
-    Raises:
-        ConfigError: If the simulation has other commands.
-    """
+    """Check that setpoints can be commanded."""
     if live.sim.control != Control.state:
         raise ConfigError(
             f"expected a simulation with control='state', got {live.sim.control.value!r}. Use Sim(control='state')."

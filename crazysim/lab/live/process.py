@@ -63,7 +63,7 @@ class Process:
 
     def run(self, now: float) -> None:
         """Call the function at a simulated time, s, and measure it."""
-        begin = time.perf_counter()
+        start_time = time.perf_counter()
         try:
             self.call()
         except Exception as error:
@@ -72,7 +72,7 @@ class Process:
             self.failures += 1
             if self._may_warn():
                 log.warning("%s failed at %.3f s (%d in all): %s", self.name, now, self.failures, error)
-        took = time.perf_counter() - begin
+        took = time.perf_counter() - start_time
         if took > self.longest:
             self.longest, self.longest_at = took, now
 
@@ -96,9 +96,6 @@ def period_of(freq: float | None, control_freq: int, name: str) -> int:
         freq: Rate of the calls, Hz; None for the rate of the control steps.
         control_freq: Rate of the control steps, Hz.
         name: Name of the process, for the message.
-
-    Raises:
-        ConfigError: If the rate does not divide the rate of the control steps.
     """
     if freq is None:
         return 1

@@ -116,11 +116,7 @@ class Radio(Closing):
         self._cf.commander.send_setpoint(0, 0, 0, 0)  # crtp_commander_rpyt.c ignores thrust until it was zero once
 
     def state(self) -> DroneState:
-        """Return the latest state that the drone has sent, with the time on the drone's clock.
-
-        Raises:
-            ConfigError: If the link is not armed.
-        """
+        """Return the latest state that the drone has sent, with the time on the drone's clock."""
         self._require_armed()
         with self._lock:
             v = {part: UNITS.get(part, 1.0) * x for part, x in self._values.items()}
@@ -129,11 +125,7 @@ class Radio(Closing):
             return DroneState(self._stamp, v["pos"], quat, v["vel"], v["ang_vel"], v["acc"])
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command to one drone, as for ``sim.state_control``, ``attitude_control`` or ``body_rate_control``.
-
-        Raises:
-            ConfigError: If the link is not armed, the level is another one, or a number is invalid.
-        """
+        """Send a command to one drone, as for ``sim.state_control``, ``attitude_control`` or ``body_rate_control``."""
         level = Control(level)
         sizes = {Control.state: 16, Control.attitude: 4, Control.body_rate: 4}
         if level not in sizes:
@@ -161,11 +153,7 @@ class Radio(Closing):
         commander.send_setpoint(roll, pitch, yaw if level == Control.attitude else -yaw, thrust)
 
     def send_pose(self, frame: Frame, body: str) -> None:
-        """Send a measured pose to the drone's estimator, as motion capture does.
-
-        Raises:
-            ConfigError: If the link is not armed, or the frame has no such body.
-        """
+        """Send a measured pose to the drone's estimator, as motion capture does."""
         self._require_armed()
         if body not in frame.names:
             raise ConfigError(f"expected one of the bodies {list(frame.names)}, got {body!r}")
@@ -198,7 +186,7 @@ class Radio(Closing):
             )
 
     def _set_mode(self, level: Control) -> None:
-        """Let the firmware read angles or rates."""
+        """Set whether the firmware reads angles or rates."""
         if self._mode != level:
             value = "1" if level == Control.attitude else "0"
             for axis in ("Roll", "Pitch", "Yaw"):

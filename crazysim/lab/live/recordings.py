@@ -78,5 +78,5 @@ class Recordings:
 
 def free_path(path: Path) -> Path:
     """Return a path, or one with a number behind its name, that does not exist."""
-    numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))
-    return path if not path.exists() else next(p for p in numbered if not p.exists())
+    candidates = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))
+    return path if not path.exists() else next(p for p in candidates if not p.exists())

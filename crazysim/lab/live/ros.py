@@ -47,18 +47,14 @@ DEPTH = 10
 
 
 def ros_messages() -> Any:
-    """Return the message classes of the ROS installation.
-
-    Raises:
-        ConfigError: If there is none.
-    """
+    """Return the message classes of the ROS installation."""
     try:
-        found = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGES.items()}
+        messages = {name: getattr(importlib.import_module(package), name) for name, package in MESSAGES.items()}
     except ImportError as error:
         raise ConfigError(
             f"messages need ROS 2, which is not installed ({error}). Source its setup file, or pass messages=."
         ) from error
-    return SimpleNamespace(**found)
+    return SimpleNamespace(**messages)
 
 
 class RosBridge:
@@ -227,11 +223,7 @@ def _get(part: Any, names: str = "xyz") -> NDArray:
 
 
 def _unit_rpy(quat: NDArray) -> NDArray:
-    """Return roll, pitch and yaw, rad, of a quaternion of any length.
-
-    Raises:
-        ConfigError: If it is zero or not finite.
-    """
+    """Return roll, pitch and yaw, rad, of a quaternion of any length."""
     norm = float(np.linalg.norm(quat))
     if not 1e-3 < norm < math.inf:
         raise ConfigError(f"expected a unit quaternion, xyzw, got {quat.tolist()}")

@@ -20,7 +20,7 @@ DRONE = "drone"
 MARK_RADIUS = 0.12
 """Radius of the sphere around a marked drone, and the smallest around other bodies, m."""
 MAX_TRAILS = 256
-"""Number of bodies of a world up to which all have trails; above it only the drones have."""
+"""Largest number of bodies of a world with trails for all; in larger worlds only drones have trails."""
 
 
 class SceneBody(NamedTuple):
@@ -60,9 +60,9 @@ class SceneBodies:
         counts = Counter(kind for kind, _ in names)
         members = {plugin.name: sim.plugins.members_of(plugin) for plugin in sim.plugins.values()}
         items = [SceneBody(DRONE, k, name, mocap) for k, (name, mocap) in enumerate(_drones(sim))]
-        own = {body.mocap for body in items}
+        mocap_ids = {body.mocap for body in items}
         for mocap, (kind, k) in enumerate(names):
-            if mocap not in own and kind not in parts:
+            if mocap not in mocap_ids and kind not in parts:
                 called = members.get(kind, ())
                 name = called[k] if k < len(called) else kind if counts[kind] == 1 else f"{kind} {k}"
                 items.append(SceneBody(kind, k, name, mocap))
@@ -99,16 +99,13 @@ class SceneBodies:
         Args:
             kind: Kind, see ``SceneBody``.
             index: Number among the bodies of its kind.
-
-        Raises:
-            ConfigError: If there is none.
         """
-        found = next((body for body in self.items if (body.kind, body.index) == (kind, index)), None)
-        if found is None:
+        match = next((body for body in self.items if (body.kind, body.index) == (kind, index)), None)
+        if match is None:
             counts = Counter(body.kind for body in self.items)
-            known = ", ".join(f"{kind!r} (0 to {n - 1})" for kind, n in counts.items())
-            raise ConfigError(f"expected a body to follow, got {kind!r} {index!r}. Use one of {known}.")
-        return found
+            listed = ", ".join(f"{kind!r} (0 to {n - 1})" for kind, n in counts.items())
+            raise ConfigError(f"expected a body to follow, got {kind!r} {index!r}. Use one of {listed}.")
+        return match
 
 
 def _drones(sim: Sim) -> list[tuple[str, int]]:
@@ -128,11 +125,11 @@ def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
 
 def _parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
     """Return the kinds of a plugin that are parts of another, ``cars_wheel`` of ``cars``, and that one."""
-    found = []
+    parts = []
     for kind in kinds:
         bases = [base for base in kinds if kind.startswith(f"{base}_")]
-        found += [(kind, min(bases, key=len))] if bases else []
-    return found
+        parts += [(kind, min(bases, key=len))] if bases else []
+    return parts
 
 
 def _boxes(n: int, shapes: Sequence[VisualGeom]) -> tuple[NDArray, NDArray]:

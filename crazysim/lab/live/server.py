@@ -41,11 +41,11 @@ class CommandQueue(Closing):
 
     def commands(self) -> list[Command]:
         """Return the commands that have arrived until this call, in their order; others wait for the next one."""
-        found = []
+        commands = []
         with contextlib.suppress(queue.Empty):
             for _ in range(self._queue.qsize()):
-                found.append(self._queue.get_nowait())
-        return found
+                commands.append(self._queue.get_nowait())
+        return commands
 
     def _enqueue(self, command: Command) -> None:
         try:
@@ -57,7 +57,7 @@ class CommandQueue(Closing):
 
 
 class CommandServer(CommandQueue):
-    """Server for the lab's protocol, in threads of its own.
+    """Server for the lab's protocol, in other threads.
 
     At ``drone_port`` a client takes the control of one drone with ``REQ_07``, answered by ``ACK_07`` or, if the drone
     does not exist or another client has it, ``ACK_00``. Its commands, ``CMDSTART_takeoff_0.5_EOF`` for example, are
@@ -119,7 +119,6 @@ class CommandServer(CommandQueue):
         return self._listeners[1].server_address[1]
 
     def close(self) -> None:
-        """Stop listening and close all connections."""
         self._stopped.set()
         for listener in self._listeners:
             listener.shutdown()
@@ -171,10 +170,10 @@ class CommandServer(CommandQueue):
 
 
 class StreamListener(CommandQueue):
-    """Client of a server's stream of commands, such as port 7002 of the lab's test server, in a thread of its own.
+    """Client of a server's stream of commands, such as port 7002 of the lab's test server, in another thread.
 
     The simulation is one of many receivers there. Every valid message is answered by ``ACK``. When the server
-    disconnects or sends something else, the listener stops and ``alive`` is False; the fleet flies on.
+    disconnects or sends something else, the listener stops and ``alive`` is False; the fleet keeps flying.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = TIMEOUT):
@@ -201,7 +200,6 @@ class StreamListener(CommandQueue):
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Disconnect."""
         self._stopped.set()
         self._thread.join(5 * POLL)
         self._peer.close()
@@ -267,8 +265,8 @@ def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> It
     """Yield the messages of a connection until it ends, or the server stops.
 
     Raises:
-        FramingError: If it sends something else.
-        TimeoutError: If it begins a message and does not finish it.
+        FramingError: If the client sends something else.
+        TimeoutError: If the client does not finish a message.
     """
     frames, deadline = Frames(), None
     peer.settimeout(POLL)

@@ -18,7 +18,7 @@ class StagedCommands:
     """The command of every drone, as the simulation's command level has it; staged while it is in use."""
 
     def __init__(self, sim: Sim):
-        """Create the commands that are in force; a drone without a state command hovers at its position."""
+        """Start from the commands of the simulation; a drone without a state command hovers at its position."""
         self._sim = sim
         self._array: NDArray | None = None
         self._staged: NDArray | None = None
@@ -51,7 +51,7 @@ class StagedCommands:
 
 
 def compile_step(sim: Sim, n_steps: int) -> None:
-    """Compile what steps need, before others wait for them: take some, and return to the data before."""
+    """Compile the step before anything waits for it: run some steps, and restore the data."""
     with sim.lock:
         data = sim.data
         sim.step(n_steps)
@@ -60,7 +60,7 @@ def compile_step(sim: Sim, n_steps: int) -> None:
 
 
 def _initial_commands(sim: Sim) -> NDArray:
-    """Return the staged commands; of drones that have had no state command, hovering where they are."""
+    """Return the staged commands; drones without a state command hover at their positions."""
     command = np.array(staged_leaves(sim.data)[0], float)
     if sim.control == Control.state:
         unset = (command == DEFAULT_COMMAND).all(-1)

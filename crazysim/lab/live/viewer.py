@@ -26,7 +26,7 @@ class Slider:
     """A slider that calls a function between two steps, with its value."""
 
     name: str
-    """Text beside the slider."""
+    """Label of the slider."""
     low: float
     """Least value."""
     high: float

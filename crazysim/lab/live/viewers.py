@@ -77,7 +77,7 @@ class Viewers(Generic[L]):
             except Exception as error:
                 self.failures += 1
                 log.warning("%s failed and is closed: %s", type(viewer).__name__, error)
-            self._open = [other for other in self._open if other is not viewer]  # viewers can be equal
+            self._open = [x for x in self._open if x is not viewer]  # viewers can be equal
             viewer.close()
             if not self._open:
                 self._on_last_closed()

@@ -1,4 +1,4 @@
-"""A live simulation in a window of the desktop, drawn by a process of its own."""
+"""A live simulation in a window of the desktop, drawn by another process."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Window(Viewer[Live]):
     follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop
     makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] move the
     chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws in a process of
-    its own, as fast as it can, and never delays the simulation.
+    its own, at the highest rate possible, and never delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)
@@ -85,22 +85,15 @@ class Window(Viewer[Live]):
 
     @property
     def is_open(self) -> bool:
-        """True until the user or ``close`` closes the window."""
         return self._process is not None and self._process.poll() is None
 
     def open(self, live: Live) -> None:
-        """Start the process of the window, and wait until it is open.
-
-        Raises:
-            ConfigError: If a world or the camera does not exist.
-            RenderError: If there is no screen, or the window cannot be opened.
-        """
         require_screen()
         sim = live.sim
         worlds = world_indices(sim, self.worlds).tolist()
         camera_id(sim.mj_model, self.camera)
-        if self.plot and self.plot not in (known := [*live.quantities, *quantities(sim)]):
-            raise ConfigError(f"expected a quantity to plot, one of {', '.join(known)}, got {self.plot!r}")
+        if self.plot and self.plot not in (names := [*live.quantities, *quantities(sim)]):
+            raise ConfigError(f"expected a quantity to plot, one of {', '.join(names)}, got {self.plot!r}")
         sim.scene.compile_if_edited()
         sim.scene.sync_one(sim.plugins.with_moved_objects(sim.data), worlds[0])
         bodies = SceneBodies(sim, visual_geoms(sim.mj_model, sim.mj_data))
@@ -120,14 +113,12 @@ class Window(Viewer[Live]):
         threading.Thread(target=self._write, args=(process,), daemon=True).start()
 
     def update(self, live: Live) -> None:
-        """Hand the present picture to the process of the window, in place of one that it has not taken yet."""
         picture = self._source.take(live, self.plot)
         with self._changed:
             self._next = picture
             self._changed.notify()
 
     def close(self) -> None:
-        """Close the window."""
         process, self._process = self._process, None
         with self._changed:
             self._changed.notify()

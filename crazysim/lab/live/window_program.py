@@ -1,4 +1,4 @@
-"""The process of a window: it draws pictures from its standard input, and writes what the user does to its output."""
+"""The process of a window: draws pictures from its standard input, and writes the user's actions to its output."""
 
 from __future__ import annotations
 
@@ -77,15 +77,15 @@ class Leds:
 
     def color(self, colors: np.ndarray) -> None:
         """Set the colours of the drones of one world, 0 to 1; zero for off. (n_drones, 3)"""
-        own = colors[self._drones]
-        brightest = own.max(-1, initial=0.0)
+        drone_colors = colors[self._drones]
+        brightest = drone_colors.max(-1, initial=0.0)
         lit, (rgba, emission) = brightest > 0, self._off
-        self._model.mat_rgba[self._materials] = np.where(lit[:, None], np.insert(own, 3, 1.0, axis=1), rgba)
+        self._model.mat_rgba[self._materials] = np.where(lit[:, None], np.insert(drone_colors, 3, 1.0, axis=1), rgba)
         self._model.mat_emission[self._materials] = np.where(lit, brightest, emission)
 
 
 class Program:
-    """Window, model and what is drawn into it."""
+    """The window and its model, trails and lights."""
 
     def __init__(self, model: mujoco.MjModel, bodies: SceneBodies, settings: dict[str, Any], out: TextIO):
         """Open the window.
@@ -120,18 +120,18 @@ class Program:
 
     def run(self, inbox: Inbox) -> None:
         """Draw until the input ends or the user closes the window."""
-        shown, drawn = None, -np.inf
+        last_picture, drawn_at = None, -np.inf
         self._say("ready")
         while self.window.is_open and not inbox.ended:
             picture, now = inbox.picture, time.perf_counter()
-            if picture is None or (picture is shown and now - drawn < REDRAW_TIME):
+            if picture is None or (picture is last_picture and now - drawn_at < REDRAW_TIME):
                 time.sleep(IDLE_TIME)
                 continue
-            if picture is not shown and self._trail is not None:
+            if picture is not last_picture and self._trail is not None:
                 self._trail.add(np.full(len(picture.worlds), picture.time), picture.pos[:, self._tracked])
-            if picture is not shown:
+            if picture is not last_picture:
                 self._chart.add(picture)
-            shown, drawn = picture, now
+            last_picture, drawn_at = picture, now
             self.draw(picture)
         self.window.close()
 
@@ -148,7 +148,7 @@ class Program:
             self._report(picture, self.window.pick(n, lambda k: self._tile(picture, k)))
 
     def _tile(self, picture: Picture, k: int) -> tuple[mujoco.MjData, Overlays]:
-        """Return the state of the k-th world, and what is drawn over it."""
+        """Return the state of the k-th world, and its overlays."""
         data, overlays, settings = self._data, self._overlays, self._settings
         data.mocap_pos[:], data.mocap_quat[:] = picture.pos[k], np.roll(picture.quat[k], 1, axis=-1)
         mujoco.mj_kinematics(self._model, data)
@@ -189,12 +189,12 @@ class Program:
         self._was_down = down
         if not down or was_down:
             return False
-        (then, where), here, now = self._click, self.window.cursor, time.perf_counter()
+        (last_time, last_cursor), cursor, now = self._click, self.window.cursor, time.perf_counter()
         double = (
-            now - then < DOUBLE_CLICK_TIME
-            and max(abs(a - b) for a, b in zip(where, here, strict=True)) < MAX_CLICK_MOVE
+            now - last_time < DOUBLE_CLICK_TIME
+            and max(abs(a - b) for a, b in zip(last_cursor, cursor, strict=True)) < MAX_CLICK_MOVE
         )
-        self._click = (-np.inf if double else now, here)
+        self._click = (-np.inf if double else now, cursor)
         return double
 
     def _report(self, picture: Picture, hit: tuple[int, int, np.ndarray] | None) -> None:
@@ -228,7 +228,7 @@ def _ascii(text: str) -> str:
 def main() -> int:
     """Show a window until the input ends; return the exit status."""
     out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print is not for the simulation
+    os.dup2(2, 1)  # output of libraries must not reach the simulation
     stream = sys.stdin.buffer
     start = read_message(stream)
     if start is None:

@@ -1,4 +1,4 @@
-"""Archives of JSON files that refer to each other, with bounds on what is unpacked."""
+"""Archives of JSON files that refer to each other, with bounds on the unpacked size."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Archive:
 
         Raises:
             ConfigError: If it has too many files.
-            DamagedFileError: If it is no zip archive.
+            DamagedFileError: If the file is not a zip archive.
         """
         self.place = place
         self._parsed: dict[str, Any] = {}
-        most = min(MAX_TOTAL, max(MIN_TOTAL, MAX_RATIO * len(content)))
+        limit = min(MAX_TOTAL, max(MIN_TOTAL, MAX_RATIO * len(content)))
         with reading(place, "a zip archive", REMEDY):
-            self._zip = ZipReader(io.BytesIO(content), place, MAX_MEMBERS, MAX_MEMBER, most)
+            self._zip = ZipReader(io.BytesIO(content), place, MAX_MEMBERS, MAX_MEMBER, limit)
 
     def json(self, name: str) -> Any:
         """Return the contents of a JSON file of the archive.

@@ -50,8 +50,8 @@ def decode_lights(
         max_repeated: Most commands that loops and jumps may repeat.
 
     Raises:
-        ConfigError: If it is no program: an unknown command, a missing argument, a jump to nowhere, loops that are too
-            deep or never advance in time, or too many commands.
+        ConfigError: If the program is malformed: an unknown command, a missing argument, a jump to nowhere, loops that
+            are too deep or never advance in time, or too many commands.
     """
     if isinstance(program, str):
         try:
@@ -182,9 +182,6 @@ def encode_lights(lights: Lights) -> bytes:
 
     Args:
         lights: Lights of one drone.
-
-    Raises:
-        ConfigError: If they belong to several drones.
     """
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if times.ndim != 1:

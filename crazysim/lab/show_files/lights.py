@@ -36,9 +36,6 @@ class Lights(PyTree):
             starts: Colour where each piece begins, 0 to 1. (n_pieces, 3)
             ends: Colour that each piece fades to until the next begins; None for constant colours. The last piece is
                 constant in any case. (n_pieces, 3)
-
-        Raises:
-            ConfigError: If the shapes do not fit, a number is out of range, or the times do not ascend.
         """
         t, a = np.asarray(times, float), np.asarray(starts, float)
         b = a.copy() if ends is None else np.array(ends, float)
@@ -65,11 +62,7 @@ class Lights(PyTree):
 
     @staticmethod
     def stack(lights: Sequence[Lights]) -> Lights:
-        """Return the lights of several drones as one record with a new first axis, padded to a common size.
-
-        Raises:
-            ConfigError: If there are none.
-        """
+        """Return the lights of several drones as one record with a new first axis, padded to a common size."""
         if not lights:
             raise ConfigError("expected the lights of at least one drone, got none. Pass a list with one per drone.")
         n = max(x.times.shape[-1] for x in lights)

@@ -40,7 +40,7 @@ class ParameterChange:
 
 @dataclass(frozen=True, eq=False)
 class Show:
-    """A light show: what a ``.skyc`` file holds."""
+    """A light show: the contents of a ``.skyc`` file."""
 
     names: tuple[str, ...]
     """Names of the drones, all different."""
@@ -67,11 +67,7 @@ class Show:
     """Metadata, such as ``title``."""
 
     def __post_init__(self) -> None:
-        """Fill in defaults and check the sizes.
-
-        Raises:
-            ConfigError: If a field has not one entry for each drone, or names repeat.
-        """
+        """Fill in defaults and check the sizes."""
         n = len(self.names)
         if not n or len(set(self.names)) != n:
             raise ConfigError(

@@ -34,7 +34,7 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
             yaw of the points; None for none.
 
     Raises:
-        ConfigError: If it is invalid, with the place.
+        ConfigError: If the trajectory is invalid; the message names the place.
     """
     value = checks.require_object(value, place)
     checks.require_version_one(value, place)
@@ -52,16 +52,16 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
     times, curves, last = [], [], None
     n_axes = len(points[0][1]) if _is_point(points[0]) else 3
     for i, point in enumerate(points):
-        at = f"{place}, point {i}"
+        where = f"{place}, point {i}"
         if not _is_point(point):
-            checks.refuse("[time, [x, y, z], [control points]]", short_repr(point), at)
-        times.append(checks.require_number(point[0], at, 0.0, checks.MAX_TIME))
-        end = checks.require_numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, at)
-        inner = checks.require_array(point[2], MAX_DEGREE - 1, f"{at}, control points") if len(point) > 2 else []
+            checks.refuse("[time, [x, y, z], [control points]]", short_repr(point), where)
+        times.append(checks.require_number(point[0], where, 0.0, checks.MAX_TIME))
+        end = checks.require_numbers(point[1], [n_axes] if i else [3, 4], checks.MAX_COORDINATE, where)
+        inner = checks.require_array(point[2], MAX_DEGREE - 1, f"{where}, control points") if len(point) > 2 else []
         if last is None and inner:
-            checks.refuse("no control points of the first point", f"{len(inner)}", at)
+            checks.refuse("no control points of the first point", f"{len(inner)}", where)
         if last is not None:
-            via = [checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, at) for x in inner]
+            via = [checks.require_numbers(x, [n_axes], checks.MAX_COORDINATE, where) for x in inner]
             curves.append(np.stack([last, *via, end]))
         last = end
     checks.require_ascending(np.array(times), checks.MIN_LENGTH, place)
@@ -120,10 +120,6 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
         trajectory: Trajectory of one vehicle.
         encoding: ``COMPRESSED`` or ``POLY4D``.
         yaw: True to write the yaw as the fourth coordinate, degrees.
-
-    Raises:
-        ConfigError: If the encoding does not exist, the degree is higher than 7, or a piece does not begin where the
-            one before ends.
     """
     if encoding not in ENCODINGS:
         raise ConfigError(f"expected type {' or '.join(ENCODINGS)}, got {encoding!r}. Use one of these.")
@@ -140,10 +136,10 @@ def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw:
 
     points: list[Any] = [[0.0, written(c[0, :, 0]), []]]
     for end, axes in zip(ends, c, strict=True):
-        needed = significant_degree(axes, TOLERANCE)
-        if needed > MAX_DEGREE:
-            raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {needed}")
-        degree = min(d for d in degrees if d >= needed)
+        n_degree = significant_degree(axes, TOLERANCE)
+        if n_degree > MAX_DEGREE:
+            raise ConfigError(f"expected polynomials of degree {MAX_DEGREE} at most, got degree {n_degree}")
+        degree = min(d for d in degrees if d >= n_degree)
         curve = control_points(axes[:, : degree + 1], degree)
         points.append([float(end), written(curve[-1]), [written(x) for x in curve[1:-1]]])
     return {

@@ -42,7 +42,7 @@ def load_show(path: str | Path) -> Show:
     in Skybrush. A drone without a name is named after its index.
 
     Raises:
-        ConfigError: If the file is no valid show, with the place of the error.
+        ConfigError: If the file is not a valid show; the message names the place.
     """
     return parse_show(read_bytes(path, checks.MAX_FILE_BYTES), str(path))
 
@@ -55,49 +55,49 @@ def parse_show(content: bytes, place: str = "a show") -> Show:
         place: Name of the file, for messages.
 
     Raises:
-        ConfigError: If it is no valid show, with the place of the error.
+        ConfigError: If the file is not a valid show; the message names the place.
     """
     archive = Archive(content, place)
-    at = f"{place}: show.json"
-    show = checks.require_object(archive.json("show.json"), at)
-    checks.require_version_one(show, at)
-    settings, _ = archive.resolve(show.get("settings", {}), at)
-    settings = checks.require_object(settings, f"{at}, settings")
-    swarm, swarm_at = archive.resolve(show.get("swarm"), f"{at}, swarm")
+    where = f"{place}: show.json"
+    show = checks.require_object(archive.json("show.json"), where)
+    checks.require_version_one(show, where)
+    settings, _ = archive.resolve(show.get("settings", {}), where)
+    settings = checks.require_object(settings, f"{where}, settings")
+    swarm, swarm_at = archive.resolve(show.get("swarm"), f"{where}, swarm")
     drones = checks.require_array(
         checks.require_object(swarm, swarm_at).get("drones"), MAX_DRONES, f"{swarm_at}, drones"
     )
     if not drones:
         checks.refuse("at least one drone", "none", swarm_at)
-    found = []
+    parsed = []
     for i, drone in enumerate(drones):
-        found.append(_drone(archive, drone, f"{swarm_at}, drone {i}", i))
-        _bound(len(drones) * found[-1]["trajectory"].n_pieces, found[-1]["at"])
-    trajectories = [drone["trajectory"] for drone in found]
+        parsed.append(_drone(archive, drone, f"{swarm_at}, drone {i}", i))
+        _bound(len(drones) * parsed[-1]["trajectory"].n_pieces, parsed[-1]["at"])
+    trajectories = [drone["trajectory"] for drone in parsed]
     duration = max(float(x.duration) for x in trajectories)
     lights, decoded = [], {}
-    for drone in found:
-        lights.append(_lights(archive, drone, duration, MAX_LOOPED // len(found), decoded))
-        _bound(len(found) * len(lights[-1].times), f"{drone['at']}, lights")
-    names = [drone["name"] for drone in found]
+    for drone in parsed:
+        lights.append(_lights(archive, drone, duration, MAX_LOOPED // len(parsed), decoded))
+        _bound(len(parsed) * len(lights[-1].times), f"{drone['at']}, lights")
+    names = [drone["name"] for drone in parsed]
     if len(set(names)) < len(names):
         checks.refuse("different names of the drones", f"{short_repr(sorted(names))}", swarm_at)
     environment = show.get("environment") or {}
-    kind = checks.require_object(environment, f"{at}, environment").get("type", "outdoor")
+    kind = checks.require_object(environment, f"{where}, environment").get("type", "outdoor")
     if kind not in ("indoor", "outdoor"):
-        checks.refuse("environment indoor or outdoor", short_repr(kind), at)
+        checks.refuse("environment indoor or outdoor", short_repr(kind), where)
     return Show(
         names=tuple(names),
         trajectories=Trajectory.stack(trajectories),
         lights=Lights.stack(lights),
-        cues=_cues(archive, settings.get("cues"), f"{at}, cues"),
+        cues=_cues(archive, settings.get("cues"), f"{where}, cues"),
         settings={name: value for name, value in settings.items() if name != "cues"},
-        homes=np.stack([drone["home"] for drone in found]),
-        landings=np.stack([drone["landing"] for drone in found]),
-        parameters=tuple(drone["parameters"] for drone in found),
-        encodings=tuple(drone["encoding"] for drone in found),
+        homes=np.stack([drone["home"] for drone in parsed]),
+        landings=np.stack([drone["landing"] for drone in parsed]),
+        parameters=tuple(drone["parameters"] for drone in parsed),
+        encodings=tuple(drone["encoding"] for drone in parsed),
         environment=kind,
-        meta=checks.require_object(show.get("meta") or {}, f"{at}, meta"),
+        meta=checks.require_object(show.get("meta") or {}, f"{where}, meta"),
     )
 
 
@@ -107,15 +107,15 @@ def _bound(n_pieces: int, place: str) -> None:
 
 
 def _drone(archive: Archive, value: object, place: str, index: int) -> dict[str, Any]:
-    """Return what the show says about one drone; its lights are not yet decoded."""
+    """Return the entry of one drone in the show; its lights are not decoded yet."""
     value, place = archive.resolve(value, place)
     settings, place = archive.resolve(checks.require_object(value, place).get("settings"), f"{place}, settings")
     settings = checks.require_object(settings, place)
-    data, at = archive.resolve(settings.get("trajectory"), f"{place}, trajectory")
+    data, where = archive.resolve(settings.get("trajectory"), f"{place}, trajectory")
     yaw_control, _ = archive.resolve(settings.get("yawControl"), f"{place}, yawControl")
     if isinstance(yaw_control, dict) and yaw_control.get("autoYaw"):
-        log.warning("%s: autoYaw is ignored; the yaw is that of the setpoints", place)
-    trajectory, encoding = parse_trajectory(data, at, yaw_control)
+        log.warning("%s: autoYaw is ignored; the drone keeps the yaw of the setpoints", place)
+    trajectory, encoding = parse_trajectory(data, where, yaw_control)
     c = np.asarray(trajectory.coefficients, float)
     start, end = c[0, :, 0], c[-1].sum(-1)
     if settings.get("startYaw") is not None:
@@ -142,9 +142,11 @@ def _parameters(value: object, place: str) -> tuple[ParameterChange, ...]:
     for i, entry in enumerate(checks.require_array(value, checks.MAX_POINTS, place) if value is not None else []):
         if not isinstance(entry, list) or len(entry) != 3:
             checks.refuse("[time, name, value]", short_repr(entry), f"{place}, entry {i}")
-        at = f"{place}, entry {i}"
-        time = checks.require_number(entry[0], at, 0.0, checks.MAX_TIME)
-        changes.append(ParameterChange(time, checks.require_text(entry[1], at), checks.require_number(entry[2], at)))
+        where = f"{place}, entry {i}"
+        time = checks.require_number(entry[0], where, 0.0, checks.MAX_TIME)
+        changes.append(
+            ParameterChange(time, checks.require_text(entry[1], where), checks.require_number(entry[2], where))
+        )
     return tuple(changes)
 
 
@@ -156,10 +158,10 @@ def _cues(archive: Archive, value: object, place: str) -> tuple[Cue, ...]:
     checks.require_version_one(value, place)
     cues = []
     for i, item in enumerate(checks.require_array(value.get("items", []), checks.MAX_POINTS, place)):
-        at = f"{place}, item {i}"
-        item = checks.require_object(item, at)
-        time = checks.require_number(item.get("time"), at, 0.0, checks.MAX_TIME)
-        cues.append(Cue(time, checks.require_text(item.get("name", ""), at)))
+        where = f"{place}, item {i}"
+        item = checks.require_object(item, where)
+        time = checks.require_number(item.get("time"), where, 0.0, checks.MAX_TIME)
+        cues.append(Cue(time, checks.require_text(item.get("name", ""), where)))
     return tuple(sorted(cues, key=lambda cue: cue.time))
 
 
@@ -191,27 +193,24 @@ def parse_colors(value: object, place: str) -> Lights:
     Args:
         value: The JSON array.
         place: File and place in it, for messages.
-
-    Raises:
-        ConfigError: If an entry is invalid.
     """
     entries = checks.require_array(value, MAX_REPEATED, place)
     times, colors, now = [], [], 0.0
     for i, entry in enumerate(entries):
-        at = f"{place}, entry {i}"
+        where = f"{place}, entry {i}"
         if not isinstance(entry, list) or len(entry) != 2:
-            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", short_repr(entry), at)
+            checks.refuse("[time, [red, green, blue]] or ['red, green, blue', duration]", short_repr(entry), where)
         first, second = entry
         if isinstance(first, str):
-            channels: Any = [_integer(x, at) for x in first.split(",")[:4]]
+            channels: Any = [_integer(x, where) for x in first.split(",")[:4]]
             times.append(now)
-            now += checks.require_number(second, at, 0.0, checks.MAX_TIME)
+            now += checks.require_number(second, where, 0.0, checks.MAX_TIME)
         else:
             channels = second
-            times.append(checks.require_number(first, at, 0.0, checks.MAX_TIME))
-        colors.append(checks.require_numbers(channels, [3], 255.0, at) / 255)
+            times.append(checks.require_number(first, where, 0.0, checks.MAX_TIME))
+        colors.append(checks.require_numbers(channels, [3], 255.0, where) / 255)
         if colors[-1].min() < 0:
-            checks.refuse("colours from 0 to 255", short_repr(channels), at)
+            checks.refuse("colours from 0 to 255", short_repr(channels), where)
     if not entries:
         return Lights.constant((0.0, 0.0, 0.0))
     checks.require_ascending(np.array(times), 0.0, place)
@@ -281,9 +280,9 @@ def _format_lights(lights: Lights) -> dict[str, Any]:
     value: dict[str, Any] = {"version": 1, "data": base64.b64encode(encode_lights(lights)).decode()}
     times, starts, ends = (np.asarray(x, float) for x in (lights.times, lights.starts, lights.ends))
     if np.array_equal(starts, ends):
-        kept = np.diff(times, append=np.inf) > 0
-        colors = np.round(255 * starts[kept]).astype(int).tolist()
+        has_length = np.diff(times, append=np.inf) > 0
+        colors = np.round(255 * starts[has_length]).astype(int).tolist()
         value["colors"] = [
-            [float(str(t)), color] for t, color in zip(np.asarray(lights.times)[kept], colors, strict=True)
+            [float(str(t)), color] for t, color in zip(np.asarray(lights.times)[has_length], colors, strict=True)
         ]
     return value

@@ -67,9 +67,6 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
         progress: Function that returns the items it gets, with a progress bar, ``progress(items, label)``; None for
             none.
         settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
-
-    Raises:
-        ConfigError: If the duration is not positive, or a setting is invalid.
     """
     end = show.duration if seconds is None else min(float(seconds), show.duration)
     if not np.isfinite(end) or end <= 0:
@@ -82,7 +79,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     fly_chunk = _compile_chunk(sim, sim.freq // rate)
     jax.block_until_ready(planned_at(show.trajectories, jnp.asarray(times)))  # compiles
     show.lights.colors(times)
-    begin = time.perf_counter()
+    start_time = time.perf_counter()
     data = sim.data
     recorded = [[np.asarray(x)[None, 0] for x in _pose(data)]]
     chunks = range(0, n, CHUNK_SAMPLES)
@@ -93,7 +90,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     pos, quat = (np.concatenate(parts)[: n + 1] for parts in zip(*recorded, strict=True))
     planned = np.asarray(planned_at(show.trajectories, jnp.asarray(times)))
     colors = show.lights.colors(times)
-    return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - begin)
+    return ShowFlight(show, sim, times, pos, quat, planned, colors, time.perf_counter() - start_time)
 
 
 def start_simulation(show: Show, settings: dict[str, Any]) -> Sim:

@@ -40,9 +40,6 @@ def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
         show: Show, whose drones start hovering at the first points of their trajectories.
         speed: Simulated seconds per second, or ``"max"``.
         settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
-
-    Raises:
-        ConfigError: If a setting is invalid.
     """
     sim = start_simulation(show, settings)
     live = Live(sim, speed=speed)

@@ -29,7 +29,7 @@ def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArr
     """
     t, p = np.asarray(times, float), np.asarray(pos)
     n, n_drones = p.shape[:2]
-    x = np.ascontiguousarray(np.transpose(p, (2, 1, 0)))  # time last: what is reduced lies together
+    x = np.ascontiguousarray(np.transpose(p, (2, 1, 0)))  # time last, so that the reduced axis is contiguous
     distance, when = np.full((n_drones, n_drones), np.inf), np.zeros((n_drones, n_drones))
     for i in range(n_drones - 1):
         squares = np.zeros((n_drones - 1 - i, n), x.dtype)
@@ -37,9 +37,9 @@ def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArr
             difference = axis[i + 1 :] - axis[i]
             difference *= difference
             squares += difference
-        least, at = _refine_approach(squares, t)
-        distance[i, i + 1 :] = distance[i + 1 :, i] = np.sqrt(least)
-        when[i, i + 1 :] = when[i + 1 :, i] = at
+        minimum, time = _refine_approach(squares, t)
+        distance[i, i + 1 :] = distance[i + 1 :, i] = np.sqrt(minimum)
+        when[i, i + 1 :] = when[i + 1 :, i] = time
     return distance, when
 
 
@@ -55,12 +55,12 @@ def _refine_approach(squares: NDArray, times: NDArray) -> tuple[NDArray, NDArray
     if n < 3:
         return squares[rows, k].astype(float), times[k]
     middle = np.clip(k, 1, n - 2)
-    before, here, after = (squares[rows, middle + d].astype(float) for d in (-1, 0, 1))
-    slope, curvature = (after - before) / 2, after - 2 * here + before
+    before, centre, after = (squares[rows, middle + d].astype(float) for d in (-1, 0, 1))
+    slope, curvature = (after - before) / 2, after - 2 * centre + before
     offset = np.where(curvature > 0, -slope / np.where(curvature > 0, curvature, 1.0), k - middle)
     offset = np.clip(offset, -1.0, 1.0)
-    least = here + slope * offset + curvature * offset**2 / 2
-    return np.maximum(np.minimum(least, squares[rows, k]), 0.0), times[middle] + offset * (times[1] - times[0])
+    minimum = centre + slope * offset + curvature * offset**2 / 2
+    return np.maximum(np.minimum(minimum, squares[rows, k]), 0.0), times[middle] + offset * (times[1] - times[0])
 
 
 def tracking_rms(flight: ShowFlight) -> dict[str, float]:
@@ -74,12 +74,12 @@ def collisions(flight: ShowFlight) -> list[dict[str, Any]]:
     """Return the pairs of drones whose collision spheres touched, each with the time of the first contact, by time."""
     reach = 2 * collision_radius(flight)
     distance, _ = sampled_approaches(flight.times, flight.pos)
-    found = []
+    pairs = []
     for i, j in np.argwhere(np.triu(distance < reach, 1)):
         apart = np.linalg.norm(flight.pos[:, i] - flight.pos[:, j], axis=-1)
         first = int(np.argmax(apart <= max(reach, apart.min())))
-        found.append({"drones": [flight.show.names[i], flight.show.names[j]], "time": float(flight.times[first])})
-    return sorted(found, key=lambda pair: pair["time"])
+        pairs.append({"drones": [flight.show.names[i], flight.show.names[j]], "time": float(flight.times[first])})
+    return sorted(pairs, key=lambda pair: pair["time"])
 
 
 def collision_radius(flight: ShowFlight) -> float:

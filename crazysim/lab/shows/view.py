@@ -53,7 +53,6 @@ def film(
         view: Settings of ``crazysim.media.View`` other than its own.
 
     Raises:
-        ConfigError: If a setting is invalid.
         ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
         RenderError: If this machine cannot draw, or the file cannot be written.
     """
@@ -72,7 +71,6 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
         view: Settings of ``crazysim.media.View`` other than its own.
 
     Raises:
-        ConfigError: If a setting is invalid.
         RenderError: If there is no screen.
     """
     if not np.isfinite(speed) or speed <= 0:

@@ -21,9 +21,6 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
     Args:
         data: Folder with logs of real flights in ``idsia`` and ``nanobench``; None for none.
         only: Names of sections.
-
-    Raises:
-        ConfigError: If a section does not exist, or the folder does not.
     """
     if unknown := [name for name in only if name not in NAMES]:
         raise ConfigError(f"expected sections of {', '.join(NAMES)}, got {unknown[0]!r}")

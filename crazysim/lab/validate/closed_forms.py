@@ -78,9 +78,9 @@ def state_of(sim: Sim) -> dict[str, NDArray]:
     return {k: np.asarray(getattr(s, k))[0, 0] for k in ("pos", "vel", "quat", "ang_vel", "rotor_vel")}
 
 
-def angle_between(one: ArrayLike, other: ArrayLike) -> float:
+def angle_between(a: ArrayLike, b: ArrayLike) -> float:
     """Return the angle between two attitudes, unit quaternions xyzw, rad."""
-    turn = rotation.multiply(rotation.conjugate(jnp.asarray(one)), jnp.asarray(other))
+    turn = rotation.multiply(rotation.conjugate(jnp.asarray(a)), jnp.asarray(b))
     return 2 * math.asin(min(1.0, float(np.linalg.norm(turn[:3]))))
 
 
@@ -110,7 +110,7 @@ def free_fall() -> Iterable[Row]:
 
 
 def precession() -> Iterable[Row]:
-    """Yield the attitude of a symmetric top that nothing turns: a product of two turns at constant rates."""
+    """Yield the attitude of a torque-free symmetric top: a product of two rotations at constant rates."""
     a, c, w, t = 2e-5, 5e-5, np.array([4.0, 3.0, 8.0]), 0.5
     with jax.enable_x64(True):
         sim = free_body("rk4", 500, w, np.diag([a, a, c]))
@@ -131,11 +131,11 @@ def terminal_velocity() -> Iterable[Row]:
         sim.data = with_states(sim.data, pos=[0, 0, 2000.0], rotor_vel=np.zeros(4))
         sim.rotor_vel_control(np.zeros((1, 1, 4)))
         sim.step(20_000)
-        found = -state_of(sim)["vel"][2]
+        speed = -state_of(sim)["vel"][2]
     rate = GRAVITY_MAGNITUDE / fall
-    # what is left of the transient, and rounding
+    # the rest of the transient, and rounding
     text = f"m g / D = {fall:.3f} m/s"
-    yield Row("terminal velocity, 40 s", text, abs(found / fall - 1), "", (0, 2 * math.exp(-40 * rate)))
+    yield Row("terminal velocity, 40 s", text, abs(speed / fall - 1), "", (0, 2 * math.exp(-40 * rate)))
 
 
 def motor_step() -> Iterable[Row]:
@@ -147,13 +147,13 @@ def motor_step() -> Iterable[Row]:
         sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=np.full(4, low))
         sim.rotor_vel_control(np.full((1, 1, 4), high))
         sim.step(25)
-        found = state_of(sim)["rotor_vel"][0]
+        speeds = state_of(sim)["rotor_vel"][0]
     # with e = c - r: e' = -e (a + 2 b c - b e), Bernoulli's equation
     rate, start = a + 2 * b * high, high - low
     e = rate / (b + (rate / start - b) * math.exp(rate * t))
     # RK4: a step of 2 ms is 0.035 of the time constant; 25 * 0.035^5 / 120 of 6,000 rpm
     yield Row(
-        "motor, 50 ms after a step from 10,000 to 16,000 rpm", "closed form", abs(found - high + e), "rpm", (0, 1e-4)
+        "motor, 50 ms after a step from 10,000 to 16,000 rpm", "closed form", abs(speeds - high + e), "rpm", (0, 1e-4)
     )
 
 
@@ -174,11 +174,11 @@ def pendulum() -> Iterable[Row]:
             x.append(np.asarray(load.read(sim.data).pos - sim.data.states.pos)[:, 0, 0])
     for k, angle in enumerate(angles):
         swing = np.stack(x)[:, k]
-        at = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))[:2]
-        times = (at + 1 + swing[at] / (swing[at] - swing[at + 1])) / sim.freq
-        mean, other = 1.0, math.cos(angle / 2)
+        crossings = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))[:2]
+        times = (crossings + 1 + swing[crossings] / (swing[crossings] - swing[crossings + 1])) / sim.freq
+        mean, geometric_mean = 1.0, math.cos(angle / 2)
         for _ in range(6):
-            mean, other = (mean + other) / 2, math.sqrt(mean * other)
+            mean, geometric_mean = (mean + geometric_mean) / 2, math.sqrt(mean * geometric_mean)
         period = 2 * math.pi * math.sqrt(length / GRAVITY_MAGNITUDE) / mean
         error = abs(float(times[1] - times[0]) / period - 1)
         # crossings are interpolated linearly between samples of 2 ms: (2 ms)^3 of the curvature, relative to 1.3 s
@@ -195,9 +195,9 @@ def dzhanibekov() -> Iterable[Row]:
     with jax.enable_x64(True):
         sim = free_body("rk4", 500, start)
         sim.step(500)
-        found = math.log(abs(state_of(sim)["ang_vel"][0]) / small) / t
+        growth = math.log(abs(state_of(sim)["ang_vel"][0]) / small) / t
     # RK4: growth per step of 2 ms is exp(0.0126) to order five, 500 * 0.0126^5 / 120 over 6.3
-    yield Row("Dzhanibekov effect: growth rate", f"{rate:.4f} 1/s", abs(found / rate - 1), "", (0, 1e-8))
+    yield Row("Dzhanibekov effect: growth rate", f"{rate:.4f} 1/s", abs(growth / rate - 1), "", (0, 1e-8))
 
 
 STEPS = {"euler": (400, 800, 1600), "symplectic_euler": (400, 800, 1600), "rk4": (100, 200, 400)}
@@ -223,8 +223,8 @@ def order_errors() -> dict[str, NDArray]:
         exact = flight(6400, "rk4")
         flights = {name: [flight(f, name) for f in freqs] for name, freqs in STEPS.items()}
     return {
-        name: np.array([[np.linalg.norm(x - e) for x, e in zip(flown, exact, strict=True)] for flown in each])
-        for name, each in flights.items()
+        name: np.array([[np.linalg.norm(x - e) for x, e in zip(flown, exact, strict=True)] for flown in by_freq])
+        for name, by_freq in flights.items()
     }
 
 

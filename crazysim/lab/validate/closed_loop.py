@@ -93,22 +93,18 @@ def read_flight(path: str | Path) -> Flight:
     """
     path = Path(path)
     columns = columns_of(path, COLUMNS)
-    t, logged, given = columns[0], columns[1:4], columns[4:]
-    rest, commanded = logged[2, 0], commanded_samples(path.name, given[2])
+    t, logged, setpoints = columns[0], columns[1:4], columns[4:]
+    height_at_rest, commanded = logged[2, 0], commanded_samples(path.name, setpoints[2])
     grid = np.arange(float(t[commanded[0]]), float(t[commanded[-1]]), 1 / FREQ)
     pos = np.stack([np.interp(grid, t, x) for x in logged], axis=-1)
     nearest = np.searchsorted((t[1:] + t[:-1]) / 2, grid)
-    setpoint = given[:, nearest].T * [1, 1, 1, np.pi / 180]
-    pos[:, 2], setpoint[:, 2] = pos[:, 2] - rest, setpoint[:, 2] - rest
+    setpoint = setpoints[:, nearest].T * [1, 1, 1, np.pi / 180]
+    pos[:, 2], setpoint[:, 2] = pos[:, 2] - height_at_rest, setpoint[:, 2] - height_at_rest
     return Flight(path.stem, setpoint, pos)
 
 
 def columns_of(path: Path, names: Sequence[str]) -> NDArray:
-    """Return columns of a log of NanoBench. (len(names), n)
-
-    Raises:
-        ConfigError: If one is missing.
-    """
+    """Return columns of a log of NanoBench. (len(names), n)"""
     _, table = read_table(path, [], None)
     if missing := [name for name in names if name not in table]:
         raise ConfigError(
@@ -125,7 +121,7 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
         height: Height of the setpoint, m. (n,)
 
     Raises:
-        ConfigError: If there are none.
+        ConfigError: If no setpoint is above the floor.
     """
     commanded = np.flatnonzero(height > 0)
     if not len(commanded):

@@ -65,10 +65,10 @@ def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParam
         slip_speed=jnp.full(1, SLIP_SPEED), trailer=None,
     )  # fmt: skip
     vel = speed * jnp.concatenate([jnp.cos(slip), jnp.sin(slip)])
-    found = single_track(CarState(jnp.zeros(3), x[4:5], vel, x[5:6], x[2:3], zero), limited[3:4], car)
-    acc, turn = found.body_vel, (vel[:1] * found.body_vel[1:] - vel[1:] * found.body_vel[:1]) / speed**2
+    rates = single_track(CarState(jnp.zeros(3), x[4:5], vel, x[5:6], x[2:3], zero), limited[3:4], car)
+    acc, turn = rates.body_vel, (vel[:1] * rates.body_vel[1:] - vel[1:] * rates.body_vel[:1]) / speed**2
     along = (vel @ acc)[None] / speed
-    return jnp.concatenate([found.pos[:2], limited[2:3], along, found.yaw, found.yaw_rate, turn])
+    return jnp.concatenate([rates.pos[:2], limited[2:3], along, rates.yaw, rates.yaw_rate, turn])
 
 
 def lane_change(t: float, rate: float) -> list[float]:
@@ -109,16 +109,16 @@ def compare_with_commonroad() -> Iterable[Row]:
         params = parameters(car)
         ours = np.asarray(commonroad_rates(x, u, params))
         # rounding of float64 in differences of terms up to 1,000 times as large
-        apart = float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
-        yield Row("rates of 500 states, commands beyond the limits", REFERENCE, apart, "", (0, 1e-11))
+        difference = float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
+        yield Row("rates of 500 states, commands beyond the limits", REFERENCE, difference, "", (0, 1e-11))
         laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (commonroad_rates, crazysim_rates)]
         start = np.array([0.0, 0, 0, SPEED, 0, 0, 0])
         for rate in (0.03, 0.12):
-            known = drive(lambda x, u: model(list(x), list(u), car), start, rate)
-            same, own = (drive(law, start, rate) for law in laws)
+            reference = drive(lambda x, u: model(list(x), list(u), car), start, rate)
+            ported, shipped = (drive(law, start, rate) for law in laws)
             what = f"lane change, steering at {rate:g} rad/s, {DURATION:g} s"
-            apart = float(np.linalg.norm((same - known)[:2]))
-            yield Row(f"{what}: `commonroad_single_track`, position", REFERENCE, apart, "m", (0, 1e-9))
+            difference = float(np.linalg.norm((ported - reference)[:2]))
+            yield Row(f"{what}: `commonroad_single_track`, position", REFERENCE, difference, "m", (0, 1e-9))
             for k, way in enumerate(("along", "across")):
-                yield Row(f"{what}: `single_track`, position {way}", REFERENCE, float(abs(own - known)[k]), "m",
-                          other=f"of {known[k]:.3g} m")  # fmt: skip
+                yield Row(f"{what}: `single_track`, position {way}", REFERENCE, float(abs(shipped - reference)[k]), "m",
+                          other=f"of {reference[k]:.3g} m")  # fmt: skip

@@ -98,12 +98,14 @@ def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArra
     ang_vel = smooth(3, 10 * size, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
-        held = POSITION_PERIOD * (np.arange(n_ticks) // POSITION_PERIOD)
-        desired_yaw = (yaw + smooth(1, size, 0.4))[held, :, 0]
+        tick_of_command = POSITION_PERIOD * (np.arange(n_ticks) // POSITION_PERIOD)
+        desired_yaw = (yaw + smooth(1, size, 0.4))[tick_of_command, :, 0]
         quat_des = np.stack([0 * desired_yaw, 0 * desired_yaw, np.sin(desired_yaw / 2), np.cos(desired_yaw / 2)], -1)
         parts = [pos + smooth(3, 1.5 * size, 0.6), vel + smooth(3, size, 0.4), smooth(3, 4 * size, 0.5)]
         rates = smooth(3, 3 * size, 0.3)
-        commands = np.concatenate([*(part[held] for part in parts), quat_des, rates[held]], axis=-1)
+        commands = np.concatenate(
+            [*(part[tick_of_command] for part in parts), quat_des, rates[tick_of_command]], axis=-1
+        )
     else:
         thrust = np.clip(38000 + 40000 * size * smooth(1, 1.0, 0.5), 1000, 65535)
         thrust[n_ticks // 3 : n_ticks // 3 + 20, ::3] = 0

@@ -125,8 +125,8 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
 def compare_filters() -> Iterable[Row]:
     """Yield the largest differences of states from the compiled firmware's."""
     for kind in KINDS:
-        found, recorded = kalman_states(kind)
-        difference = np.abs(found - recorded)
+        estimates, recorded = kalman_states(kind)
+        difference = np.abs(estimates - recorded)
         # rounding of float32, which 4,000 loops add up
         yield Row(f"Kalman filter, {kind}: position, velocity, attitude error", "compiled C, 4 s",
                   float(difference[:, :9].max()), "m, m/s, rad", (0, 2e-4))  # fmt: skip
@@ -136,6 +136,6 @@ def compare_filters() -> Iterable[Row]:
         yield Row(f"Kalman filter, {kind}: covariance", "compiled C, 4 s", float(relative.max()), "",
                   (0, 5e-3))  # fmt: skip
     for kind in ("pressure", "ground"):
-        found, recorded = complementary_states(kind)
+        estimates, recorded = complementary_states(kind)
         yield Row(f"complementary filter, {kind}: quaternion, height in m", "compiled C, 2 s",
-                  float(np.abs(found - recorded)[:, :5].max()), "", (0, 5e-6))  # fmt: skip
+                  float(np.abs(estimates - recorded)[:, :5].max()), "", (0, 5e-6))  # fmt: skip

@@ -31,47 +31,47 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
     Raises:
         ConfigError: If there are none.
     """
-    found = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
-    if not found:
+    paths = sorted(path for ending in ("npz", "csv") for path in folder.glob(f"{pattern}.{ending}"))
+    if not paths:
         raise ConfigError(
             f"expected logs {pattern}.npz or .csv in {folder.name}, got none. docs/validation.md has them."
         )
-    return found
+    return paths
 
 
 def open_loop(folder: Path) -> Iterable[Row]:
     """Yield mean errors of predictions of melon from measured rotor speeds, over ``HORIZONS``, and published ones."""
     path = find_logs(folder, "melon*")[0]
     log = read_log(path)
-    found: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
+    series_errors: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
     errors: dict[str, NDArray] = {}
     for name in ("cf21B_500", "cf21B_500_idsia"):
         model = Model.create(load_airframe(name), MASS)
         flight = aligned(log, fast_rotation([log], model.params).delays[0])
         errors = prediction_errors([flight], model)
         errors = {key.removesuffix(" (mean)"): x for key, x in errors.items() if key.endswith("(mean)")}
-        found["position"][f"`{name}`"] = errors["position"]
-        found["position"][f"`{name}` at constant body rates"] = errors["position at constant body rates"]
-        found["attitude"][f"`{name}`"] = errors["attitude"]
-    found["position"]["constant velocity"] = errors["position at constant velocity"]
-    found["attitude"]["constant body rates"] = errors["attitude at constant body rates"]
-    found["attitude"]["unchanged"] = errors["attitude unchanged"]
+        series_errors["position"][f"`{name}`"] = errors["position"]
+        series_errors["position"][f"`{name}` at constant body rates"] = errors["position at constant body rates"]
+        series_errors["attitude"][f"`{name}`"] = errors["attitude"]
+    series_errors["position"]["constant velocity"] = errors["position at constant velocity"]
+    series_errors["attitude"]["constant body rates"] = errors["attitude at constant body rates"]
+    series_errors["attitude"]["unchanged"] = errors["attitude unchanged"]
     for what, unit in (("position", "m"), ("attitude", "degrees")):
-        known = {f"published {name}": figures for name, figures in PUBLISHED_ERRORS[what].items()}
-        for series, figures in (found[what] | known).items():
-            at, of = ((0.1, 0.5), "three melon flights") if series in known else (HORIZONS, path.stem)
-            for h, figure in zip(at, figures, strict=True):
+        published = {f"published {name}": figures for name, figures in PUBLISHED_ERRORS[what].items()}
+        for series, figures in (series_errors[what] | published).items():
+            horizons, flights = ((0.1, 0.5), "three melon flights") if series in published else (HORIZONS, path.stem)
+            for h, figure in zip(horizons, figures, strict=True):
                 label = f"{what}, {series}, after {h:g} s"
-                yield Row(label, of, float(figure), unit, series=series.replace("`", ""), at=h)
+                yield Row(label, flights, float(figure), unit, series=series.replace("`", ""), at=h)
 
 
 def closed_loop(folder: Path) -> Iterable[Row]:
     """Yield simulated over logged tracking errors, flight by flight."""
     paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
     for row in compare([read_flight(path) for path in paths], estimator=laboratory_estimator()):
-        other = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"
+        remark = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"
         if row.failed:
-            yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, other=other)
+            yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, other=remark)
             continue
         kind = " ".join(part for part in row.name.split("_")[1:] if not part.startswith("rep"))
-        yield Row(row.name, "its log", row.ratio, "", (0.7, 1.4), other, series="one flight", at=kind)
+        yield Row(row.name, "its log", row.ratio, "", (0.7, 1.4), remark, series="one flight", at=kind)

@@ -121,7 +121,9 @@ def compare_filter(folder: Path) -> Iterable[Row]:
         longest = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
         ours = errors(log, *(np.asarray(x)[:size] for x in replay(*longest)))
         board = errors(log, log["est_pos"], log["est_quat"])
-        for what, unit, one, other in zip(("position", "attitude"), ("m", "degrees"), ours, board, strict=True):
-            yield Row(f"{name}: {what}", "filter on board", one / other, "", (0, 1.1),
-                      f"on board {other:.3g} {unit}, here {one:.3g} {unit}", series=what,
+        for what, unit, our_error, board_error in zip(
+            ("position", "attitude"), ("m", "degrees"), ours, board, strict=True
+        ):
+            yield Row(f"{name}: {what}", "filter on board", our_error / board_error, "", (0, 1.1),
+                      f"on board {board_error:.3g} {unit}, here {our_error:.3g} {unit}", series=what,
                       at=name.partition("_")[2])  # fmt: skip

@@ -37,7 +37,7 @@ FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazy
 - `nanobench/` holds the logs of NanoBench (arXiv 2603.09908) that the rows name, from `datasets/dataset` of
   [its repository](https://github.com/syediu/nanobench-iros2026) at commit d45bc5a. More of its logs make more rows.
 
-A figure passes if it is within the range in its row; rows without a range report what was found.
+A figure passes if it is within the range in its row; rows without a range only report.
 """
 """Beginning of the page."""
 COLUMNS: Mapping[str, Callable[[Row], str]] = {
@@ -76,8 +76,8 @@ def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: 
             continue
         if section.name in pictures:
             parts.append(f"![{section.axes[1]}]({pictures[section.name]})")
-        own = [row for row in rows if row.section == section.name]
-        cells = {name: [cell(row) for row in own] for name, cell in COLUMNS.items()}
+        section_rows = [row for row in rows if row.section == section.name]
+        cells = {name: [cell(row) for row in section_rows] for name, cell in COLUMNS.items()}
         cells = {name: column for name, column in cells.items() if any(column)}
         lines = [list(cells), ["---"] * len(cells), *zip(*cells.values(), strict=True)]
         parts.append("\n".join(f"| {' | '.join(line)} |".replace("  ", " ") for line in lines))

@@ -38,9 +38,9 @@ def mujoco_differences() -> dict[str, float]:
         sim.step(500)
         s = state_of(sim)
     quat = np.roll(s["quat"], 1)
-    found = {"pos": s["pos"], "vel": s["vel"], "quat": quat * np.sign(quat @ data.qpos[3:]), "ang_vel": s["ang_vel"]}
-    known = {"pos": data.qpos[:3], "vel": data.qvel[:3], "quat": data.qpos[3:], "ang_vel": data.qvel[3:]}
-    return {k: float(np.max(np.abs(x - known[k]))) for k, x in found.items()}
+    ours = {"pos": s["pos"], "vel": s["vel"], "quat": quat * np.sign(quat @ data.qpos[3:]), "ang_vel": s["ang_vel"]}
+    reference = {"pos": data.qpos[:3], "vel": data.qvel[:3], "quat": data.qpos[3:], "ang_vel": data.qvel[3:]}
+    return {k: float(np.max(np.abs(x - reference[k]))) for k, x in ours.items()}
 
 
 def compare_with_mujoco() -> Iterable[Row]:
@@ -68,7 +68,7 @@ def compare_with_crazyflow() -> Iterable[Row]:
             getattr(sim, f"{level}_control")(command)
             sim.step(1000)
             ends.append(np.asarray(sim.data.states.pos)[0, 0])
-        moved = np.linalg.norm(ends[1] - [0, 0, 5.0])
+        distance = np.linalg.norm(ends[1] - [0, 0, 5.0])
         # rounding of float32 in 1,000 steps, as between the peer's own precisions (tests/golden)
-        yield Row(f"{level} commands, 2 s, {moved:.2f} m from the start: distance", "Crazyflow, `cf21B_500`",
+        yield Row(f"{level} commands, 2 s, {distance:.2f} m from the start: distance", "Crazyflow, `cf21B_500`",
                   float(np.linalg.norm(ends[0] - ends[1])), "m", (0, 1e-3))  # fmt: skip

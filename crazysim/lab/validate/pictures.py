@@ -34,19 +34,21 @@ def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
     rows = [row for row in rows if row.series and not row.problem]
     units = list(dict.fromkeys(row.unit for row in rows))
     colours = {series: f"C{k}" for k, series in enumerate(dict.fromkeys(row.series for row in rows))}
-    named = isinstance(rows[0].at, str)
-    figure = Figure(figsize=(9, 4 if named else 4.8), layout="constrained")
+    has_names = isinstance(rows[0].at, str)
+    figure = Figure(figsize=(9, 4 if has_names else 4.8), layout="constrained")
     for axis, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
-        own = [row for row in rows if row.unit == unit]
-        places = list(dict.fromkeys(row.at for row in own))
-        for series in dict.fromkeys(row.series for row in own):
-            points = [(places.index(row.at) if named else row.at, row.figure) for row in own if row.series == series]
-            line = "" if named else "--" if series.startswith("published") else "-"
+        unit_rows = [row for row in rows if row.unit == unit]
+        places = list(dict.fromkeys(row.at for row in unit_rows))
+        for series in dict.fromkeys(row.series for row in unit_rows):
+            points = [
+                (places.index(row.at) if has_names else row.at, row.figure) for row in unit_rows if row.series == series
+            ]
+            line = "" if has_names else "--" if series.startswith("published") else "-"
             style = {"marker": "o", "linestyle": line, "markersize": 4, "linewidth": 1.2}
             axis.plot(*zip(*points, strict=True), label=series, color=colours[series], **style)
-        if named:
+        if has_names:
             axis.set_xticks(range(len(places)), places, rotation=90 if len(places) > 12 else 20, fontsize=7)
-            low, high = next(row.bound for row in own if row.bound is not None)
+            low, high = next(row.bound for row in unit_rows if row.bound is not None)
             axis.axhspan(max(low, 0), high, color="0.93", zorder=0, label="passes")
             axis.legend(fontsize=7)
         else:

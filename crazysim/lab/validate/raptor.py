@@ -67,10 +67,10 @@ class Pilot:
         """
         weight = (self._made - 1) % self._calls
         self._mean = (weight * self._mean + self._action) / (weight + 1)
-        kept = self._memory.state
+        memory = self._memory.state
         self._action = self._policy.evaluate_step(np.concatenate([state, self._mean], axis=-1))
         if self._made % self._calls:
-            self._memory.state = kept
+            self._memory.state = memory
         self._made += 1
         return self._action
 
@@ -229,26 +229,26 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
     batch.initial_state(device, world, parameters, state)
     start = np.resize(np.random.default_rng(0).uniform(-0.5, 0.5, (STARTS, 3)), (n, 3))
     for i in range(n):
-        one = json.loads(l2f.parameters_to_json(device, world.environments[i], parameters.parameters[i]))
-        one["integration"]["dt"] = STEP / 1000
-        signs = np.sign(one["dynamics"]["rotor_positions"])
-        own = {
+        parameter_file = json.loads(l2f.parameters_to_json(device, world.environments[i], parameters.parameters[i]))
+        parameter_file["integration"]["dt"] = STEP / 1000
+        signs = np.sign(parameter_file["dynamics"]["rotor_positions"])
+        parameters_of_drone = {
             "mass": q.mass[i], "rotor_positions": q.arm[i] * signs, "J": np.diag(q.inertia[i]),
             "J_inv": np.diag(1 / q.inertia[i]), "rotor_thrust_coefficients": np.tile([0, 0, q.thrust[i]], (4, 1)),
             "rotor_torque_constants": np.full(4, q.torque[i]), "rotor_time_constants_rising": np.full(4, q.lag[i, 0]),
             "rotor_time_constants_falling": np.full(4, q.lag[i, 1]),
         }  # fmt: skip
-        one["dynamics"] |= {name: np.asarray(value).tolist() for name, value in own.items()}
-        l2f.parameters_from_json(device, world.environments[i], json.dumps(one), parameters.parameters[i])
+        parameter_file["dynamics"] |= {name: np.asarray(value).tolist() for name, value in parameters_of_drone.items()}
+        l2f.parameters_from_json(device, world.environments[i], json.dumps(parameter_file), parameters.parameters[i])
         drone = state.states[i]
         drone.position, drone.orientation, drone.rpm = start[i].tolist(), [1, 0, 0, 0], ((q.hover[i] + 1) / 2).tolist()
         drone.linear_velocity = drone.angular_velocity = [0, 0, 0]
-    seen = np.zeros((n, world.OBSERVATION_DIM), np.float32)
+    observed = np.zeros((n, world.OBSERVATION_DIM), np.float32)
     sent = [q.hover] * delay
 
     def observe() -> np.ndarray:
-        batch.observe(device, world, parameters, state, seen, rng)
-        return seen[:, :18].astype(np.float64)
+        batch.observe(device, world, parameters, state, observed, rng)
+        return observed[:, :18].astype(np.float64)
 
     def fly(action: np.ndarray) -> None:
         for _ in range(period // STEP):
@@ -264,10 +264,10 @@ def compare_training_airframes() -> Iterable[Row]:
     quadrotors = Quadrotors.sample()
     for period in PERIODS:
         for delay in (0, 2, 6, 10):
-            here, there = (
+            ours, theirs = (
                 100 * np.mean(fly(quadrotors, delay // STEP, period)) for fly in (hold_in_crazysim, hold_in_l2f)
             )
             # rounding decides over quadrotors at the edge of stability: 5 of 256 are 2 points
-            yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim beside l2f",
-                      "256 quadrotors of the training", float(abs(here - there)), "points", (0, 2),
-                      f"{here:.1f} % here, {there:.1f} % in l2f")  # fmt: skip
+            yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim and l2f",
+                      "256 quadrotors of the training", float(abs(ours - theirs)), "points", (0, 2),
+                      f"{ours:.1f} % here, {theirs:.1f} % in l2f")  # fmt: skip

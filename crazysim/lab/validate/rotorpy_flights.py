@@ -105,14 +105,14 @@ def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False
     return states
 
 
-def state_differences(one: dict[str, NDArray], other: dict[str, NDArray]) -> dict[str, float]:
+def state_differences(a: dict[str, NDArray], b: dict[str, NDArray]) -> dict[str, float]:
     """Return the differences of two states: of ``quat`` the angle, degrees, of others the length."""
-    found = {name: float(np.linalg.norm(one[name] - other[name])) for name in one}
-    return found | {"quat": math.degrees(angle_between(one["quat"], other["quat"]))}
+    differences = {name: float(np.linalg.norm(a[name] - b[name])) for name in a}
+    return differences | {"quat": math.degrees(angle_between(a["quat"], b["quat"]))}
 
 
 def wrenches(params: dict[str, Any], speed: float, n: int = 100) -> tuple[NDArray, NDArray]:
-    """Return what forces of the air add to the thrusts and torques of rotors in ``n`` states, ours and RotorPy's.
+    """Return the additional forces and torques of the air in ``n`` states, ours and RotorPy's.
 
     Args:
         params: Parameters.
@@ -146,30 +146,38 @@ def compare_with_rotorpy() -> Iterable[Row]:
     commands = hover_speed(params) * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (20, 4)))
     with jax.enable_x64(True):
         ours, theirs = flight(params, commands[:10]), rotorpy_flight(params, commands[:10])
-        apart = state_differences(ours[-1], theirs[-1])
+        differences = state_differences(ours[-1], theirs[-1])
         drag_only = flight(params, commands, [Wind(WIND)], drag=True)
         ours = flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
         theirs = rotorpy_flight(params, commands, aero=True)
         slow, fast = (wrenches(params, speed) for speed in (0.1, 3.0))
-    # RotorPy's integrator keeps 1e-10 of each state in each of some 100 steps
+    # RotorPy's integrator keeps 1e-10 of each state in each of about 100 steps
     for name, what, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
                                     ("ang_vel", "angular velocity", "rad/s", 1e-8),
                                     ("rotor_vel", "rotor speeds", "rpm", 1e-4)):  # fmt: skip
-        yield Row(f"flight without air, 1 s: {what}", "RotorPy", apart[name], unit, (0, bound))
-    mine, known = fast
-    for what, at, unit in (("force across the rotors", [0, 1], "N"), ("yaw torque", [5], "N m")):
-        size = f"RotorPy: up to {np.abs(known[:, at]).max():.2g} {unit}"
+        yield Row(f"flight without air, 1 s: {what}", "RotorPy", differences[name], unit, (0, bound))
+    our_wrench, their_wrench = fast
+    for what, axes, unit in (("force across the rotors", [0, 1], "N"), ("yaw torque", [5], "N m")):
+        size = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
         yield Row(
-            f"air at up to 3 m/s: {what}", "RotorPy", float(np.abs(mine - known)[:, at].max()), unit, (0, 1e-15), size
+            f"air at up to 3 m/s: {what}",
+            "RotorPy",
+            float(np.abs(our_wrench - their_wrench)[:, axes].max()),
+            unit,
+            (0, 1e-15),
+            size,
         )
-    for speed, (mine, known) in ((0.1, slow), (3.0, fast)):
-        for what, at, unit in (("force along the rotors", [2], "N"), ("roll and pitch torque", [3, 4], "N m")):
-            size = f"RotorPy: up to {np.abs(known[:, at]).max():.2g} {unit}"
-            apart_at = float(np.abs(mine - known)[:, at].max())
+    for speed, (our_wrench, their_wrench) in ((0.1, slow), (3.0, fast)):
+        for what, axes, unit in (("force along the rotors", [2], "N"), ("roll and pitch torque", [3, 4], "N m")):
+            size = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
+            apart_at = float(np.abs(our_wrench - their_wrench)[:, axes].max())
             yield Row(f"air at up to {speed:g} m/s: {what}", "RotorPy", apart_at, unit, None, size)
     for seconds in (1, 2):
         k = round(seconds / PERIOD) - 1
-        apart, simple = state_differences(ours[k], theirs[k]), state_differences(drag_only[k], theirs[k])
+        differences, drag_only_differences = (
+            state_differences(ours[k], theirs[k]),
+            state_differences(drag_only[k], theirs[k]),
+        )
         for name, what, unit in (("pos", "position", "m"), ("quat", "attitude", "degrees")):
-            other = f"linear drag alone: {simple[name]:.3g} {unit}"
-            yield Row(f"flight in wind, {seconds} s: {what}", "RotorPy", apart[name], unit, None, other)
+            remark = f"linear drag alone: {drag_only_differences[name]:.3g} {unit}"
+            yield Row(f"flight in wind, {seconds} s: {what}", "RotorPy", differences[name], unit, None, remark)

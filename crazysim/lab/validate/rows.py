@@ -72,8 +72,8 @@ class Section:
     @property
     def missing(self) -> str:
         """Reason why the section cannot be measured, or an empty text."""
-        needed = [name for package, name in self.packages.items() if importlib.util.find_spec(package) is None]
-        return f"run `pip install {' '.join(needed)}`" if needed else self.absent
+        missing = [name for package, name in self.packages.items() if importlib.util.find_spec(package) is None]
+        return f"run `pip install {' '.join(missing)}`" if missing else self.absent
 
 
 def measure(sections: Sequence[Section]) -> list[Row]:
@@ -81,15 +81,15 @@ def measure(sections: Sequence[Section]) -> list[Row]:
     rows: list[Row] = []
     tasks = [(section, check) for section in sections if not section.missing for check in section.checks]
     for section, check in progress_bar(tasks, "validating", "check"):
-        found: list[Row] = []
+        measured: list[Row] = []
         try:
-            found += check()
+            measured += check()
         except Exception as error:  # one broken comparison must not hide the others
-            named = check.func if isinstance(check, functools.partial) else check
-            label = getattr(named, "__name__", section.title).replace("_", " ")
+            check_fn = check.func if isinstance(check, functools.partial) else check
+            label = getattr(check_fn, "__name__", section.title).replace("_", " ")
             text = str(error).partition("\n")[0][:300] or type(error).__name__
-            found.append(
+            measured.append(
                 Row(label, "", problem=text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}")
             )
-        rows += [dataclasses.replace(row, section=section.name) for row in found]
+        rows += [dataclasses.replace(row, section=section.name) for row in measured]
     return rows

@@ -110,11 +110,7 @@ class FreeBodies(Population):
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
-        """Shape of each body.
-
-        Raises:
-            ConfigError: If a size is neither a radius nor three lengths.
-        """
+        """Shape of each body."""
         n, size = self.n_members, self.size
         if n > MAX_BODIES:
             raise ConfigError(f"expected at most {MAX_BODIES} bodies in a world, got {n}. Use fewer, and more worlds.")
@@ -137,7 +133,7 @@ class FreeBodies(Population):
         others = [p.name for p in sim.scene.plugins() if isinstance(p, FreeBodies) and p.name != self.name]
         if others:
             raise ConfigError(
-                f"expected one FreeBodies in a simulation, got a second beside {others[0]!r}. Use "
+                f"expected one FreeBodies in a simulation, got a second next to {others[0]!r}. Use "
                 f"FreeBodies(n, size=[...]) with a size for each body."
             )
         check_softness(sim.data.core.freq, self.softness)
@@ -206,7 +202,6 @@ class FreeBodies(Population):
         return record.replace(quat=rotation.safe_normalize(record.quat, identity))
 
     def move_objects(self, data: SimData) -> Objects:
-        """Return the scene's objects with the bodies at their poses; of one world."""
         record = self.read(data)
         return data.objects.with_poses({self.name: (record.pos, record.quat)})  # type: ignore[union-attr]
 

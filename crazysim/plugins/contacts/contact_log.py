@@ -69,16 +69,16 @@ class ContactLog(Plugin):
 
         Two, because a stage of one world computes everything for all its drones.
         """
-        names, found = self._names(sim), []
-        moved = moving_plugins(sim.scene.plugins(), names)
-        others = [name for name in names if name not in moved]
+        names, placements = self._names(sim), []
+        movers = moving_plugins(sim.scene.plugins(), names)
+        others = [name for name in names if name not in movers]
         if others or self.floor or self.drones:
-            alone = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
-            found.append(StagePlacement(alone, before="increment_steps"))
-        if moved:
-            together = self._stage(sim.scene.contact_fn(list(moved), floor=False, drones=False), "world")
-            found.append(StagePlacement(together, before="increment_steps", name=f"{self.name}_of_moved"))
-        return found
+            drone_stage = self._stage(sim.scene.contact_fn(others, self.floor, self.drones), "drone")
+            placements.append(StagePlacement(drone_stage, before="increment_steps"))
+        if movers:
+            together = self._stage(sim.scene.contact_fn(list(movers), floor=False, drones=False), "world")
+            placements.append(StagePlacement(together, before="increment_steps", name=f"{self.name}_of_moved"))
+        return placements
 
     def _names(self, sim: Simulation) -> tuple[str, ...]:
         return tuple(body.name for body in select_bodies(sim.scene.collision_model, self.objects))

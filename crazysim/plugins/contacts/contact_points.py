@@ -65,7 +65,7 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection
         without: Names of populations that are left out.
     """
     model = sim.scene.collision_model
-    found = [Carrier(None, None, tuple(model.floor))] if model.floor else []
+    carriers = [Carrier(None, None, tuple(model.floor))] if model.floor else []
     moved_kinds = {kind for plugin in sim.scene.plugins() for kind in plugin.moved_kinds or ()}
     members = populations(sim.data)
     for body in select_bodies(model, objects):
@@ -73,10 +73,10 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection
         if kind in without:
             continue
         if kind in members and hasattr(members[kind], "ang_vel"):
-            found.append(Carrier(kind, int(number), body.geoms))
+            carriers.append(Carrier(kind, int(number), body.geoms))
         elif kind not in moved_kinds:
-            found.append(Carrier(None, body.row, body.geoms))
-    return found
+            carriers.append(Carrier(None, body.row, body.geoms))
+    return carriers
 
 
 def find_surfaces(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
@@ -125,7 +125,7 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
     middles = [jnp.asarray(box[:3] + np.array([0, 0, side * (1 - PLATE_SHARE) * box[5]]), dtype) for side in (-1, 1)]
     turn = quat[..., None, :]
     in_world = pos[..., None, :] + rotation.rotate(turn, corners)
-    found = []
+    points = []
     for surface in surfaces:
         geom = surface.geom
         into, back, vel = _geom_frame(data, surface)
@@ -133,15 +133,15 @@ def contact_points(data: SimData, surfaces: list[Surface], box: np.ndarray) -> C
         if geom.shape.kind == "hfield":
             gap, normal = _height_above_field(data, geom, in_world, into, back)
             normal = rotation.rotate_inverse(turn, normal)
-            found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+            points.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
         if geom.shape.kind in FLAT_KINDS:
             gap, pull = jax.vjp(lambda p, s=geom.shape: point_distance(s, p), into(in_world, True))
             normal = rotation.rotate_inverse(turn, back(pull(jnp.ones_like(gap))[0]))
-            found.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
+            points.append(ContactPoints(gap, normal, *(jnp.broadcast_to(x, normal.shape) for x in (corners, still))))
         if geom.shape.kind not in ("plane", "hfield"):
-            found += [_nearest_plate_point(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
-    joined = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*found, strict=True)))
-    return ContactPoints(*joined)
+            points += [_nearest_plate_point(data, geom, into, plate, middle, still[..., :1, :]) for middle in middles]
+    arrays = (jnp.concatenate(xs, axis=-1 if k == 0 else -2) for k, xs in enumerate(zip(*points, strict=True)))
+    return ContactPoints(*arrays)
 
 
 def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surface]) -> ContactPoints:
@@ -203,13 +203,13 @@ def _nearest_plate_point(
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
-    def pose(move: Array, turned: Array) -> tuple[Array, Array]:
-        q = rotation.turn(quat, turned, 1.0, normalize=False)
+    def pose(move: Array, turn: Array) -> tuple[Array, Array]:
+        q = rotation.turn(quat, turn, 1.0, normalize=False)
         columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
         return into(pos + move + rotation.rotate(q, middle), True), jnp.stack(columns, axis=-1)
 
-    at, pull_back = jax.vjp(pose, jnp.zeros_like(pos), jnp.zeros_like(pos))
-    gap, slopes = _distance_and_slopes(shape, geom.shape, *at)
+    frame, pull_back = jax.vjp(pose, jnp.zeros_like(pos), jnp.zeros_like(pos))
+    gap, slopes = _distance_and_slopes(shape, geom.shape, *frame)
     force, torque = pull_back(slopes)
     normal = rotation.rotate_inverse(quat, force)
     reach = jnp.sum(jnp.abs(normal) * jnp.asarray(shape.size, pos.dtype), axis=-1, keepdims=True)
@@ -240,7 +240,7 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
     """
     geom, row = surface.geom, surface.row
     dtype = data.states.pos.dtype
-    at = jnp.asarray(geom.pos, dtype)
+    pos = jnp.asarray(geom.pos, dtype)
     rot = None if geom.rot is None else jnp.asarray(geom.rot, dtype)
     own_pos = own_quat = vel = spin = None
     if surface.population is not None:
@@ -256,7 +256,7 @@ def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Ca
     def into(x: Array, is_point: bool) -> Array:
         if own_quat is not None and own_pos is not None:
             x = rotation.rotate_inverse(own_quat[..., None, :], x - own_pos[..., None, :] if is_point else x)
-        x = x - at if is_point else x
+        x = x - pos if is_point else x
         return x if rot is None else rotation.matvec(rot.T, x)
 
     def back(x: Array) -> Array:

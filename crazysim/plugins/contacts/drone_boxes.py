@@ -25,14 +25,14 @@ def collision_boxes(sim: Simulation) -> DroneBoxes:
     return list(zip(kinds, boxes, strict=True))
 
 
-def select_airframe(found: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
+def select_airframe(results: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
     """Return for each drone the result for its airframe.
 
     Args:
-        found: Results for drones of each airframe: trees of arrays of one drone, or (..., n_drones, k).
+        results: Results for drones of each airframe: trees of arrays of one drone, or (..., n_drones, k).
         drone_id: Indices of the drones. () or (n_drones,)
     """
-    (_, result), *others = found
+    (_, result), *others = results
     for kind, other in others:
         present: Any = kind.drone_mask(drone_id)
         mask = present[..., None] if present.ndim else present

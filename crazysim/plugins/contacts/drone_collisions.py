@@ -82,8 +82,8 @@ class DroneCollisions(Plugin):
             record = self.read(data)
             pos, rot = drones_as_boxes(data, boxes)
             solids = Solids(np.arange(n), np.zeros(n, bool), boxes[:, 3:], pos, rot)
-            each = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
-            contacts = join_contacts(contacts_between(solids, pairs), *each)
+            surface = (jnp.broadcast_to(x, (n,)) for x in (record.friction, record.restitution))
+            contacts = join_contacts(contacts_between(solids, pairs), *surface)
             before, dt = Impulses(record.press, record.drag), 1 / data.core.freq
             solved = solve_contacts(drones_as_bodies(data), contacts, before, dt, self.softness, self.iterations)
             changes: Any = {"impulse": solved.impulse, "press": solved.at.press, "drag": solved.at.drag}

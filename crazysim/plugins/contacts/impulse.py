@@ -66,35 +66,40 @@ def velocity_after_contact(
         return out, rotation.safe_norm(vel - out[..., None] * n)[..., 0]
 
     fast = active & (-slip(before)[0] > BOUNCE_SPEED)
-    wanted = jnp.where(fast, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
+    target_speed = jnp.where(fast, 0.0, jnp.minimum(-points.gap / material.softness, MAX_PUSH_SPEED))
 
     def turn(k: Array, u: Array) -> Array:
         out, aside = slip(u)
-        pressed = active & (out < wanted)
-        push = jnp.where(pressed, stiff * (wanted - out), 0.0)
+        pressed = active & (out < target_speed)
+        push = jnp.where(pressed, stiff * (target_speed - out), 0.0)
         w_n = jnp.where(pressed, stiff, 0.0)
         # The first push stops the whole fall at every point: the friction force is known from the second on.
         w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, material.friction * push / (aside + STICKING_SPEED)))
-        rest = w_n - w_t
-        steep = jnp.sum(rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
+        w_rest = w_n - w_t
+        steep = jnp.sum(w_rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
         matrix = inertia + _weighted_inertia(w_t, p, n.dtype) + steep
-        held = w_t[..., None] * _with_torque(s, p)
-        driven = (rest * along + w_n * wanted)[..., None] * row
-        return solve_symmetric(matrix, rotation.matvec(inertia, before) + jnp.sum(held + driven, axis=-2))
+        friction_pull = w_t[..., None] * _with_torque(s, p)
+        normal_pull = (w_rest * along + w_n * target_speed)[..., None] * row
+        return solve_symmetric(matrix, rotation.matvec(inertia, before) + jnp.sum(friction_pull + normal_pull, axis=-2))
 
     after = jax.lax.fori_loop(0, iterations, turn, before)
-    push = jnp.where(active, stiff * jnp.maximum(wanted - slip(after)[0], 0.0), 0.0)
+    push = jnp.where(active, stiff * jnp.maximum(target_speed - slip(after)[0], 0.0), 0.0)
     after = after + material.restitution * solve_symmetric(
         inertia, jnp.sum(jnp.where(fast, push, 0.0)[..., None] * row, axis=-2)
     )
     # Energy is measured relative to the surfaces that push.
     total = jnp.sum(push, axis=-1, keepdims=True)
-    seen = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
-    seen = seen if p is None else jnp.concatenate([seen, jnp.zeros_like(seen)], axis=-1)
-    had, has = (rotation.dot(u - seen, rotation.matvec(inertia, u - seen)) for u in (before, after))
-    most = had + mass * MAX_PUSH_SPEED**2
+    surface_vel = jnp.sum(push[..., None] * s, axis=-2) / jnp.where(total > 0, total, 1.0)
+    surface_vel = surface_vel if p is None else jnp.concatenate([surface_vel, jnp.zeros_like(surface_vel)], axis=-1)
+    energy_before, energy_after = (
+        rotation.dot(u - surface_vel, rotation.matvec(inertia, u - surface_vel)) for u in (before, after)
+    )
+    max_energy = energy_before + mass * MAX_PUSH_SPEED**2
     after = jnp.where(
-        has > most, seen + (after - seen) * rotation.safe_sqrt(most / jnp.where(has > 0, has, 1.0)), after
+        energy_after > max_energy,
+        surface_vel
+        + (after - surface_vel) * rotation.safe_sqrt(max_energy / jnp.where(energy_after > 0, energy_after, 1.0)),
+        after,
     )
     return jnp.where(jnp.any(active, axis=-1, keepdims=True), after, before)
 
@@ -123,6 +128,6 @@ def _weighted_inertia(weight: Array, p: Array | None, dtype: jnp.dtype) -> Array
     o = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
     square = jnp.sum(weight * jnp.sum(p * p, axis=-1), axis=-1)[..., None, None] * jnp.eye(3, dtype=p.dtype)
-    turned = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
+    angular = square - jnp.sum(weight[..., None, None] * p[..., None] * p[..., None, :], axis=-3)
     upper = jnp.concatenate([total, -cross], axis=-1)
-    return jnp.concatenate([upper, jnp.concatenate([cross, turned], axis=-1)], axis=-2)
+    return jnp.concatenate([upper, jnp.concatenate([cross, angular], axis=-1)], axis=-2)

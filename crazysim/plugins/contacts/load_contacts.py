@@ -54,8 +54,8 @@ def stop_loads(
     body = collider.body(data)
     # A load of a whole world takes the material of its first drone.
     material = Material(*(x[:1] if x.ndim > 1 else x for x in material))
-    points, one = load_points(data, body, collider.shape, surfaces), jnp.ones_like(body.mass)
-    vel = velocity_after_contact(points, body.vel, one, inertia_matrix(one), material, iterations)
+    points, unit_mass = load_points(data, body, collider.shape, surfaces), jnp.ones_like(body.mass)
+    vel = velocity_after_contact(points, body.vel, unit_mass, inertia_matrix(unit_mass), material, iterations)
     vel = vel if body.exists is None else jnp.where(body.exists[..., None], vel, body.vel)
     return collider.with_vel(data, vel)
 
@@ -94,8 +94,8 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Dro
 
     def response(change: Array) -> Array:
         """Return the change of the relative velocity at the lever where the load's velocity changes, m/s."""
-        turned = rotation.matvec(p.J_inv, rotation.cross(lever, change))
-        return change + mass * (change / p.mass + rotation.cross(turned, lever))
+        ang_vel_change = rotation.matvec(p.J_inv, rotation.cross(lever, change))
+        return change + mass * (change / p.mass + rotation.cross(ang_vel_change, lever))
 
     vel = rotation.rotate_inverse(quat, body.vel[:, None] - s.vel) - rotation.cross(s.ang_vel[None], lever)
     change = velocity_change(gap, normal, vel, material, response)
@@ -103,10 +103,10 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Dro
     share = jnp.where(touches, 1 / jnp.maximum(jnp.maximum(n_load, n_drone), 1.0), 0.0)[..., None]
     change = share * change
 
-    turned = rotation.matvec(p.J_inv, rotation.cross(lever, change))
+    turn_rate = rotation.matvec(p.J_inv, rotation.cross(lever, change))
     change = rotation.rotate(quat, change)
     impulse = -jnp.sum(mass * change, axis=0)
-    states = s.replace(vel=s.vel + impulse / p.mass, ang_vel=s.ang_vel - jnp.sum(mass * turned, axis=0))
+    states = s.replace(vel=s.vel + impulse / p.mass, ang_vel=s.ang_vel - jnp.sum(mass * turn_rate, axis=0))
     data = collider.with_vel(data, body.vel + jnp.sum(change, axis=1))
     return data.replace(states=states), impulse
 
@@ -114,7 +114,7 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Dro
 def velocity_change(
     gap: Array, normal: Array, vel: Array, material: Material, response: Callable[[Array], Array]
 ) -> Array:
-    """Return what a contact changes of the velocity of a body; the other body responds to it. (..., 3)
+    """Return the change of a body's velocity by a contact; the other body responds to it. (..., 3)
 
     Args:
         gap: Distance of the bodies, negative where they overlap, m. (...)
@@ -125,11 +125,11 @@ def velocity_change(
     """
     out = rotation.dot(vel, normal)
     pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)
-    wanted = jnp.where(out < -BOUNCE_SPEED, -material.restitution * out, pushed_out)
-    moved = response(normal)
+    target_speed = jnp.where(out < -BOUNCE_SPEED, -material.restitution * out, pushed_out)
+    response_along = response(normal)
     # At least one, except where the normal is zero: between balls with one centre.
-    speed = jnp.maximum(wanted - out, 0.0) / jnp.maximum(rotation.dot(normal, moved), 1.0)
-    vel = vel + speed * moved
+    speed = jnp.maximum(target_speed - out, 0.0) / jnp.maximum(rotation.dot(normal, response_along), 1.0)
+    vel = vel + speed * response_along
     slip = vel - rotation.dot(vel, normal) * normal
     fast = rotation.safe_norm(slip)
     along = slip / (fast + STICKING_SPEED)
@@ -151,7 +151,7 @@ class _PairContacts(NamedTuple):
 def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Material) -> SimData:
     """Return one world after the impulses of loads and hooks on each other.
 
-    They are point masses, so an impulse changes velocities and turns nothing. Momentum is kept. The impulse has a
+    They are point masses, so an impulse changes velocities only. Momentum is conserved. The impulse has a
     normal part with restitution, and friction, limited by Coulomb's law and by what stops the slip. Where a body has
     several contacts, each counts by its share, so that together they create no energy. What the impulse does to a
     drone on a taut link follows in the next step, from the constraint.
@@ -163,14 +163,14 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     """
     groups = list(combinations_with_replacement(range(len(colliders)), 2))
     material = Material(*(x.reshape(-1)[:1] for x in material))
-    found = {(a, b): _pair_contacts(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
+    contacts = {(a, b): _pair_contacts(data, colliders[a], colliders[b], material, same=a == b) for a, b in groups}
     n_touches: list[Any] = [
-        sum(pairs.touches.sum(axis=1) for (a, _), pairs in found.items() if a == k)
-        + sum(pairs.touches.sum(axis=0) for (_, b), pairs in found.items() if b == k)
+        sum(pairs.touches.sum(axis=1) for (a, _), pairs in contacts.items() if a == k)
+        + sum(pairs.touches.sum(axis=0) for (_, b), pairs in contacts.items() if b == k)
         for k in range(len(colliders))
     ]
     changes: list[Array | float] = [0.0] * len(colliders)
-    for (a, b), pairs in found.items():
+    for (a, b), pairs in contacts.items():
         n = jnp.maximum(n_touches[a][:, None], n_touches[b][None])
         share = jnp.where(pairs.touches, 1 / jnp.maximum(n, 1), 0.0)[..., None].astype(pairs.first.dtype)
         changes[a] = changes[a] + jnp.sum(share * pairs.first, axis=1)

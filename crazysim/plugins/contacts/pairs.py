@@ -51,7 +51,7 @@ class PairContacts(NamedTuple):
 
 def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
     """Return the contact points of pairs of solids. (n_pairs, 2)"""
-    found = []
+    contacts = []
     kinds = solids.is_ball[pairs]
     for first, second in ((True, True), (True, False), (False, True), (False, False)):
         of_kind = pairs[(kinds[:, 0] == first) & (kinds[:, 1] == second)]
@@ -69,8 +69,8 @@ def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
             points = jax.vmap(box_contacts)(
                 size[a], solids.pos[a], solids.rot[a], size[b], solids.pos[b], solids.rot[b]
             )
-        found.append(PairContacts(solids.body[a], solids.body[b], _flatten_manifolds(points)))
-    return found
+        contacts.append(PairContacts(solids.body[a], solids.body[b], _flatten_manifolds(points)))
+    return contacts
 
 
 def contacts_on_surface(
@@ -85,18 +85,18 @@ def contacts_on_surface(
         carrier: Number of the body that carries it.
         pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
     """
-    (at, turn), shape = pose, geom.shape
+    (surface_pos, surface_rot), shape = pose, geom.shape
 
     def gap_at(points: Array) -> tuple[Array, Array]:
-        gap, normal = _distance_and_normal(shape, matvec(turn.T, points - at))
-        return gap, matvec(turn, normal)
+        gap, normal = _distance_and_normal(shape, matvec(surface_rot.T, points - surface_pos))
+        return gap, matvec(surface_rot, normal)
 
-    found = contacts_on_ground(solids, number, carrier, gap_at)
+    contacts = contacts_on_ground(solids, number, carrier, gap_at)
     if solids.is_ball[number] or shape.kind == "plane":
-        return found
+        return contacts
     box = Shape("box", tuple(map(float, solids.size[number])))
-    nearest = _nearest_point(box, solids.pos[number], solids.rot[number], shape, at, turn)
-    return found._replace(points=Manifold(*(jnp.concatenate(x) for x in zip(found.points, nearest, strict=True))))
+    nearest = _nearest_point(box, solids.pos[number], solids.rot[number], shape, surface_pos, surface_rot)
+    return contacts._replace(points=Manifold(*(jnp.concatenate(x) for x in zip(contacts.points, nearest, strict=True))))
 
 
 def contacts_on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn) -> PairContacts:
@@ -106,34 +106,34 @@ def contacts_on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn)
         radius = float(solids.size[number, 0])
         gap, normal = gap_at(pos[None])
         gap = gap - radius
-        found = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
+        manifold = Manifold(gap, normal, pos - normal * (radius + 0.5 * gap[:, None]))
     else:
         corners = pos + matvec(rot, jnp.asarray(CORNERS * solids.size[number], pos.dtype))
-        found = Manifold(*gap_at(corners), corners)
-    return PairContacts(solids.body[number : number + 1], np.array([carrier]), found)
+        manifold = Manifold(*gap_at(corners), corners)
+    return PairContacts(solids.body[number : number + 1], np.array([carrier]), manifold)
 
 
-def join_contacts(found: list[PairContacts], friction: Array, restitution: Array) -> Contacts:
+def join_contacts(pairs: list[PairContacts], friction: Array, restitution: Array) -> Contacts:
     """Return all contact points, each with the larger friction and restitution of its two bodies, as MuJoCo combines.
 
     Args:
-        found: Contact points.
+        pairs: Contact points of pairs of bodies.
         friction: Coulomb's coefficients of the bodies, 1. (n,)
         restitution: Their coefficients of restitution, 1. (n,)
     """
-    found = sorted(found, key=_n_points)
-    first, second = (np.concatenate([f[k] for f in found]) for k in range(2))
-    n_points = np.concatenate([np.full(len(f.first), _n_points(f)) for f in found])
-    gap, normal, point = (jnp.concatenate([f.points[k] for f in found]) for k in range(3))
+    pairs = sorted(pairs, key=_n_points)
+    first, second = (np.concatenate([pair[k] for pair in pairs]) for k in range(2))
+    n_points = np.concatenate([np.full(len(pair.first), _n_points(pair)) for pair in pairs])
+    gap, normal, point = (jnp.concatenate([pair.points[k] for pair in pairs]) for k in range(3))
     mixed = (
         jnp.maximum(x[first], x[second])[np.repeat(np.arange(len(first)), n_points)] for x in (friction, restitution)
     )
     return Contacts(first, second, n_points, gap, normal, point, *mixed)
 
 
-def _n_points(found: PairContacts) -> int:
+def _n_points(contacts: PairContacts) -> int:
     """Return the number of points of each pair."""
-    return found.points.gap.shape[0] // len(found.first)
+    return contacts.points.gap.shape[0] // len(contacts.first)
 
 
 def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
@@ -145,8 +145,8 @@ def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
 def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: Array) -> Manifold:
     """Return the nearest point of a box and a shape; the gradient of the gap is the normal, and the lever times it."""
 
-    def gap_at(move: Array, turned: Array) -> Array:
-        spun = rot + jnp.stack([rotation.cross(turned, rot[:, k]) for k in range(3)], axis=-1)
+    def gap_at(move: Array, turn_offset: Array) -> Array:
+        spun = rot + jnp.stack([rotation.cross(turn_offset, rot[:, k]) for k in range(3)], axis=-1)
         columns = [matvec(turn.T, spun[:, k]) for k in range(3)]
         return distance(box, shape, matvec(turn.T, pos + move - at), jnp.stack(columns, axis=-1))
 

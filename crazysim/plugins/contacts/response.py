@@ -50,10 +50,10 @@ class ContactResponse(Plugin):
     """Response of floor and objects to contacts with drones and loads; replaces the stage ``clip_floor_pos``.
 
     Drones do not push each other (``DroneCollisions``), and objects do not move; drones ride on members of populations,
-    such as cars, that are in the scene at the time of adding. A drone that stands on the floor has its centre half its
-    collision box above it. Loads, and hooks that carry none, that are objects of the scene at the time of adding are
-    stopped by all objects but the flat floor, where they stop without it too. If they are among ``objects``, they
-    exchange impulses with drones and with each other.
+    such as cars, that are in the scene when the plugin is added. The centre of a drone that stands on the floor is half
+    the height of its collision box above the floor. Loads and empty hooks that are in the scene when the plugin is
+    added are stopped by all objects except the flat floor, where they also stop without this plugin. If they are among
+    ``objects``, they exchange impulses with drones and with each other.
     """
 
     objects: ObjectSelection = None
@@ -84,16 +84,16 @@ class ContactResponse(Plugin):
         surfaces = find_surfaces(sim, self.objects)
 
         def respond(data: SimData) -> SimData:
-            found = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
-            states, record = select_airframe(found, data.core.drone_id)
+            results = [(kind, _respond(data, self.read(data), surfaces, box, self.iterations)) for kind, box in boxes]
+            states, record = select_airframe(results, data.core.drone_id)
             return self.write(data.replace(states=states), record)
 
-        found = [StagePlacement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
+        placements = [StagePlacement(Stage(respond, "drone"), before="increment_steps", replaces="clip_floor_pos")]
         obstacles = [surface for surface in surfaces if not is_ground(surface)]
         hits = any(body.name in names for body in select_bodies(sim.scene.collision_model, self.objects))
         for plugin in plugins:
-            found += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
-        return found
+            placements += self._load_stages(plugin, obstacles, boxes if hits else [], sim.n_drones)
+        return placements
 
     def _load_stages(
         self, plugin: CollidingPlugin, obstacles: list[Surface], boxes: DroneBoxes, n_drones: int
@@ -131,14 +131,14 @@ class ContactResponse(Plugin):
                 return data
             return hit_each_other(data, colliders, self.read(data).material)
 
-        found = []
+        stages = []
         if obstacles:
-            found.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
+            stages.append((Stage(stop, plugin.coupling), f"{self.name}_of_{plugin.name}"))
         if boxes:
-            found.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
+            stages.append((Stage(hit, "world"), f"{self.name}_of_{plugin.name}_and_drones"))
             if meet:
-                found.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
-        return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in found]
+                stages.append((Stage(hit_others, "world"), f"{self.name}_between_{plugin.name}"))
+        return [StagePlacement(stage, before="increment_steps", name=name) for stage, name in stages]
 
 
 def _respond(

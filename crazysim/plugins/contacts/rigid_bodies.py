@@ -1,4 +1,4 @@
-"""Contact of free bodies within a step: which solids there are, and what their impulses change."""
+"""Contact of free bodies within a step: the solids, and the changes by their impulses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class BodyContacts:
     """Contacts of the free bodies of a simulation."""
 
     def __init__(self, sim: Simulation, plugin: Any):
-        """Collect the solids of the scene as they are now."""
+        """Collect the present solids of the scene."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
         self.boxes = drone_box_extents(sim)
@@ -75,16 +75,16 @@ class BodyContacts:
         bodies, first_carrier = self._bodies(data, record), n_free + n_drones
         solids = self._solids(data, record)
         dynamic = [k for k, body in enumerate(solids.body) if body < n_free]
-        found = contacts_between(solids, self._pairs(solids, n_free))
+        groups = contacts_between(solids, self._pairs(solids, n_free))
         for k, carrier in enumerate(self.carriers):
-            found += self._contacts_on_carrier(data, solids, dynamic, carrier, first_carrier + k)
-        if not found:
+            groups += self._contacts_on_carrier(data, solids, dynamic, carrier, first_carrier + k)
+        if not groups:
             return data
         size = bodies.pos.shape[0]
         friction, restitution = (
             jnp.concatenate([x[:, 0], jnp.zeros(size - n_free, x.dtype)]) for x in (record.friction, record.restitution)
         )
-        contacts = join_contacts(found, friction, restitution)
+        contacts = join_contacts(groups, friction, restitution)
         before = Impulses(record.press, record.drag)
         solved = solve_contacts(bodies, contacts, before, 1 / data.core.freq, plugin.softness, plugin.iterations)
         record = states_after_contact(record, solved, slice(n_free))
@@ -123,12 +123,12 @@ class BodyContacts:
         for k, carrier in enumerate(self.carriers):
             for geom in carrier.geoms:
                 if geom.shape.kind in EXACT_KINDS:
-                    at, turn = _geom_pose(data, carrier, geom, dtype)
+                    geom_pos, geom_rot = _geom_pose(data, carrier, geom, dtype)
                     owners.append(n_free + self.n_drones + k)
                     balls.append(geom.shape.kind == "sphere")
                     sizes.append(np.resize(geom.shape.size, 3))
-                    pos.append(at[None])
-                    rot.append(turn[None])
+                    pos.append(geom_pos[None])
+                    rot.append(geom_rot[None])
         return Solids(np.array(owners), np.array(balls), np.array(sizes), jnp.concatenate(pos), jnp.concatenate(rot))
 
     def _pairs(self, solids: Solids, n_free: int) -> np.ndarray:
@@ -140,17 +140,17 @@ class BodyContacts:
         self, data: SimData, solids: Solids, dynamic: list[int], carrier: Carrier, number: int
     ) -> list[PairContacts]:
         """Return the contacts of free bodies with the geoms of a carrier that are neither balls nor boxes."""
-        found = []
+        contacts = []
         for geom in carrier.geoms:
             terrain = data.plugins.get(geom.name) if carrier.row is None else None
             for k in dynamic if geom.shape.kind not in EXACT_KINDS else ():
                 if isinstance(terrain, TerrainData):
-                    found.append(contacts_on_ground(solids, k, number, terrain.gap_at))
+                    contacts.append(contacts_on_ground(solids, k, number, terrain.gap_at))
                 else:
-                    found.append(
+                    contacts.append(
                         contacts_on_surface(solids, k, geom, number, _geom_pose(data, carrier, geom, solids.pos.dtype))
                     )
-        return found
+        return contacts
 
 
 def require_few_contacts(n_contacts: int, among: str) -> int:
@@ -159,9 +159,6 @@ def require_few_contacts(n_contacts: int, among: str) -> int:
     Args:
         n_contacts: Number of contact points in a world.
         among: Bodies that they are of, for the message.
-
-    Raises:
-        ConfigError: If it is larger than ``MAX_CONTACTS``.
     """
     if n_contacts > MAX_CONTACTS:
         raise ConfigError(
@@ -179,8 +176,8 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
         solved: Bodies after contact.
         rows: Their numbers among these.
     """
-    ang_vel, turned = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.turned))
-    quat = rotation.turn(states.quat, turned, 1.0)
+    ang_vel, angle = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.turned))
+    quat = rotation.turn(states.quat, angle, 1.0)
     return states.replace(pos=solved.bodies.pos[rows], quat=quat, vel=solved.bodies.vel[rows], ang_vel=ang_vel)
 
 
@@ -226,8 +223,8 @@ def _geom_pose(data: SimData, carrier: Carrier, geom: CollisionGeom, dtype: jnp.
     """Return position and rotation matrix of a geom, world frame."""
     pos, quat, _, _ = _carrier_motion(data, carrier)
     rot = rotation.matrix(quat)
-    at = pos + matvec(rot, jnp.asarray(geom.pos, dtype))
-    return at, rot if geom.rot is None else matmul(rot, jnp.asarray(geom.rot, dtype))
+    geom_pos = pos + matvec(rot, jnp.asarray(geom.pos, dtype))
+    return geom_pos, rot if geom.rot is None else matmul(rot, jnp.asarray(geom.rot, dtype))
 
 
 def _rotate_diagonal(quat: Array, diagonal: Array) -> Array:

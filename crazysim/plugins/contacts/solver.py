@@ -59,11 +59,11 @@ class Contacts(NamedTuple):
 
     def sum_pairs(self, values: Array) -> Array:
         """Return the sums of values of the points over the points of every pair. (n_pairs, m)"""
-        found, end = [], 0
+        sums, end = [], 0
         for n_points, n_pairs in zip(*np.unique(self.n_points, return_counts=True), strict=True):
             start, end = end, end + n_points * n_pairs
-            found.append(jnp.sum(values[start:end].reshape(n_pairs, n_points, -1), axis=1))
-        return jnp.concatenate(found)
+            sums.append(jnp.sum(values[start:end].reshape(n_pairs, n_points, -1), axis=1))
+        return jnp.concatenate(sums)
 
 
 class Impulses(NamedTuple):
@@ -135,10 +135,10 @@ def solve_contacts(
 
     start = slip(bodies.vel, bodies.ang_vel)
     out = rotation.dot(start, normal)[:, 0]
-    near = contacts.gap < MAX_ACTING_GAP + dt * jnp.abs(out)
+    is_near = contacts.gap < MAX_ACTING_GAP + dt * jnp.abs(out)
     closes = jnp.minimum(-contacts.gap / dt, 0.0)
     bounces = (out < -BOUNCE_SPEED) & (contacts.gap + dt * out < 0)
-    wanted = jnp.where(bounces, -contacts.restitution * out, closes)
+    target_speed = jnp.where(bounces, -contacts.restitution * out, closes)
 
     along, across = jnp.zeros(k, dtype), jnp.zeros(k, dtype)
     for numbers, sum_of, lever in ((a, sums[0], arm), (b, sums[1], arm + offset[pair])):
@@ -147,7 +147,7 @@ def solve_contacts(
         spun = matmul(inverse, turn)
         of_normal = inv_mass + rotation.dot(rotation.cross(lever, normal), matvec(spun, normal))[:, 0]
         of_slip = 0.5 * (3 * inv_mass + jnp.sum(turn * spun, axis=(-2, -1)) - of_normal)
-        acts = near & (of_normal > 0)
+        acts = is_near & (of_normal > 0)
         n_weight, s_weight = (jnp.where(acts, 1 / jnp.where(acts, x, 1.0), 0.0) for x in (of_normal, of_slip))
         together = _shared_response(bodies, sum_of, contacts, normal, turn, n_weight, s_weight)[numbers][pair]
         along, across = along + together * of_normal, across + together * of_slip
@@ -159,7 +159,7 @@ def solve_contacts(
         y, z = press + ahead * (press - old.press), drag + ahead * (drag - old.drag)
         moving = start + slip(*change(y[:, None] * normal + z))
         speed = rotation.dot(moving, normal)[:, 0]
-        new = jnp.where(near, jnp.maximum(y + (wanted - speed) / along, 0.0), 0.0)
+        new = jnp.where(is_near, jnp.maximum(y + (target_speed - speed) / along, 0.0), 0.0)
         held = z - (moving - speed[:, None] * normal) / across[:, None]
         size, limit = rotation.safe_norm(held), (contacts.friction * new)[:, None]
         held = jnp.where(size > limit, held * (limit / jnp.where(size > 0, size, 1.0)), held)
@@ -167,31 +167,31 @@ def solve_contacts(
         rise = jnp.sum((y - new) * along * (new - press)) + jnp.sum((z - held) * across[:, None] * (held - drag))
         return Impulses(new, held), Impulses(press, drag), jnp.where(rise > 0, 0.0, age + 1)
 
-    press = jnp.where(near, before.press, 0.0)
-    drag = jnp.where(near[:, None], before.drag - rotation.dot(before.drag, normal) * normal, 0.0)
+    press = jnp.where(is_near, before.press, 0.0)
+    drag = jnp.where(is_near[:, None], before.drag - rotation.dot(before.drag, normal) * normal, 0.0)
     first = Impulses(press, drag)
-    at, *_ = jax.lax.fori_loop(0, iterations, turn_once, (first, first, jnp.zeros((), dtype)))
-    total = at.press[:, None] * normal + at.drag
+    impulses, *_ = jax.lax.fori_loop(0, iterations, turn_once, (first, first, jnp.zeros((), dtype)))
+    total = impulses.press[:, None] * normal + impulses.drag
     vel, ang_vel = change(total)
     share = _energy_share(total, start, slip(vel, ang_vel))
-    at, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (at, total, vel, ang_vel))
+    impulses, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (impulses, total, vel, ang_vel))
 
     # One step down the gradient, as far as the overlaps shrink; the next time step continues.
     leaves = out + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
     push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(leaves, 0.0)
     push = jnp.maximum(push, 0.0)
-    moved, turned = change((push / along)[:, None] * normal)
-    apart = jnp.sum(push / along * rotation.dot(slip(moved, turned), normal)[:, 0])
-    size = dt * jnp.sum(push / along * push) / jnp.where(apart > 0, apart, 1.0)
-    after = bodies._replace(pos=bodies.pos + size * moved, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel)
+    vel_change, ang_vel_change = change((push / along)[:, None] * normal)
+    slip_change = jnp.sum(push / along * rotation.dot(slip(vel_change, ang_vel_change), normal)[:, 0])
+    size = dt * jnp.sum(push / along * push) / jnp.where(slip_change > 0, slip_change, 1.0)
+    after = bodies._replace(pos=bodies.pos + size * vel_change, vel=bodies.vel + vel, ang_vel=bodies.ang_vel + ang_vel)
     impulse = _sum_for_bodies(sums[0] - sums[1], contacts.sum_pairs(total))
-    return SolvedBodies(after, size * turned, at, impulse)
+    return SolvedBodies(after, size * ang_vel_change, impulses, impulse)
 
 
 def _shared_response(
     bodies: Bodies, sum_of: Array, contacts: Contacts, normal: Array, turn: Array, along: Array, across: Array
 ) -> Array:
-    """Return for each body how many times more its contacts respond to all their impulses than each to its own. (n,)
+    """Return for each body the ratio of the responses of its contacts to all impulses and to their own alone. (n,)
 
     It is a bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, at most a quarter above it. ``M`` is the inertia
     of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` holds the inverse responses.
@@ -207,11 +207,11 @@ def _shared_response(
     """
     eye = jnp.eye(3, dtype=normal.dtype)
     weight = across[:, None, None] * eye + (along - across)[:, None, None] * normal[:, :, None] * normal[:, None]
-    turned = matmul(turn, weight)
-    upper = jnp.concatenate([weight, jnp.swapaxes(turned, -1, -2)], axis=-1)
-    lower = jnp.concatenate([turned, matmul(turned, jnp.swapaxes(turn, -1, -2))], axis=-1)
-    both = jnp.concatenate([upper, lower], axis=-2).reshape(-1, 36)
-    total = _sum_for_bodies(sum_of, contacts.sum_pairs(both)).reshape(-1, 6, 6)
+    angular = matmul(turn, weight)
+    upper = jnp.concatenate([weight, jnp.swapaxes(angular, -1, -2)], axis=-1)
+    lower = jnp.concatenate([angular, matmul(angular, jnp.swapaxes(turn, -1, -2))], axis=-1)
+    blocks = jnp.concatenate([upper, lower], axis=-2).reshape(-1, 36)
+    total = _sum_for_bodies(sum_of, contacts.sum_pairs(blocks)).reshape(-1, 6, 6)
     response = jnp.concatenate(
         [bodies.inv_mass[:, None, None] * total[:, :3], matmul(bodies.inv_inertia, total[:, 3:])], axis=-2
     )
@@ -223,7 +223,7 @@ def _shared_response(
 def _energy_share(impulse: Array, before: Array, change: Array) -> Array:
     """Return the share of impulses, at most one, with which they add no kinetic energy. ()
 
-    The energy that they add, in the frame of what cannot be pushed, is the sum of their products with the means of the
+    The energy that they add, in the frame of immovable bodies, is the sum of their products with the means of the
     contacts' velocities before and after them.
 
     Args:

@@ -82,8 +82,8 @@ class Terrain(Plugin):
 
     def _check_heights(self, sim: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return heights, full lengths along x and y, and the middle, m."""
-        given = self.heights
-        is_image = isinstance(given, (str, Path))
+        source = self.heights
+        is_image = isinstance(source, (str, Path))
         size, pos = np.asarray(self.size, np.float64), np.asarray(self.pos, np.float64)
         n = 3 if is_image else 2
         if size.shape != (n,):
@@ -91,7 +91,7 @@ class Terrain(Plugin):
                 f"expected size as {n} positive lengths, m, {'along x, y and z' if is_image else 'along x and y'}, "
                 f"got {self.size!r}"
             )
-        heights = size[2] * read_image(given) if isinstance(given, (str, Path)) else np.asarray(given, np.float64)
+        heights = size[2] * read_image(source) if isinstance(source, (str, Path)) else np.asarray(source, np.float64)
         if heights.ndim != 2 or min(heights.shape) < 2:
             raise ConfigError(
                 f"expected heights of two or more rows and columns, m, got shape {np.shape(heights)}. Use a 2-D array."
@@ -115,7 +115,7 @@ def read_image(path: str | Path) -> np.ndarray:
     MuJoCo reads it, with 8 bits per pixel.
 
     Raises:
-        ConfigError: If it is no image that MuJoCo can read.
+        ConfigError: If MuJoCo cannot read the file as an image.
     """
     content = read_bytes(path, MAX_FILE_BYTES)
     size = struct.unpack(">II", content[16:24]) if content[:8] == PNG_SIGNATURE and len(content) >= 24 else (0, 0)
@@ -135,7 +135,7 @@ def read_image(path: str | Path) -> np.ndarray:
 
 
 def _set_height_field(scene: Any, plugin: Terrain, heights: np.ndarray, size: np.ndarray, pos: np.ndarray) -> None:
-    """Put the height field into the scene, or change it where it is there already."""
+    """Add the height field to the scene, or change it if it exists already."""
     spec, lowest = scene.spec, float(heights.min())
     rise = max(float(np.ptp(heights)), MIN_HEIGHT_RANGE)
     shares = ((heights - lowest) / rise).astype(np.float32)

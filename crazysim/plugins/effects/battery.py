@@ -102,8 +102,10 @@ class Battery(Plugin):
         cells = counts.astype(sim.data.states.pos.dtype)
         full_speed_voltage = self.full_speed_voltage
         if full_speed_voltage is None:
-            known = airframe_numbers(sim, lambda a: a.full_thrust_voltage or 0.0)
-            full_speed_voltage = np.where(known[..., None] > 0, known[..., None], NOMINAL_VOLTAGE * np.asarray(cells))
+            voltage = airframe_numbers(sim, lambda a: a.full_thrust_voltage or 0.0)
+            full_speed_voltage = np.where(
+                voltage[..., None] > 0, voltage[..., None], NOMINAL_VOLTAGE * np.asarray(cells)
+            )
         charge = drone_array(sim, check_parameter(sim, "charge", self.charge, (1,), 0.0, 1.0), 1)
         return self.filled(
             sim,
@@ -120,8 +122,8 @@ class Battery(Plugin):
 
     def _own_or_airframe_value(self, sim: Simulation, key: str) -> ArrayLike:
         """Return a setting, or else the airframes' number."""
-        given = getattr(self, key)
-        return airframe_numbers(sim, lambda a: a.value(f"battery.{key}", ())) if given is None else given
+        value = getattr(self, key)
+        return airframe_numbers(sim, lambda a: a.value(f"battery.{key}", ())) if value is None else value
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return [StagePlacement(stage("drone")(self.discharge))]
@@ -159,9 +161,9 @@ class Battery(Plugin):
         )
 
         # Compensated summation (Kahan 1965): a step draws some millionths of the charge, mostly lost in float32.
-        drawn = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
-        charge = battery.charge - drawn
-        rounding = drawn - (battery.charge - charge)
+        charge_used = current / (3600.0 * data.core.freq * battery.capacity) + battery.rounding
+        charge = battery.charge - charge_used
+        rounding = charge_used - (battery.charge - charge)
         empty = charge <= 0
         battery = battery.replace(
             charge=jnp.where(empty, 0.0, charge),
@@ -202,5 +204,5 @@ def voltage_under_load(power: Array, open_circuit: Array, resistance: Array) -> 
     enough = spare > 0
     root = jnp.where(enough, jnp.sqrt(jnp.where(enough, spare, 1.0)), 0.0)
     voltage = 0.5 * (open_circuit + root)
-    most = open_circuit * open_circuit / (4 * resistance)
-    return voltage, jnp.where(enough, power, most) / voltage
+    max_power = open_circuit * open_circuit / (4 * resistance)
+    return voltage, jnp.where(enough, power, max_power) / voltage

@@ -81,15 +81,15 @@ class Downwash(Plugin):
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
         positions = {self.name: s.pos} | {name: x.pos for name, x in bodies.items()}
         axis = rotation.z_axis(s.quat)
-        own = jet_source(collective_thrust(data), record.diameter, record.air_density)
+        sources = jet_source(collective_thrust(data), record.diameter, record.air_density)
 
         def at_places(other: tuple[Array, Array, JetSource], _: Array) -> dict[str, Array]:
             origin, axis, source = other
             return {name: jet_speed(pos - origin, axis, source) * axis for name, pos in positions.items()}
 
-        against = reduce_over_others(at_places, (s.pos, axis, own))
-        moved = {name: x.replace(air_vel=-against[name]) for name, x in bodies.items()}
-        data = data.replace(plugins=data.plugins | moved)
+        against = reduce_over_others(at_places, (s.pos, axis, sources))
+        in_jet = {name: x.replace(air_vel=-against[name]) for name, x in bodies.items()}
+        data = data.replace(plugins=data.plugins | in_jet)
         return self.write(data, record.replace(air_vel=-against[self.name]))
 
 
@@ -103,7 +103,7 @@ def stream_diameter(sim: Simulation, radius: Array) -> Array:
 def hover_jet_speed(offset: Array, axis: Array, thrust: Array, diameter: Array, air_density: Array) -> Array:
     """Return the speed of the air in the jet of a hovering drone, m/s.
 
-    From 2.5 drone diameters downwards the mean flow below a quadrotor is that of one round turbulent jet (Bauersfeld
+    From 2.5 drone diameters downwards the mean flow below a quadrotor is one round turbulent jet (Bauersfeld
     et al., Robotics meets Fluid Dynamics, RA-L 2025), whose speed falls as one over the distance and whose profile
     keeps its shape (Pope 2000, sections 5.1 and 5.2):
 

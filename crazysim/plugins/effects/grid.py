@@ -43,9 +43,6 @@ class Grid(NamedTuple):
         Args:
             name: Name in messages.
             k: Length of a vector; None for a grid of numbers.
-
-        Raises:
-            ConfigError: If a shape or a number is invalid.
         """
         values, origin, spacing = (
             read_numbers(f"{what} of {name}", getattr(self, what), POSITIVE if what == "spacing" else ANY_NUMBER)
@@ -95,8 +92,8 @@ def interpolate(values: Array, position: Array) -> Array:
         weight: Array | float = 1.0
         for k, c in enumerate(corner):
             weight = weight * shares[k][c]
-        found = node.get(mode="promise_in_bounds", wrap_negative_indices=False)
-        total = total + weight.reshape(weight.shape + core) * found
+        corner_values = node.get(mode="promise_in_bounds", wrap_negative_indices=False)
+        total = total + weight.reshape(weight.shape + core) * corner_values
     return total
 
 

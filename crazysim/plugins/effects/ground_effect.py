@@ -54,8 +54,8 @@ def rotor_positions(sim: Simulation) -> Array:
     n_rotors = sim.data.states.rotor_vel.shape[-1]
 
     def of_one(airframe: Airframe) -> np.ndarray:
-        own = airframe.value("rotors.position")
-        return np.pad(own, [(0, n_rotors - len(own)), (0, 0)])  # missing rotors have no thrust
+        positions = airframe.value("rotors.position")
+        return np.pad(positions, [(0, n_rotors - len(positions)), (0, 0)])  # missing rotors have no thrust
 
     return device_array(airframe_numbers(sim, of_one), sim.data.states.pos.dtype)
 
@@ -69,7 +69,7 @@ def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:
 
     Args:
         height: Height of the rotors above the floor, m; below zero counts as zero. (..., n_rotors)
-        upright: Cosine of the tilt; below zero, upside down, there is no gain. (..., 1)
+        upright: Cosine of the tilt; below zero, upside down, thrust does not increase. (..., 1)
         radius: Radius of a propeller, m. (..., 1)
     """
     height = jnp.where(height > 0, height, 0.0)

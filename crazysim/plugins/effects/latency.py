@@ -78,7 +78,7 @@ class Latency(Plugin):
         return self.write(data, latency.replace(queue=queue, arrived=arrived))
 
     def _delayed_controller(self, controller: Stage) -> Stage:
-        """Return a controller that gets the command that has arrived, and leaves the one that was sent staged."""
+        """Return a controller that uses the command that has arrived, and does not change the staged command."""
         scope: Any = controller.scope
 
         def late(data: SimData) -> SimData:

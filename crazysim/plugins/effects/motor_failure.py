@@ -83,9 +83,6 @@ class MotorFailure(Plugin):
         Args:
             data: The simulation, all worlds of it.
             mask: True for rotors that fail; None for all. (n_worlds, n_drones, n_rotors)
-
-        Raises:
-            ConfigError: If this plugin has not been added, or the mask has another shape or type.
         """
         if self.name not in data.plugins:
             raise ConfigError(f"{self.name} is not enabled. Use sim.add(MotorFailure(...)) first.")

@@ -45,8 +45,8 @@ class MovingAir(PyTree):
 
 def air_velocity(data: SimData) -> Array:
     """Return the velocity of the air at one drone, the sum of all effects that move it, world frame, m/s. (3,)"""
-    moved = [record.velocity_at_drone(data) for record in data.plugins.values() if isinstance(record, MovingAir)]
-    return sum(moved, jnp.zeros_like(data.states.vel))
+    velocities = [record.velocity_at_drone(data) for record in data.plugins.values() if isinstance(record, MovingAir)]
+    return sum(velocities, jnp.zeros_like(data.states.vel))
 
 
 def drag_factor(data: SimData) -> Array | float:
@@ -57,7 +57,7 @@ def drag_factor(data: SimData) -> Array | float:
 def with_moving_air(data: SimData, air_vel: Array) -> SimData:
     """Return the data with the force that moving air adds to the drag.
 
-    The drag is linear: that of the velocity relative to the air is the drag of the velocity plus the drag of
+    The drag is linear: the drag of the velocity relative to the air is the drag of the velocity plus the drag of
     ``-air_vel``.
 
     Args:
@@ -76,11 +76,7 @@ def has_drag(sim: Simulation) -> bool:
 
 
 def require_drag(sim: Simulation, effect: str) -> None:
-    """Check that moving air would push the drones.
-
-    Raises:
-        ConfigError: If the model has no drag, or the airframe's is zero.
-    """
+    """Check that moving air would push the drones."""
     if not has_drag(sim):
         raise ConfigError(
             f"{effect} acts through drag, and drone {sim.airframes[0].name!r} has none in this model. Use "
@@ -89,11 +85,7 @@ def require_drag(sim: Simulation, effect: str) -> None:
 
 
 def require_rotors(sim: Simulation, effect: str) -> None:
-    """Check that the model has rotors.
-
-    Raises:
-        ConfigError: If it is a fitted one.
-    """
+    """Check that the model has rotors."""
     if not isinstance(sim.data.params, first_principles.Params):
         raise ConfigError(f"{effect} acts on single rotors, which only dynamics='first_principles' has")
 

@@ -63,7 +63,6 @@ class RandomizeData(MovingAir):
 
     @property
     def drag_factor(self) -> Array | float:
-        """Factor of the drag, 1. (..., 1)"""
         return 1.0 if self.drag is None else self.factors[..., FACTORS.index("drag") :]
 
 
@@ -98,17 +97,13 @@ class Randomize(Plugin):
     delay: ArrayLike | None = parameter(default=None, low=0.0)
     """Delay of commands, steps, rounded down, of simulations with ``Latency``, whose delay must be one per drone."""
     optional: Sequence[str] = ()
-    """Settings that do nothing, in place of an error, where a simulation lacks what they act on: ``charge``, ``drag``,
-    ``wind``, ``delay``. Those of the presets are optional."""
+    """Settings that are ignored, instead of an error, if the simulation lacks the model they act on: ``charge``,
+    ``drag``, ``wind``, ``delay``. Settings of presets are optional."""
     name: str = "randomize"
     order: ClassVar[int] = -2  # before effects that change the same parameters
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a simulation.
-
-        Raises:
-            ConfigError: If a number is out of its range, or a name of ``optional`` is none of the settings.
-        """
+        """Check the settings that do not depend on a simulation."""
         super().__post_init__()
         if not isinstance(self.optional, (list, tuple)) or not all(name in RANGES for name in self.optional):
             raise ConfigError(
@@ -169,21 +164,16 @@ class Randomize(Plugin):
             air_vel=drone_array(sim, 0.0, 3) if blows else None,
         )
         for name in RANGES:
-            limits, given = getattr(record, name), getattr(self, name)
-            if limits is not None and np.ndim(given) == 0:
+            limits, values = getattr(record, name), getattr(self, name)
+            if limits is not None and np.ndim(values) == 0:
                 raise ConfigError(
-                    f"expected {name} as (low, high), got {given!r}. Use ({given}, {given}) for a fixed number."
+                    f"expected {name} as (low, high), got {values!r}. Use ({values}, {values}) for a fixed number."
                 )
             if limits is not None and np.any(np.asarray(limits[..., 0]) > np.asarray(limits[..., 1])):
-                raise ConfigError(f"expected {name} as (low, high), got {given!r}. Use the smaller number first.")
+                raise ConfigError(f"expected {name} as (low, high), got {values!r}. Use the smaller number first.")
         return record
 
     def check_plugins(self, sim: Simulation) -> None:
-        """Check that there is what the settings act on, and that delays are one per drone and queues long enough.
-
-        Raises:
-            ConfigError: If there is not, or they are not.
-        """
         records = sim.data.plugins.values()
         latencies = {name: x for name, x in sim.data.plugins.items() if isinstance(x, LatencyData)}
         has_battery = any(isinstance(x, BatteryData) for x in records)
@@ -238,8 +228,8 @@ class Randomize(Plugin):
 
     def observations(self, data: SimData) -> dict[str, Array]:
         record = self.read(data)
-        found = {"factors": record.factors, "thrust_factors": record.thrust_factors}
-        return found if record.air_vel is None else found | {"air_vel": record.air_vel}
+        observations = {"factors": record.factors, "thrust_factors": record.thrust_factors}
+        return observations if record.air_vel is None else observations | {"air_vel": record.air_vel}
 
     def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
@@ -250,20 +240,20 @@ class Randomize(Plugin):
             return jnp.ones_like(share) if limits is None else limits[0] + share * (limits[1] - limits[0])
 
         single = [drawn(getattr(record, name), u[k : k + 1]) for k, name in enumerate(FACTORS)]
-        rest = u[len(FACTORS) :]
-        thrust = drawn(record.thrust, rest[:1]) * drawn(record.rotor_thrust, rest[5:])
+        other_draws = u[len(FACTORS) :]
+        thrust = drawn(record.thrust, other_draws[:1]) * drawn(record.rotor_thrust, other_draws[5:])
         changes = {"factors": jnp.concatenate(single), "thrust_factors": thrust}
         if record.wind is not None:
-            speed, angle = drawn(record.wind, rest[1:2]), 2 * math.pi * rest[2:3]
+            speed, angle = drawn(record.wind, other_draws[1:2]), 2 * math.pi * other_draws[2:3]
             changes["air_vel"] = jnp.concatenate([speed * jnp.cos(angle), speed * jnp.sin(angle), 0 * speed])
         data = self.write(data, record.replace(**changes))
 
         others = dict(data.plugins)
         for name, other in data.plugins.items():
             if isinstance(other, BatteryData) and record.charge is not None:
-                charge = drawn(record.charge, rest[3:4])
+                charge = drawn(record.charge, other_draws[3:4])
                 others[name] = other.replace(charge=charge, voltage=open_circuit_voltage(charge, other.n_cells))
             if isinstance(other, LatencyData) and record.delay is not None:
-                steps = jnp.floor(drawn(record.delay, rest[4:5])).astype(other.delay.dtype)
+                steps = jnp.floor(drawn(record.delay, other_draws[4:5])).astype(other.delay.dtype)
                 others[name] = other.replace(delay=steps)
         return data.replace(plugins=others)

@@ -35,11 +35,7 @@ class ResidualData(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> ResidualData:
-        """Return the shared coefficients of an airframe.
-
-        Raises:
-            ConfigError: If the airframe has no table ``[residual]``.
-        """
+        """Return the shared coefficients of an airframe."""
         dtype = jnp.result_type(float)
         names = ("hidden", "output") if "residual.hidden" in airframe.values else ()
         return ResidualData(
@@ -54,7 +50,7 @@ class Residual(Plugin):
 
     They depend on the velocity over ground, so that wind does not change them. Coefficients are for all drones, as
     given here, or for each, with (n_worlds, n_drones) in front; without them they are those of the airframe's table
-    ``[residual]``, which were fitted beside the linear drag, and do not go with ``RotorAerodynamics``.
+    ``[residual]``, which were fitted with the linear drag, and cannot be combined with ``RotorAerodynamics``.
     """
 
     linear: ArrayLike | None = parameter(default=None)
@@ -67,27 +63,27 @@ class Residual(Plugin):
 
     @property
     def replaced_terms(self) -> tuple[str, ...]:
-        """The drag, where the coefficients are the airframe's, which were fitted beside its linear drag."""
+        """The drag, if the coefficients are the airframe's, which were fitted with its linear drag."""
         return ("drag",) if self.linear is None else ()
 
     def record(self, sim: Simulation) -> ResidualData:
         require_rotors(sim, "a residual")
-        given = {key: getattr(self, key) for key in ("linear", "hidden", "output")}
+        coefficients = {key: getattr(self, key) for key in ("linear", "hidden", "output")}
         if (self.hidden is None) != (self.output is None) or (self.linear is None and self.hidden is not None):
-            names = ", ".join(key for key, value in given.items() if value is not None)
+            names = ", ".join(key for key, value in coefficients.items() if value is not None)
             raise ConfigError(
                 f"expected hidden and output together, and linear with them, got {names or 'none'}. Give zeros for no "
                 f"linear terms."
             )
         if self.linear is None:
-            given = _airframe_coefficients(sim)
-        n_hidden = 0 if given["hidden"] is None else np.atleast_2d(given["hidden"]).shape[-2]
+            coefficients = _airframe_coefficients(sim)
+        n_hidden = 0 if coefficients["hidden"] is None else np.atleast_2d(coefficients["hidden"]).shape[-2]
 
         def checked(key: str, shape: tuple[int, int]) -> Array | None:
-            value = given[key]
+            value = coefficients[key]
             return None if value is None else check_parameter(sim, key, value, shape)
 
-        linear = check_parameter(sim, "linear", given["linear"], (6, N_INPUTS))
+        linear = check_parameter(sim, "linear", coefficients["linear"], (6, N_INPUTS))
         return ResidualData(linear, checked("hidden", (n_hidden, N_INPUTS)), checked("output", (6, n_hidden)))
 
     def influence(self, data: SimData) -> SimData:
@@ -167,5 +163,5 @@ def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
             f"expected residuals of one number of hidden units, got {sorted(sizes)}. Use airframes of equal networks."
         )
     keys = ("linear", "hidden", "output") if max(sizes) else ("linear",)
-    found = {key: airframe_numbers(sim, lambda a, key=key: a.value(f"residual.{key}")) for key in keys}
-    return {"hidden": None, "output": None} | found
+    coefficients = {key: airframe_numbers(sim, lambda a, key=key: a.value(f"residual.{key}")) for key in keys}
+    return {"hidden": None, "output": None} | coefficients

@@ -94,9 +94,9 @@ class RotorAerodynamics(Plugin):
                 "inflow=, or ceiling=None."
             )
         if not np.all((blade >= 0) & np.isfinite(blade)):
-            most = np.min(np.sqrt(thrust * disc) / speed)
+            limit = np.min(np.sqrt(thrust * disc) / speed)
             raise ConfigError(
-                f"expected inflow below {most:.3g} N s^2/(m rad), the limit of momentum theory at this propeller "
+                f"expected inflow below {limit:.3g} N s^2/(m rad), the limit of momentum theory at this propeller "
                 f"radius and air density, got {np.max(inflow):.3g}. Use RotorAerodynamics(inflow=...) with a "
                 f"smaller number."
             )
@@ -110,20 +110,20 @@ class RotorAerodynamics(Plugin):
         )
 
     def _own_or_drag_value(self, sim: Simulation, name: str, of_drag: Callable[[np.ndarray], float]) -> Array:
-        """Return a coefficient as it is set, or else from the airframes' linear drag in hover."""
-        given = getattr(self, name)
-        if given is None:
+        """Return a coefficient from the setting, or else from the airframes' linear drag in hover."""
+        value = getattr(self, name)
+        if value is None:
             drag = airframe_numbers(
                 sim, lambda a: of_drag(a.matrix("drag.coefficients")) / (a.n_rotors * hover_speed(a))
             )
-            given = drag[..., None] if drag.ndim else drag
-            if not np.all(given > 0):
+            value = drag[..., None] if drag.ndim else drag
+            if not np.all(value > 0):
                 raise ConfigError(
                     f"expected {name}, got none, and drone {sim.airframes[0].name!r} has no linear drag from which it "
                     f"would follow. Use RotorAerodynamics({name}=...); RotorPy has drag 1.0e-6 and inflow 7.6e-7 "
                     f"N s^2/(m rad) for the Crazyflie 2.0."
                 )
-        return check_parameter(sim, name, given, low=0.0)
+        return check_parameter(sim, name, value, low=0.0)
 
     def _hub_positions(self, sim: Simulation) -> Array:
         """Return the positions of the hubs, body frame, m. (..., n_rotors, 3)"""

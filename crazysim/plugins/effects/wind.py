@@ -40,7 +40,7 @@ class WindData(MovingAir):
     exponent: Array | None = leaf("parameter", 1, (1,))
     """Exponent of the power-law profile, 1; None for another. (1,)"""
     reference_height: Array | None = leaf("parameter", 1, (1,))
-    """Height of the mean wind, m; None for a wind that is the same at all heights. (1,)"""
+    """Height of the mean wind, m; None for the same wind at all heights. (1,)"""
     speed_20ft: Array | None = leaf("parameter", 1, (1,))
     """Mean wind speed 20 ft above ground, which sets the strength of gusts, m/s; None without gusts. (1,)"""
     filters: Array | None = leaf("drone", 1, (5,))

@@ -44,9 +44,9 @@ class WindFieldData(MovingAir):
 
     def velocity_at(self, pos: Array) -> Array:
         """Return the velocity of the air at a position, world frame, m/s. (..., 3)"""
-        moved = pos - self.origin - self.offset
-        moved = moved if self.shift is None else moved - self.shift
-        return self.scale * interpolate(self.field, moved / self.spacing)
+        field_pos = pos - self.origin - self.offset
+        field_pos = field_pos if self.shift is None else field_pos - self.shift
+        return self.scale * interpolate(self.field, field_pos / self.spacing)
 
 
 class WindField(Plugin):
@@ -98,8 +98,8 @@ class WindField(Plugin):
 
     def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
-        drawn = 2 * uniform(world_key(data, self.name), (3,), record.shift.dtype) - 1
-        return self.write(data, record.replace(shift=record.spread * drawn))
+        sample = 2 * uniform(world_key(data, self.name), (3,), record.shift.dtype) - 1
+        return self.write(data, record.replace(shift=record.spread * sample))
 
     def look_up(self, data: SimData) -> SimData:
         """Look up the velocity of the air at drones and loads."""
@@ -107,5 +107,5 @@ class WindField(Plugin):
         data = self.write(data, record.replace(air_vel=record.velocity_at(data.states.pos)))
         fields = [x for x in data.plugins.values() if isinstance(x, WindFieldData)]
         loads = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.wind_vel is not None}
-        moved = {name: x.replace(wind_vel=sum(f.velocity_at(x.pos) for f in fields)) for name, x in loads.items()}
-        return data.replace(plugins=data.plugins | moved)
+        in_wind = {name: x.replace(wind_vel=sum(f.velocity_at(x.pos) for f in fields)) for name, x in loads.items()}
+        return data.replace(plugins=data.plugins | in_wind)

@@ -13,16 +13,12 @@ ESTIMATORS: dict[str, type[Estimator]] = {"kalman": Kalman, "eskf": ESKF, "compl
 
 
 def find_estimator(estimator: str | Estimator) -> Estimator:
-    """Return an estimator; a name stands for the estimator on its default sensors.
-
-    Raises:
-        ConfigError: If there is none of that name.
-    """
+    """Return an estimator; a name stands for the estimator on its default sensors."""
     if isinstance(estimator, Estimator):
         return estimator
     if not isinstance(estimator, str) or estimator not in ESTIMATORS:
         raise ConfigError(
             f"expected an estimator as one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}. Use a name, or an "
-            f"estimator with sensors of its own, such as Kalman([IMU(), MotionCapture()])."
+            f"estimator with its sensors, such as Kalman([IMU(), MotionCapture()])."
         )
     return ESTIMATORS[estimator].default()

@@ -77,7 +77,6 @@ class Complementary(Estimator):
 
     @classmethod
     def default(cls) -> Complementary:
-        """Return the filter on the Crazyflie's inertial measurement unit and a barometer without errors."""
         return cls([IMU.crazyflie(), Barometer()])
 
     @property
@@ -171,8 +170,8 @@ def height_over_surface(
         shift: Inertial change of the height in the interval, m. (1,)
     """
     over_surface = jnp.where(useful, 1.0, over_surface)
-    held = jnp.where(over_surface > 0, height, by_pressure)
-    return jnp.where(useful, filtered_height(height, distance, shift), held), over_surface
+    height_estimate = jnp.where(over_surface > 0, height, by_pressure)
+    return jnp.where(useful, filtered_height(height, distance, shift), height_estimate), over_surface
 
 
 def update_mahony(

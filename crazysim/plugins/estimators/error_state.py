@@ -32,7 +32,7 @@ N, N_BIASED = 9, 15
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
 """Bounds of a covariance and a variance (kalman_core.c); with biases, whose variances are smaller, an assumption."""
 EPS = 1e-6
-"""Added to a norm that something is divided by (kalman_core.c)."""
+"""Added to a norm before a division by it (kalman_core.c)."""
 MAX_POS, MAX_VEL = 100.0, 10.0
 """Bounds of coordinates, m, and of velocities, body frame, m/s, beyond which the filter has failed
 (kalman_supervisor.c)."""
@@ -137,7 +137,7 @@ def predict(
 
 
 def propagate(estimate: Estimate, accel: Array, gyro: Array, dt: Array | float, gravity: Array) -> Estimate:
-    """Return the estimate with biases after an interval, or before one where it is negative, with its covariance as is.
+    """Return the estimate with biases after an interval, which may be negative, with an unchanged covariance.
 
     Args:
         estimate: The estimate.
@@ -230,12 +230,12 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     r = deviation * deviation
     gain = ph * (1 / (jnp.dot(h, ph[jnp.asarray(rows)]) + r))
     # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns of I - K H that belong to rows are not trivial.
-    left = jnp.eye(n, dtype=p.dtype)[:, rows] - gain[:, None] * h
+    reduction = jnp.eye(n, dtype=p.dtype)[:, rows] - gain[:, None] * h
     others = np.setdiff1d(np.arange(n), rows)
     keep = np.zeros((n, 1), bool)
     keep[others] = True
-    p = jnp.where(keep, p, 0.0) + left @ p[jnp.asarray(rows)]
-    p = jnp.where(keep.T, p, 0.0) + p[:, rows] @ left.T
+    p = jnp.where(keep, p, 0.0) + reduction @ p[jnp.asarray(rows)]
+    p = jnp.where(keep.T, p, 0.0) + p[:, rows] @ reduction.T
     p = p + r * gain[:, None] * gain
     step = error * gain
     biases = {}
@@ -272,9 +272,9 @@ def is_within_bounds(estimate: Estimate, max_pos: float = MAX_POS, max_vel: floa
     return jnp.all(jnp.abs(estimate.pos) <= max_pos) & jnp.all(jnp.abs(estimate.vel) <= max_vel)
 
 
-def select_estimate(which: Array, one: Estimate, other: Estimate) -> Estimate:
-    """Return one estimate where a flag is set, and the other elsewhere."""
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), one, other)
+def select_estimate(which: Array, new: Estimate, old: Estimate) -> Estimate:
+    """Return the new estimate where a flag is set, and the old one elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
 
 def bound_covariance(p: Array) -> Array:

@@ -39,7 +39,6 @@ class ErrorStateFilter(Estimator):
 
     @classmethod
     def default(cls) -> Self:
-        """Return the filter on the Crazyflie's inertial measurement unit and motion capture without errors."""
         return cls([IMU.crazyflie(), MotionCapture()])
 
     def update_estimate(self, sensor: Sensor, data: SimData, record: Any) -> Estimate:
@@ -51,7 +50,7 @@ class ErrorStateFilter(Estimator):
         return error_state.is_within_bounds(estimate)
 
     def restarted_estimate(self, data: SimData, pos: Array, quat: Array) -> Estimate:
-        """Return the estimate with which the filter of one drone begins again, at rest.
+        """Return the estimate from which the filter of one drone restarts, at rest.
 
         Args:
             data: Data of the drone.
@@ -64,7 +63,7 @@ class ErrorStateFilter(Estimator):
         """Return the record before the first step.
 
         No measurement was ``used``: the step in which the latest one was taken is -1 for each sensor. The filter has
-        had no ``failures``, in which its estimate left its bounds and it began again.
+        had no ``failures``, in which its estimate left its bounds and it was restarted.
 
         Args:
             sim: The simulation.
@@ -87,7 +86,7 @@ class ErrorStateFilter(Estimator):
         return [(s.name, Stage(self._fusion_stage(k, s), "drone", self._is_new(k, s))) for k, s in enumerate(self.aids)]
 
     def restart_stage(self) -> Stage:
-        """Return the stage with which the filter begins again where its estimate left its bounds."""
+        """Return the stage that restarts the filter where its estimate has left its bounds."""
         return Stage(self._begin_again, "drone", lambda data: ~self.is_valid(self.read(data).estimate))
 
     def add_sample(self, data: SimData) -> SimData:

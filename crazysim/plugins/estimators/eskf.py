@@ -186,9 +186,9 @@ class ESKF(ErrorStateFilter):
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
         since = (taken - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq  # the last prediction
         if not sensor.is_late:
-            then = error_state.propagate(record.estimate, accel, gyro, since, gravity)
-            then = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, then))
-            return error_state.propagate(then, accel, gyro, -since, gravity)
+            past_estimate = error_state.propagate(record.estimate, accel, gyro, since, gravity)
+            past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
+            return error_state.propagate(past_estimate, accel, gyro, -since, gravity)
         interval, (first, last) = data.core.freq // (sensor.freq or data.core.freq), self._path_rows(sensor, data)
         paths: Array = record.paths  # type: ignore[assignment]
         row, number = paths[first], (steps - taken) // interval
@@ -196,9 +196,9 @@ class ESKF(ErrorStateFilter):
             row = jnp.where(number == k - first, paths[k], row)
         path, estimate = InertialPath.from_row(row, -since), record.estimate
         back = path.without_biases(estimate).reverse()
-        then = inertial_path.propagate_along(estimate, back, gravity)
-        then = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, then))
-        return inertial_path.propagate_along(then, path.without_biases(then), gravity)
+        past_estimate = inertial_path.propagate_along(estimate, back, gravity)
+        past_estimate = _finalize(UPDATE_FNS[type(sensor)](sensor, self.imu, data, past_estimate))
+        return inertial_path.propagate_along(past_estimate, path.without_biases(past_estimate), gravity)
 
     def is_valid(self, estimate: Estimate) -> Array:
         return error_state.is_within_bounds(estimate, self.max_pos, self.max_vel)

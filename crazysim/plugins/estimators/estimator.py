@@ -38,11 +38,7 @@ class Estimator(Plugin):
     name: str = "estimator"
 
     def __post_init__(self) -> None:
-        """Check that the sensors are a list of them.
-
-        Raises:
-            ConfigError: If they are not.
-        """
+        """Check that the sensors are a list of them."""
         super().__post_init__()
         if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
             example = f"{type(self).__name__}([IMU(), MotionCapture()])"
@@ -98,9 +94,9 @@ class Estimator(Plugin):
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
         """Return the estimated state of one drone, the true one in a world's first step."""
-        s, found = data.states, self.estimated_states(data)
+        s, estimate = data.states, self.estimated_states(data)
         first = data.core.steps[..., None] == 0 if s.pos.ndim > 1 else data.core.steps == 0
-        states = {name: jnp.where(first, getattr(s, name), value) for name, value in found.items()}
+        states = {name: jnp.where(first, getattr(s, name), value) for name, value in estimate.items()}
         return self.imu.measured_states(data) | states
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -113,11 +109,7 @@ class Estimator(Plugin):
         return rotation.rotate(mounting, gyro), rotation.rotate(mounting, accel)
 
     def check_sensors(self, sim: Simulation) -> None:
-        """Check the sensors.
-
-        Raises:
-            ConfigError: If there is not one ``IMU``, or another is not of ``kinds``, or has not been added.
-        """
+        """Check the sensors."""
         names = ", ".join(kind.__name__ for kind in self.kinds)
         if sum(isinstance(sensor, IMU) for sensor in self.sensors) != 1:
             got = [type(sensor).__name__ for sensor in self.sensors]

@@ -106,8 +106,8 @@ def propagate_along(estimate: Estimate, path: InertialPath, gravity: Array) -> E
         """Return the derivatives of the errors at the end times a matrix."""
         att = back @ (p[6:9] + gyro_to_att @ p[12:])
         pushed = p[3:6] + att_to_vel @ p[6:9] + accel_to_vel @ p[9:12] + gyro_to_vel @ p[12:]
-        moved = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
-        return jnp.concatenate([moved, back @ pushed + turn @ att, att, p[9:]])
+        pos_rows = p[:3] + t * rot @ p[3:6] + att_to_pos @ p[6:9] + accel_to_pos @ p[9:12] + gyro_to_pos @ p[12:]
+        return jnp.concatenate([pos_rows, back @ pushed + turn @ att, att, p[9:]])
 
     cov = bound_covariance(rows(rows(covariance(estimate.cov)).T))
     return estimate.replace(pos=pos, vel=vel, quat=quat, cov=cov)

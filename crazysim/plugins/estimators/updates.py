@@ -85,17 +85,17 @@ def update_flow(
         scale: Pixels by which the image moves at 1 rad/s. ()
         deviation: Standard deviation of a motion, pixels.
     """
-    at = estimate
+    predicted_from = estimate
     for k, (axis, sign) in enumerate(((1, -1.0), (0, 1.0))):
-        height = jnp.maximum(at.pos[2], MIN_FLOW_HEIGHT)
+        height = jnp.maximum(predicted_from.pos[2], MIN_FLOW_HEIGHT)
         rate = rot[2, 2] / height
-        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-at.vel[k] * rate / height, rate]
-        if at.gyro_bias is not None:
-            turn = turn - at.gyro_bias[axis]
+        turn, rows, slopes = gyro[axis], [POS[2], VEL[k]], [-predicted_from.vel[k] * rate / height, rate]
+        if predicted_from.gyro_bias is not None:
+            turn = turn - predicted_from.gyro_bias[axis]
             rows, slopes = [*rows, GYRO[axis]], [*slopes, jnp.full_like(rate, -sign)]
-        predicted = scale * (at.vel[k] * rate + sign * turn)
+        predicted = scale * (predicted_from.vel[k] * rate + sign * turn)
         estimate = update(estimate, rows, scale * jnp.stack(slopes), flow[k] - predicted, deviation)
-        at = at if estimate.gyro_bias is None else estimate
+        predicted_from = predicted_from if estimate.gyro_bias is None else estimate
     return estimate
 
 
@@ -134,10 +134,10 @@ def update_ray(estimate: Estimate, distance: Array, deviation: Array | float) ->
 
 def update_distance(estimate: Estimate, anchor: Array, distance: Array, deviation: Array | float) -> Estimate:
     """Return the estimate after a measured distance, m, () to an anchor, world frame, m. (3,)"""
-    apart = estimate.pos - anchor
-    predicted = rotation.safe_norm(apart)
+    offset = estimate.pos - anchor
+    predicted = rotation.safe_norm(offset)
     away = predicted > 0
-    direction = jnp.where(away, apart / jnp.where(away, predicted, 1.0), jnp.asarray([1.0, 0.0, 0.0], apart.dtype))
+    direction = jnp.where(away, offset / jnp.where(away, predicted, 1.0), jnp.asarray([1.0, 0.0, 0.0], offset.dtype))
     return update(estimate, POS, direction, distance - predicted[0], deviation)
 
 
@@ -173,12 +173,12 @@ def update_differences(estimate: Estimate, anchors: Array, differences: Array, d
         differences: Distances to all anchors but the first minus the distance to the first, m. (n - 1,)
         deviation: Standard deviation of a distance, m.
     """
-    at, apart = estimate.pos, estimate.pos - anchors
-    distance = rotation.safe_norm(apart)
-    direction = apart / jnp.where(distance > 0, distance, 1.0)
+    pos, offsets = estimate.pos, estimate.pos - anchors
+    distance = rotation.safe_norm(offsets)
+    direction = offsets / jnp.where(distance > 0, distance, 1.0)
     for k in range(1, anchors.shape[0]):
         h = direction[k] - jnp.sum(direction[:k], axis=0) / k
-        predicted = distance[k, 0] - jnp.sum(distance[:k]) / k + jnp.dot(h, estimate.pos - at)
+        predicted = distance[k, 0] - jnp.sum(distance[:k]) / k + jnp.dot(h, estimate.pos - pos)
         measured = differences[k - 1] - jnp.sum(differences[: k - 1]) / k
         estimate = update(estimate, POS, h, measured - predicted, math.sqrt(1 + 1 / k) * deviation)
     return estimate
@@ -207,12 +207,12 @@ def update_sweep(
     origin, frame = station
     x, y, z = frame.T @ (rotation.matvec(rot, sensor, estimate.pos) - origin)
     tangent, squared = math.tan(tilt), x * x + y * y
-    rest = squared - (z * tangent) ** 2
-    sees = rest > 1e-4
-    squared, rest = jnp.where(sees, squared, 1.0), jnp.where(sees, rest, 1.0)
+    radicand = squared - (z * tangent) ** 2
+    sees = radicand > 1e-4
+    squared, radicand = jnp.where(sees, squared, 1.0), jnp.where(sees, radicand, 1.0)
     ratio = jnp.where(sees, z * tangent, 0.0) / jnp.sqrt(squared)
     predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt(1 - ratio**2))
-    q = tangent / jnp.sqrt(rest)
+    q = tangent / jnp.sqrt(radicand)
     h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
     return select_estimate(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)
 

@@ -89,11 +89,7 @@ class CollidingPlugin:
 
 
 def load_shape(size: ArrayLike) -> Shape:
-    """Return a ball of a radius, or a box of three full lengths, m.
-
-    Raises:
-        ConfigError: If the size is neither.
-    """
+    """Return a ball of a radius, or a box of three full lengths, m."""
     lengths = as_numbers("a body", "size", size)
     if lengths.shape not in ((), (3,)) or not np.all((lengths >= LENGTH.low) & (lengths <= LENGTH.high)):
         raise ConfigError(
@@ -105,9 +101,5 @@ def load_shape(size: ArrayLike) -> Shape:
 
 
 def rest_height(size: ArrayLike) -> float:
-    """Return the height of the middle of a ball or box above the floor on which it stands, m.
-
-    Raises:
-        ConfigError: If the size is neither a radius nor three lengths.
-    """
+    """Return the height of the middle of a ball or box above the floor on which it stands, m."""
     return load_shape(size).size[-1]

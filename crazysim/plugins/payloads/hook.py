@@ -113,8 +113,8 @@ class Hook(CollidingPlugin, Plugin):
         load = load_record(self, sim, HookData, False, rest_height(self.size) + self.ring, self.ring, grip=grip)
         if self.load_at is None:
             return load.replace(tip_pos=device_array(load.pos), tip_vel=device_array(load.vel))
-        at = check_parameter(sim, "load_at", self.load_at, (3,))
-        pos = np.array(np.broadcast_to(at, load.pos.shape))
+        load_pos = check_parameter(sim, "load_at", self.load_at, (3,))
+        pos = np.array(np.broadcast_to(load_pos, load.pos.shape))
         pos[..., 2] = np.maximum(pos[..., 2], np.asarray(load.clearance)[..., 0])
         no_clearance = device_array(np.zeros(load.clearance.shape))
         tip_pos, tip_vel = hanging_state(sim.data.states, load.attach, load.length, no_clearance, False)
@@ -157,9 +157,9 @@ class Hook(CollidingPlugin, Plugin):
         impulse along the rod that a rigid rod passes on to the drone.
         """
         load, p, s = self.read(data), data.params, data.states
-        apart, speed = load.pos - load.tip_pos, load.vel - load.tip_vel
-        near = (dot(apart, apart) < load.reach**2) & (dot(speed, speed) < load.max_speed**2) & (load.mass > 0)
-        picks = load.grip & ~load.attached & near[..., 0]
+        offset, speed = load.pos - load.tip_pos, load.vel - load.tip_vel
+        can_grip = (dot(offset, offset) < load.reach**2) & (dot(speed, speed) < load.max_speed**2) & (load.mass > 0)
+        picks = load.grip & ~load.attached & can_grip[..., 0]
         held = load.replace(attached=load.grip & (load.attached | picks))
         link = self._link_params(held)
         joint = load.tip_vel + load.mass / (link.mass + MIN_MASS) * speed
@@ -190,9 +190,6 @@ class Hook(CollidingPlugin, Plugin):
             data: Simulation.
             grip: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones), or
                 broadcast to that
-
-        Raises:
-            ConfigError: If it has another shape or type.
         """
         load = self.read(data)
         flags = grip if isinstance(grip, jax.Array) else np.asarray(grip)
@@ -213,9 +210,6 @@ class Hook(CollidingPlugin, Plugin):
         Args:
             data: Simulation.
             mask: True in the worlds to change; None for all. (n_worlds,)
-
-        Raises:
-            ConfigError: If the mask has another shape or type.
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
         height = jnp.where(load.attached[..., None], load.clearance, 0.0)
@@ -231,7 +225,6 @@ class Hook(CollidingPlugin, Plugin):
         return self.write(data, new)
 
     def move_objects(self, data: SimData) -> Objects:
-        """Return the scene's objects with loads and rods at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
@@ -261,7 +254,6 @@ class Hook(CollidingPlugin, Plugin):
         return self.write(data, load.replace(vel=vel, tip_vel=jnp.where(load.attached[..., None], vel, load.tip_vel)))
 
     def joined_mask(self, data: SimData) -> Array:
-        """Return True where a load is on the hook of a drone; of one world. (n_drones, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
 
     def head(self, data: SimData) -> LoadBody:

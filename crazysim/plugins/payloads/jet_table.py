@@ -38,11 +38,7 @@ class JetTable(NamedTuple):
         return np.shape(self.velocity if self.pressure is None else self.pressure)[:4]
 
     def checked(self) -> JetTable:
-        """Return the table as arrays of the host, with one spacing for each axis.
-
-        Raises:
-            ConfigError: If a shape or a number is invalid.
-        """
+        """Return the table as arrays of the host, with one spacing for each axis."""
         speeds = read_numbers("speeds", self.speeds, POSITIVE)
         if speeds.ndim != 1 or np.any(np.diff(speeds) <= 0):
             raise ConfigError(f"expected positive rotor speeds in ascending order, rad/s, got {self.speeds!r}")
@@ -50,7 +46,7 @@ class JetTable(NamedTuple):
             raise ConfigError(
                 "expected a table of pressure or velocity, got neither. Use pressure=, velocity= or both."
             )
-        found: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray] = {}
         for name, core in (("pressure", ()), ("velocity", (3,))):
             value = getattr(self, name)
             if value is None:
@@ -59,11 +55,11 @@ class JetTable(NamedTuple):
             if value.ndim != 4 + len(core) or len(value) != len(speeds) or value.shape[4:] != core:
                 shape = f"({len(speeds)}, n_x, n_y, n_z{', 3' if core else ''})"
                 raise ConfigError(f"expected {name} of shape {shape} for {len(speeds)} speeds, got {value.shape}")
-            found[name] = value
-        if len({x.shape[:4] for x in found.values()}) > 1:
+            arrays[name] = value
+        if len({x.shape[:4] for x in arrays.values()}) > 1:
             raise ConfigError(
-                f"expected pressure and velocity on the same grid, got {found['pressure'].shape} and "
-                f"{found['velocity'].shape}. Use two RotorJet with a name each for two grids."
+                f"expected pressure and velocity on the same grid, got {arrays['pressure'].shape} and "
+                f"{arrays['velocity'].shape}. Use two RotorJet with a name each for two grids."
             )
         origin, spacing = read_numbers("origin", self.origin), read_numbers("spacing", self.spacing, POSITIVE)
         if origin.shape != (3,) or spacing.shape not in ((), (3,)):
@@ -71,7 +67,7 @@ class JetTable(NamedTuple):
                 f"expected an origin of shape (3,) and a spacing of shape () or (3,), m, got "
                 f"{self.origin!r} and {self.spacing!r}. Use spacing=0.01 for cubes of a centimetre, for example."
             )
-        return JetTable(speeds, found.get("pressure"), found.get("velocity"), origin, np.broadcast_to(spacing, (3,)))
+        return JetTable(speeds, arrays.get("pressure"), arrays.get("velocity"), origin, np.broadcast_to(spacing, (3,)))
 
 
 def load_jet_table(
@@ -93,27 +89,27 @@ def load_jet_table(
             lab.
 
     Raises:
-        ConfigError: If there is no such file, or the sizes do not match.
+        ConfigError: If the folder has no such files, or their sizes do not match.
     """
     files = sorted(Path(folder).glob("*.txt"))
-    named = [(path, int(match[1])) for path in files if (match := re.fullmatch(r".*_(\d+)", path.stem))]
-    if not named:
+    path_speeds = [(path, int(match[1])) for path in files if (match := re.fullmatch(r".*_(\d+)", path.stem))]
+    if not path_speeds:
         raise ConfigError(
             f"expected files named NAME_SPEED.txt with the rotor speed in rad/s, such as pressure_1500.txt, in "
             f"{str(folder)!r}, got {', '.join(path.name for path in files) or 'none'}"
         )
-    found: dict[int, dict[int, np.ndarray]] = {1: {}, 3: {}}
-    for path, speed in named:
+    rows_by_speed: dict[int, dict[int, np.ndarray]] = {1: {}, 3: {}}
+    for path, speed in path_speeds:
         try:
             rows = np.loadtxt(path, ndmin=2)
         except (ValueError, OSError) as error:
             raise ConfigError(f"expected a table of numbers in {str(path)!r}, got: {error}") from error
-        if rows.shape[1] not in found:
+        if rows.shape[1] not in rows_by_speed:
             raise ConfigError(f"expected one or three columns in {str(path)!r}, got {rows.shape[1]}")
-        if speed in found[rows.shape[1]]:
+        if speed in rows_by_speed[rows.shape[1]]:
             raise ConfigError(f"expected one table for each speed, got a second for {speed} rad/s, {str(path)!r}")
-        found[rows.shape[1]][speed] = rows
-    pressure, velocity = found[1], found[3]
+        rows_by_speed[rows.shape[1]][speed] = rows
+    pressure, velocity = rows_by_speed[1], rows_by_speed[3]
     speeds = sorted(pressure or velocity)
     if pressure and velocity and sorted(velocity) != speeds:
         raise ConfigError(f"expected velocities at the speeds of the pressures, {speeds}, got {sorted(velocity)}")
@@ -121,12 +117,12 @@ def load_jet_table(
     if len(n_rows) > 1:
         raise ConfigError(f"expected the same number of rows in all files of {str(folder)!r}, got {sorted(n_rows)}")
     dims = _table_shape(n_rows.pop(), shape)
-    at = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else np.asarray(origin)
+    corner = np.array([-dims[0] / 2, -dims[1] / 2, -dims[2]]) * spacing if origin is None else np.asarray(origin)
     return JetTable(
         speeds=np.array(speeds, np.float64),
         pressure=np.stack([pressure[s].reshape(dims) for s in speeds]) if pressure else None,
         velocity=np.stack([velocity[s].reshape(*dims, 3) for s in speeds]) if velocity else None,
-        origin=tuple(map(float, at)),
+        origin=tuple(map(float, corner)),
         spacing=spacing,
     ).checked()
 

@@ -179,18 +179,18 @@ def couple_bodies(
         tensions[0] = tensions[0] - rate * out
     parts = [t * p.direction for t, p in zip(tensions, pulls, strict=True)]
     pull = sum(parts[1:], parts[0])
-    # Constants are multiplied first: what no step changes is then computed once, and the rest are multiply-adds.
-    share, turned = m / mass, deriv
+    # Constants are multiplied first, which is then done once, and the rest are multiply-adds.
+    share, coupled = m / mass, deriv
     if damping is not None:
         pull = pull + damping
         # All that pulls at the tip turns the body as if it were part of it: along the link no force has another lever.
         torque = to_body_frame(r.rot, cross(pos - s.pos, pull))
-        turned = _with_torque(deriv, m * J_inv, torque, dt)
+        coupled = _with_torque(deriv, m * J_inv, torque, dt)
     elif any(p.turn is not None for p in pulls):
         turns = [m * t * p.turn for t, p in zip(tensions, pulls, strict=True) if p.turn is not None]
-        turned = _with_torque(deriv, None, sum(turns[1:], turns[0]), dt)
+        coupled = _with_torque(deriv, None, sum(turns[1:], turns[0]), dt)
     tip_acc = free_acc - pull
-    after = turned.replace(acc=deriv.acc + share * pull)
+    after = coupled.replace(acc=deriv.acc + share * pull)
     after = after if dt is None else after.replace(vel=deriv.vel + dt * share * pull)
     rate = _tip_rate(s, deriv, r, link, vel, tip_acc, attach_acc, dt, freq)
     return LinkedMotion(after, rate, tip_acc)
@@ -199,10 +199,10 @@ def couple_bodies(
 def _with_torque(deriv: SimStateDeriv, factor: Array | None, torque: Array, dt: float | None) -> SimStateDeriv:
     """Return a derivative with the angular acceleration ``factor @ torque`` added, and its share in the velocity."""
     if factor is None:
-        turned = deriv.replace(ang_acc=deriv.ang_acc + torque)
-        return turned if dt is None else turned.replace(ang_vel=deriv.ang_vel + dt * torque)
-    turned = deriv.replace(ang_acc=matvec(factor, torque, deriv.ang_acc))
-    return turned if dt is None else turned.replace(ang_vel=matvec(dt * factor, torque, deriv.ang_vel))
+        result = deriv.replace(ang_acc=deriv.ang_acc + torque)
+        return result if dt is None else result.replace(ang_vel=deriv.ang_vel + dt * torque)
+    result = deriv.replace(ang_acc=matvec(factor, torque, deriv.ang_acc))
+    return result if dt is None else result.replace(ang_vel=matvec(dt * factor, torque, deriv.ang_vel))
 
 
 def to_body_frame(rot: Array, vector: Array) -> Array:
@@ -267,8 +267,8 @@ def _radial_term(r: LinkGeometry, out: Array, free: Array, link: LinkParams, dt:
     if link.restitution is None:
         return freq * (out - gap)
     # It bounces in the step at whose end it would be taut, with the speed that it had when it became taut.
-    late = jnp.maximum(r.distance - link.length, 0.0)
-    back = link.restitution * rotation.safe_sqrt(out * out - 2 * late * jnp.maximum(free, 0.0))
+    overshoot = jnp.maximum(r.distance - link.length, 0.0)
+    back = link.restitution * rotation.safe_sqrt(out * out - 2 * overshoot * jnp.maximum(free, 0.0))
     bounces = (link.restitution > 0) & (out > BOUNCE_SPEED) & (out + dt * free > gap)
     return freq * (out - jnp.where(bounces, -back, gap))
 

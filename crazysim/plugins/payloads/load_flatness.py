@@ -106,6 +106,6 @@ def _norm_and_direction(vector: list[Array]) -> tuple[Array, list[Array]]:
         square = sum(comb(n, k) * rotation.dot(vector[k], vector[n - k]) for k in range(n + 1))
         square = square - sum(comb(n, k) * norms[k] * norms[n - k] for k in range(1, n))
         norms.append(square / (2 * norms[0]))
-        rest = vector[n] - sum(comb(n, k) * norms[k] * directions[n - k] for k in range(1, n + 1))
-        directions.append(rest / norms[0])
+        remainder = vector[n] - sum(comb(n, k) * norms[k] * directions[n - k] for k in range(1, n + 1))
+        directions.append(remainder / norms[0])
     return norms[0], directions

@@ -88,9 +88,6 @@ class PointLoad(CollidingPlugin):
             data: Simulation.
             mask: True for drones that let go, or for worlds in which all do; None for all. (n_worlds, n_drones) or
                 (n_worlds,)
-
-        Raises:
-            ConfigError: If the mask has another shape or type.
         """
         load = self.read(data)
         shape = load.attached.shape

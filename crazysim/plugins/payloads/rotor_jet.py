@@ -116,19 +116,19 @@ class RotorJet(Plugin):
 
     def _loads(self, sim: Simulation) -> Any:
         """Return the plugin of the loads."""
-        found = [p for p in sim.scene.plugins() if isinstance(p, CollidingPlugin) and p.name == self.load]
-        if not found:
+        loads = [p for p in sim.scene.plugins() if isinstance(p, CollidingPlugin) and p.name == self.load]
+        if not loads:
             names = [p.name for p in sim.scene.plugins() if isinstance(p, CollidingPlugin)]
             raise ConfigError(
                 f"expected the name of a plugin of loads, {' or '.join(map(repr, names)) or 'none of which is there'}, "
                 f"got {self.load!r}. Use sim.add(SlungLoad(...)) first, and load= for another name."
             )
-        if found[0].coupling != "drone":
+        if loads[0].coupling != "drone":
             raise ConfigError(
                 f"expected loads of one drone each, got {self.load!r}, which hangs from all drones of a world. Use "
                 f"SlungLoad or Hook."
             )
-        return found[0]
+        return loads[0]
 
 
 def without_wrench(record: RotorJetData) -> RotorJetData:
@@ -160,13 +160,13 @@ def jet_pressure(
     if drone is not None:
         of_one = tuple(x if x.ndim == 1 else x[drone] for x in of_one)
     # An axis for the panels.
-    at, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in of_one)
-    offset = pos - at
+    load_pos, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in of_one)
+    offset = pos - load_pos
 
     def momentum(air: Array) -> Array:
         relative = air - vel[..., None, :]
         arrives = -rotation.dot(relative, normal)
-        # Only air of the jet has momentum to give: still air beside it exerts no force on a load that moves.
+        # Only air of the jet has momentum to give: still air outside it exerts no force on a load that moves.
         blows = rotation.dot(air, air) > 0
         return jnp.where(blows & (arrives > 0), density * arrives, 0.0) * relative
 

@@ -34,7 +34,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 TENSION_REGULARIZATION = 1e-6
 """Summand of the matrix of tensions, 1, without which four rods at one load would have no unique tensions."""
 N_ITERATIONS = 3
-"""Solutions of the tensions, each without the cables that would push in the one before."""
+"""Number of solutions of the tensions, each without the cables that would push in the last."""
 
 
 class SharedLoadData(PyTree):
@@ -142,7 +142,6 @@ class SharedLoad(PointLoad, Plugin):
         return [StagePlacement(Stage(self.stop_at_floor, "world"), "increment_steps", name=f"{self.name}_floor")]
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-        """Return the derivative with the pull of the load on all drones, and the load's rates; of one world."""
         load, p, s, freq = self.read(data), data.params, data.states, data.core.freq
         m, n = load.mass, s.pos.shape[0]
         gravity = p.gravity_vec if p.gravity_vec.ndim == 1 else jnp.mean(p.gravity_vec, axis=0)
@@ -159,9 +158,9 @@ class SharedLoad(PointLoad, Plugin):
         else:
             gap = jnp.maximum(load.length - r.distance, 0.0) if self.cable else 0.0
             rhs = rhs + freq * (out - freq * gap)
-        own = jnp.broadcast_to(m / p.mass, (n, 1))
-        own = own if pull.lever is None or pull.turn is None else own + m * rotation.dot(pull.lever, pull.turn)
-        gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (own + TENSION_REGULARIZATION)
+        ratio = jnp.broadcast_to(m / p.mass, (n, 1))
+        ratio = ratio if pull.lever is None or pull.turn is None else ratio + m * rotation.dot(pull.lever, pull.turn)
+        gram = jnp.sum(q[:, None] * q[None], axis=-1) + jnp.eye(n, dtype=q.dtype) * (ratio + TENSION_REGULARIZATION)
         tension = _tensions(gram, rhs[:, 0], acts, self.cable)[:, None]
 
         force = tension * q
@@ -183,7 +182,6 @@ class SharedLoad(PointLoad, Plugin):
         return deriv.replace(**changes, plugins=deriv.plugins | {self.name: rates})
 
     def move_objects(self, data: SimData) -> Objects:
-        """Return the scene's objects with load and links at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
@@ -201,11 +199,9 @@ class SharedLoad(PointLoad, Plugin):
         return LoadBody(load.pos[None], upright, load.vel[None], load.mass[None])
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
-        """Return the data with another velocity of the load; of one world. (1, 3)"""
         return self.write(data, self.read(data).replace(vel=vel[0]))
 
     def joined_mask(self, data: SimData) -> Array:
-        """Return True for drones that a rod joins to the load; of one world. (1, n_drones)"""
         return self.read(data).attached[None] & (not self.cable)
 
 
@@ -221,7 +217,7 @@ def _tensions(matrix: Array, rhs: Array, acts: Array, one_sided: bool) -> Array:
     eye = jnp.eye(rhs.shape[0], dtype=rhs.dtype)
     tension = jnp.zeros_like(rhs)
     for _ in range(N_ITERATIONS if one_sided else 1):
-        both = acts[:, None] & acts[None]
-        tension = solve_symmetric(jnp.where(both, matrix, eye), jnp.where(acts, rhs, 0.0))
+        active_pairs = acts[:, None] & acts[None]
+        tension = solve_symmetric(jnp.where(active_pairs, matrix, eye), jnp.where(acts, rhs, 0.0))
         acts = acts & (tension > 0) if one_sided else acts
     return jnp.maximum(tension, 0.0) if one_sided else tension

@@ -40,7 +40,7 @@ class SlungLoad(PointLoad, Plugin):
     """A load on a rod or a cable, a point mass that hangs from each drone.
 
     Load and drone are integrated together. A cable is slack while the load is nearer than its length, and pulls as soon
-    as it is taut. The load starts at rest below the drone, where the drone is when the plugin is added.
+    as it is taut. The load starts at rest below the drone's position at the time when the plugin is added.
     """
 
     mass: ArrayLike = parameter(low=0.0)
@@ -73,14 +73,13 @@ class SlungLoad(PointLoad, Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the floor's stage, and for cables in schemes of higher order the stage of becoming taut."""
-        found = [StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
+        placements = [StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
         method = find_integrator(sim)
         if self.cable and method is rk4:
-            found.append(StagePlacement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
-        return found
+            placements.append(StagePlacement(Stage(self.become_taut, "drone"), "integration", name=f"{self.name}_taut"))
+        return placements
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-        """Return the derivative with the pull of the load, and the load's rates; of one drone."""
         load, p = self.read(data), data.params
         free = free_acceleration(data, load, self.name, dt)
         linked = couple_bodies(
@@ -103,9 +102,6 @@ class SlungLoad(PointLoad, Plugin):
         Args:
             data: Simulation.
             mask: True in the worlds to change; None for all. (n_worlds,)
-
-        Raises:
-            ConfigError: If the mask has another shape or type.
         """
         load, mask = self.read(data), as_mask(mask, data.core.steps.shape[:1])
         pos, vel = hanging_state(data.states, load.attach, load.length, load.clearance, self.cable)
@@ -117,7 +113,6 @@ class SlungLoad(PointLoad, Plugin):
         return self.write(data, new)
 
     def move_objects(self, data: SimData) -> Objects:
-        """Return the scene's objects with loads and links at their poses; of one world."""
         if not self.in_scene:
             return data.objects  # type: ignore[return-value]
         load = self.read(data)
@@ -132,7 +127,6 @@ class SlungLoad(PointLoad, Plugin):
         return self.write(data, self.read(data).replace(vel=vel))
 
     def joined_mask(self, data: SimData) -> Array:
-        """Return True where a rod joins a load to a drone; of one world. (n_drones, n_drones)"""
         n = data.states.pos.shape[0]
         return np.eye(n, dtype=bool) & self.read(data).attached & (not self.cable)
 
@@ -149,7 +143,7 @@ def load_record(
     is_cable: bool,
     clearance: float,
     ring: float | None = None,
-    **given: Any,
+    **fields: Any,
 ) -> L:
     """Return the record of loads at rest below their drones, from the settings of a plugin, which are checked.
 
@@ -160,13 +154,13 @@ def load_record(
         is_cable: True for cables.
         clearance: Height of a load's position above the floor where it rests, m.
         ring: Height of the ring above the middle of the load, m, by which a hook holds it; None without a hook.
-        given: Further fields of the record.
+        **fields: Further fields of the record.
     """
-    rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
+    height_at_rest, states = check_parameter(sim, "size", clearance, low=0.0), sim.data.states
     attached = device_array(np.ones(states.pos.shape[:2]), bool)
-    given |= {} if is_cable else {"restitution": None}
-    load = plugin.filled(sim, kind, clearance=rest, attached=attached, **given)
-    # A setting that is zero everywhere is None: what is not there is not computed.
+    fields |= {} if is_cable else {"restitution": None}
+    load = plugin.filled(sim, kind, clearance=height_at_rest, attached=attached, **fields)
+    # A setting that is zero everywhere becomes None and is not computed.
     optional = [name for name in ("attach", "damping", "restitution", "drag") if getattr(load, name) is not None]
     load = load.replace(**{name: None for name in optional if not np.any(np.asarray(getattr(load, name)))})
     if load.drag is None:
@@ -176,7 +170,7 @@ def load_record(
             sim, plugin.name, plugin.size, plugin.rgba, float(np.max(load.length)), sim.n_drones,
             CABLE_SEGMENTS if is_cable else 1, ring,
         )  # fmt: skip
-    pos, vel = hanging_state(states, load.attach, load.length, rest, is_cable)
+    pos, vel = hanging_state(states, load.attach, load.length, height_at_rest, is_cable)
     return load.replace(pos=pos, vel=vel)
 
 

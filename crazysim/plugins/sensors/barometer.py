@@ -78,8 +78,8 @@ class Barometer(Sensor):
     def reset_episode(self, data: SimData) -> SimData:
         record = self.read(data)
         noise = normal(self.episode_key(data), (2,), record.offset.dtype)
-        drawn = record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
-        return self.write(data, drawn)
+        new_record = record.replace(offset=record.offset_spread * noise[:1], wander=record.drift * noise[1:])
+        return self.write(data, new_record)
 
     def measure(self, data: SimData, record: BarometerData, key: Array) -> tuple[Array, BarometerData]:
         noise = normal(key, (2,), record.offset.dtype)

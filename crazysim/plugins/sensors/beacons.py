@@ -78,7 +78,6 @@ class UWB(Sensor):
         return {"difference": n - 1} if self.tdoa else {"distance": n}
 
     def record(self, sim: Simulation) -> UWBData:
-        """Return the system before its first measurement."""
         anchors = _point_array("anchors", self.anchors, 2 if self.tdoa else 1)
         return self.filled(sim, UWBData, anchors=device_array(anchors, sim.data.states.pos.dtype))
 
@@ -87,7 +86,6 @@ class UWB(Sensor):
         return self._output(self._distances(data))
 
     def measure(self, data: SimData, record: UWBData, key: Array) -> tuple[Array, UWBData]:
-        """Return the distances of one drone, or their differences, m, and the record."""
         distance = self._distances(data)
         keys, shape, dtype = jax.random.split(key), distance.shape, distance.dtype
         chance = uniform(keys[0], (*shape, 2), dtype)
@@ -172,7 +170,6 @@ class Lighthouse(Sensor):
         return jnp.concatenate([angle.reshape(-1), visible.astype(angle.dtype).reshape(-1)])
 
     def measure(self, data: SimData, record: LighthouseData, key: Array) -> tuple[Array, LighthouseData]:
-        """Return the angles of one drone, rad, with where they are in view, and the record."""
         truth = self.ideal(data)
         n = truth.shape[0] // 3
         visible = jnp.repeat(truth[2 * n :], 2)
@@ -194,11 +191,7 @@ def sweep_angle(pos: Array, tilt: float) -> Array:
 
 
 def _point_array(name: str, value: ArrayLike, least: int) -> np.ndarray:
-    """Return vectors as an array. (n, 3)
-
-    Raises:
-        ConfigError: If the shape is not (n, 3), a number is not finite, or n is less than ``least``.
-    """
+    """Return vectors as an array. (n, 3)"""
     points = np.asarray(value, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < least or not np.isfinite(points).all():
         raise ConfigError(f"expected {name} as at least {least} finite vectors (n, 3), got {points.tolist()}")

@@ -140,19 +140,18 @@ class TimeOfFlight(Sensor):
         return jnp.where(sees & (distance < record.max_range), distance, record.max_range)
 
     def measure(self, data: SimData, record: TimeOfFlightData, key: Array) -> tuple[Array, TimeOfFlightData]:
-        """Return the distance of one sensor, m, and the record."""
         truth = self.ideal(data)
         deviation = record.noise + range_deviation(truth, record.far_noise)
-        near = truth < record.max_range
+        in_range = truth < record.max_range
         value = truth + deviation * normal(key, (1,), truth.dtype)
-        value = jnp.where(near, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
+        value = jnp.where(in_range, rotation.safe_clip(value, 0.0, record.max_range), record.max_range)
         return quantise(value, record.resolution), record
 
 
 def range_deviation(distance: Array, scale: Array) -> Array:
     """Return the standard deviation of a measured distance that grows with it as in ``FAR_NOISE``, m. (...)"""
-    growth, at, _ = FAR_NOISE
-    return scale * (1 + jnp.exp(growth * (distance - at)))
+    growth, reference, _ = FAR_NOISE
+    return scale * (1 + jnp.exp(growth * (distance - reference)))
 
 
 def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:

@@ -210,7 +210,6 @@ class IMU(Sensor):
         return self.write(data, record)
 
     def measure(self, data: SimData, record: IMUData, key: Array) -> tuple[Array, IMUData]:
-        """Return the angular velocity, rad/s, and the specific force, m/s^2, and the record after it."""
         s, freq, dt = data.states, data.core.freq, self.interval(data)
         ang_vel = s.ang_vel
         acc, ang_acc = freq * (s.vel - record.vel), freq * (s.ang_vel - record.ang_vel)
@@ -232,7 +231,6 @@ class IMU(Sensor):
         return jnp.concatenate([rates, forces]), record.replace(gyro=gyro, accel=accel)
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return the angular velocity, body frame, rad/s."""
         return {"ang_vel": rotation.rotate(self.read(data).quat, self.part(data, "gyro"))}
 
     def _store_velocities(self, data: SimData) -> SimData:

@@ -36,7 +36,7 @@ class MagnetometerData(PyTree):
 
 
 class Magnetometer(Sensor):
-    """Magnetic field in the sensor's frame, T. The bias of its errors is what is known as hard iron."""
+    """Magnetic field in the sensor's frame, T. The bias of its errors is known as hard iron."""
 
     field: ArrayLike = parameter()
     """Magnetic field, world frame, T: (0, 2e-5, -4.5e-5) with x east, y north and z up has the size of that in central
@@ -75,7 +75,6 @@ class Magnetometer(Sensor):
         return self.write(data, record.replace(errors=errors))
 
     def measure(self, data: SimData, record: MagnetometerData, key: Array) -> tuple[Array, MagnetometerData]:
-        """Return the field that one magnetometer measures, T, and the record after it."""
         truth = self.ideal(data)
         value, errors = record.errors.measure(truth, normal(key, (9,), truth.dtype), self.interval(data))
         return value, record.replace(errors=errors)

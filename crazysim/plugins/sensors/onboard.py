@@ -78,9 +78,9 @@ class RotorSpeeds(NoisySensor):
 
     def record(self, sim: Simulation) -> PyTree:
         require_rotors(sim, "measuring rotor speeds")
-        own = sim.data.states.rotor_vel.shape[-1]
-        if self.n_rotors != own:
-            raise ConfigError(f"expected n_rotors = {own}, that of the drones, got {self.n_rotors}")
+        n_rotors = sim.data.states.rotor_vel.shape[-1]
+        if self.n_rotors != n_rotors:
+            raise ConfigError(f"expected n_rotors = {n_rotors} as the drones have, got {self.n_rotors}")
         return super().record(sim)
 
     def ideal(self, data: SimData) -> Array:
@@ -88,7 +88,6 @@ class RotorSpeeds(NoisySensor):
         return data.states.rotor_vel
 
     def measured_states(self, data: SimData) -> dict[str, Array]:
-        """Return the rotor speeds, rpm."""
         return {"rotor_vel": self.latest(data)}
 
 
@@ -136,14 +135,14 @@ class MultiRanger(NoisySensor):
         return {"distance": self.n_rays}
 
     def record(self, sim: Simulation) -> PyTree:
-        found = sim.data.plugins.get(self.range_finder)
-        if not isinstance(found, RangeFinderData):
+        range_finder = sim.data.plugins.get(self.range_finder)
+        if not isinstance(range_finder, RangeFinderData):
             raise ConfigError(
                 f"expected a RangeFinder named {self.range_finder!r}, got none. Use sim.add(RangeFinder()) first."
             )
-        if found.direction.shape[0] != self.n_rays:
+        if range_finder.direction.shape[0] != self.n_rays:
             raise ConfigError(
-                f"expected n_rays = {found.direction.shape[0]}, those of the range finder, got {self.n_rays}"
+                f"expected n_rays = {range_finder.direction.shape[0]} as the range finder has, got {self.n_rays}"
             )
         return super().record(sim)
 
@@ -152,7 +151,6 @@ class MultiRanger(NoisySensor):
         return data.plugins[self.range_finder].distance
 
     def measure(self, data: SimData, record: NoisyData, key: Array) -> tuple[Array, NoisyData]:
-        """Return the distances of one drone, m, and the record."""
         value, record = super().measure(data, record, key)
         far = data.plugins[self.range_finder].max_range
         return jnp.where(self.ideal(data) < far, rotation.safe_clip(value, 0.0, far), far), record

@@ -49,7 +49,7 @@ class RadarData(PyTree):
 
 
 class Radar(Plugin):
-    """Radars, each detecting the drones within its lobe; nothing hides a drone.
+    """Radars, each detecting the drones within its lobe, also behind objects.
 
     The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: the range is the same in
     all directions. Settings are one for all radars, or one for each.
@@ -77,13 +77,13 @@ class Radar(Plugin):
                 f"expected pos as positions (3,) or (n_radars, 3), m, got {self.pos!r}. Use pos=(0, 0, 1), say."
             )
         dtype = sim.data.states.pos.dtype
-        found = {}
+        settings = {}
         for name in ("max_range", "exponent", "height_scale", "tilt"):
             value = np.asarray(getattr(self, name), np.float64)
             if value.shape not in ((), (len(pos),)):
                 raise ConfigError(f"expected {name} of shape () or ({len(pos)},) for each radar, got {value.shape}")
-            found[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
-        return RadarData(pos=device_array(pos, dtype), **found, exposure=drone_array(sim, 0.0, len(pos)))
+            settings[name] = device_array(np.broadcast_to(value, len(pos)), dtype)
+        return RadarData(pos=device_array(pos, dtype), **settings, exposure=drone_array(sim, 0.0, len(pos)))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         return [StagePlacement(Stage(self.count, "drone"), before="increment_steps")]

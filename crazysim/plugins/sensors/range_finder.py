@@ -84,16 +84,16 @@ class RangeFinder(Plugin):
         worlds if more can move than a step's kernel has code for.
         """
         visual, solid = sim.scene.visual_model, sim.scene.collision_model
-        moved = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
+        movers = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
         touched = {body.name for body in solid.objects}
-        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in moved)
+        objects = tuple(body for body in visual.objects if body.name in touched or body.name not in movers)
         # The outline of a drone is enough for a few rays.
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
-        moved = {name: plugin for name, plugin in moved.items() if name in touched}
+        movers = {name: plugin for name, plugin in movers.items() if name in touched}
         n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
         if self.drones:
             n_movable += sum(len(kind.geoms) * len(kind.drones or range(sim.n_drones)) for kind in model.drones)
-        scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or moved else "drone"
+        scope = "batch" if n_movable > MAX_UNROLLED_GEOMS else "world" if self.drones or movers else "drone"
         period, scene = steps_between(self, sim), sim.scene
 
         def is_due(data: SimData) -> Array:
@@ -102,7 +102,7 @@ class RangeFinder(Plugin):
 
         def measure(data: SimData) -> SimData:
             """Measure distances, to loads where they are now."""
-            present = {name: plugin for name, plugin in moved.items() if plugin.name in data.plugins}
+            present = {name: plugin for name, plugin in movers.items() if plugin.name in data.plugins}
             current = with_moved_objects(data, present)
             return self.write(data, self._measure(model, current, scope == "drone", scene.ray_kernels))
 
@@ -112,7 +112,7 @@ class RangeFinder(Plugin):
 
         fn = measure_at_times if scope == "batch" and period > 1 else measure
         when = None if period == 1 else is_due
-        why = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a kernel of their own"
+        why = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a separate kernel"
         return [StagePlacement(Stage(fn, scope, when, name="range_finder", why=why), before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -136,8 +136,10 @@ class RangeFinder(Plugin):
         direction = rotation.rotate(quat[..., None, :], record.direction)
         n_drones, n_rays = direction.shape[-3:-1]
         origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
-        own = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
+        drone_of_ray = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
         origin, direction = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
-        hits = cast_rays(model, data, origin, direction, own, self.drones, kernels=kernels, limit=record.max_range)
+        hits = cast_rays(
+            model, data, origin, direction, drone_of_ray, self.drones, kernels=kernels, limit=record.max_range
+        )
         distance = jnp.minimum(hits.distance, record.max_range).reshape(*pos.shape[:-1], n_rays)
         return record.replace(distance=distance[0] if of_drone else distance)

@@ -101,7 +101,6 @@ class Sensor(Plugin):
         return self.filled(sim, self.kind)
 
     def filled(self, sim: Simulation, kind: type[R], **given: Any) -> R:
-        """Return a record as ``Plugin.filled`` does, with measurements in its field ``samples``."""
         return super().filled(sim, kind, samples=self.samples(sim), **given)
 
     def samples(self, sim: Simulation) -> Samples:

@@ -56,16 +56,16 @@ class TriadData(PyTree):
             truth: True quantity of the first measurement, in the sensor's frame, u. (3,)
             noise: Standard normal numbers. (12,)
         """
-        drawn = self.mean + self.spread * noise[:9]
+        values = self.mean + self.spread * noise[:9]
         triad = self.replace(
-            bias=drawn[:3], scale=drawn[3:6], misalignment=drawn[6:], wander=self.instability * noise[9:]
+            bias=values[:3], scale=values[3:6], misalignment=values[6:], wander=self.instability * noise[9:]
         )
         return triad if self.filtered is None else triad.replace(filtered=triad.without_noise(truth))
 
     def without_noise(self, truth: Array) -> Array:
         """Return the measurement of one sensor before noise, low-pass, saturation and rounding, u. (3,)"""
-        turned = truth - rotation.cross(self.misalignment, truth)
-        return turned + self.scale * turned + self.bias + self.wander
+        rotated = truth - rotation.cross(self.misalignment, truth)
+        return rotated + self.scale * rotated + self.bias + self.wander
 
     def measure(self, truth: Array, noise: Array, dt: float) -> tuple[Array, TriadData]:
         """Return the measurement of one sensor, u, (3,), an interval after the last one, and the errors after it.
@@ -127,11 +127,7 @@ class Triad:
     """Smallest difference of two measurements, u; None for none. Gradients pass as if there were none."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ConfigError: If one is not finite, or out of its range.
-        """
+        """Check the numbers."""
         check_settings(self)
 
     def record(self, sim: Simulation, name: str) -> TriadData:
@@ -148,15 +144,15 @@ class Triad:
 
         def optional_field(field: str, n: int) -> Array | None:
             value = getattr(self, field)
-            named = f"{field} of {name}"
-            return None if value is None else check_parameter(sim, named, value, (n,), per_axis=True)
+            setting_name = f"{field} of {name}"
+            return None if value is None else check_parameter(sim, setting_name, value, (n,), per_axis=True)
 
         mean = join_fields("bias", "scale", "misalignment")
-        each = drone_array(sim, mean, 9)
+        means = drone_array(sim, mean, 9)
         return TriadData(
-            bias=each[..., :3],
-            scale=each[..., 3:6],
-            misalignment=each[..., 6:],
+            bias=means[..., :3],
+            scale=means[..., 3:6],
+            misalignment=means[..., 6:],
             wander=drone_array(sim, 0.0, 3),
             filtered=None if self.bandwidth is None else drone_array(sim, 0.0, 3),
             noise=vector("noise"),

@@ -97,10 +97,10 @@ def _trailers(vehicle: VehicleModel, car: Any) -> dict[str, tuple[Array, Array]]
     front, rear = (_above_plane(x, car, radius - number("wheels.radius")) for x in trailer_axles(car.state, car.params))
     turn = _rolled(car.distance / radius)
     wheels = []
-    for at, attitude in ((front, bar), (rear, deck)):
+    for origin, attitude in ((front, bar), (rear, deck)):
         for side in (half, -half):
-            offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], at.dtype))
-            wheels.append((at + offset, rotation.multiply(attitude, turn)))
+            offset = rotation.rotate(attitude, jnp.asarray([0.0, side, 0.0], origin.dtype))
+            wheels.append((origin + offset, rotation.multiply(attitude, turn)))
     pos, quat = (jnp.stack(x, axis=1) for x in zip(*wheels, strict=True))
     wheel = (pos.reshape(-1, 3), quat.reshape(-1, 4))
     return {"drawbar": (front, bar), "trailer": (front, deck), "trailer_wheel": wheel}
@@ -150,9 +150,9 @@ def _wheel(radius: float, width: float) -> str:
     rim = _geom("cylinder", (0.6 * radius, width / 2 + 0.0008), (0, 0, 0), DARK, GHOST, axis)
     spokes = ""
     for angle in np.arange(N_SPOKES) * 2 * np.pi / N_SPOKES:
-        at, turn = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
+        pos, turn = (reach * np.cos(angle), 0, -reach * np.sin(angle)), (np.cos(angle / 2), np.sin(angle / 2))
         quat = f'quat="{turn[0]:.6g} 0 {turn[1]:.6g} 0"'
-        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), at, STEEL, GHOST, quat)
+        spokes += _geom("box", (reach, width / 2 + 0.0016, 0.06 * radius), pos, STEEL, GHOST, quat)
     return _geom("cylinder", (radius, width / 2), (0, 0, 0), RUBBER, TOUCHES, axis) + rim + spokes
 
 

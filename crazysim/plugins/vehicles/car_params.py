@@ -62,9 +62,6 @@ class CarParams(PyTree):
             vehicle: The vehicle model.
             freq: Rate of the physics, Hz: at rates too low for tyres at ``SLIP_SPEED``, ``slip_speed`` is larger.
             trailer: True if the vehicle tows its trailer.
-
-        Raises:
-            ConfigError: If the vehicle lacks a number, or stops within a step.
         """
         number = vehicle.number
         n, wheel_mass, radius = number("wheels.number"), number("wheels.mass"), number("wheels.radius")

@@ -91,7 +91,6 @@ class Cars(Population):
 
     @property
     def control_freq(self) -> int | None:
-        """Rate of the controller, Hz."""
         return self.rate
 
     @property
@@ -123,8 +122,8 @@ class Cars(Population):
         if paths is not None and follows is not None:
             follows.check(vehicle, paths)
             index = starts.member_numbers("index", self._indices(paths), counts, paths.n_paths)
-            given = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
-            start = starts.member_numbers("start", given, counts)
+            start_times = starts.spread_start_times(paths, index, self.n_members) if self.start is None else self.start
+            start = starts.member_numbers("start", start_times, counts)
             pos, yaw, arc = starts.path_poses(paths, index, start, counts)
             gains, memory = follows.gains(vehicle, params, self.rate_in(freq)), follows.memory()
         if self.pos is not None:
@@ -138,7 +137,7 @@ class Cars(Population):
         z = np.asarray(height) + vehicle.number("wheels.radius")
         zero = np.zeros((*counts, 1))
         two, three = np.concatenate([zero] * 2, axis=-1), np.concatenate([zero] * 3, axis=-1)
-        held = self.level == "drive" and follows is None
+        is_held = self.level == "drive" and follows is None
         record = self.create(
             sim,
             CarData,
@@ -151,7 +150,7 @@ class Cars(Population):
             distance=zero,
             joints=np.concatenate([yaw, yaw], axis=-1) if self.trailer else None,
             command=two,
-            applied=None if held else two,
+            applied=None if is_held else two,
             force=three,
             torque=three,
             params=params,
@@ -182,9 +181,9 @@ class Cars(Population):
             drive = motor_reference(car.command[:1], acc, car.params)
             return car.replace(applied=jnp.concatenate([drive, car.command[1:]]))
         time = data.core.steps / data.core.freq - car.start[0] if self.reference == "time" else None
-        at = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
-        applied, memory = follows.update(car.state, at, car.memory, car.gains, car.params)
-        return car.replace(applied=applied, arc=at.arc, memory=memory)
+        path_point = path_state(car.state, car.path, car.index[0], car.arc, follows.ahead(car.params), time)
+        applied, memory = follows.update(car.state, path_point, car.memory, car.gains, car.params)
+        return car.replace(applied=applied, arc=path_point.arc, memory=memory)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
         car = self.read(data)
@@ -218,11 +217,7 @@ class Cars(Population):
         return self.in_scene
 
     def _check_settings(self, vehicle: VehicleModel) -> None:
-        """Check settings that are not numbers.
-
-        Raises:
-            ConfigError: If one is invalid.
-        """
+        """Check settings that are not numbers."""
         for name, allowed in (("level", ("drive", "speed")), ("reference", ("time", "arc"))):
             if getattr(self, name) not in allowed:
                 raise ConfigError(f"expected {name} of {self.name!r} as one of {allowed}, got {getattr(self, name)!r}")
@@ -236,13 +231,13 @@ class Cars(Population):
         """Return all paths in one record."""
         if self.path is None:
             return None
-        given = [self.path] if isinstance(self.path, (Path, Trajectory)) else self.path
-        if not isinstance(given, Sequence) or not all(isinstance(x, (Path, Trajectory)) for x in given):
+        paths = [self.path] if isinstance(self.path, (Path, Trajectory)) else self.path
+        if not isinstance(paths, Sequence) or not all(isinstance(x, (Path, Trajectory)) for x in paths):
             raise ConfigError(
                 f"expected a Path, a Trajectory or a sequence of them, got {self.path!r}. Use "
                 f"Path.of_points([(0, 0), (1, 0), (2, 1)])."
             )
-        return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in given])
+        return Path.stack([Path.of_trajectory(x) if isinstance(x, Trajectory) else x for x in paths])
 
     def _indices(self, paths: Path) -> ArrayLike:
         return np.arange(self.n_members) % paths.n_paths if self.index is None else self.index

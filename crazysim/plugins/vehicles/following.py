@@ -61,12 +61,12 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
         time: Time since the start for a reference by time, s; None for one by arc length. ()
     """
     heading = jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
-    at = state.pos[:2] + ahead * heading
-    arc = path.project(index, at, guess[0])
+    lookahead_pos = state.pos[:2] + ahead * heading
+    arc = path.project(index, lookahead_pos, guess[0])
     point = path.at(index, arc)
     backwards = path.speed_at(index, jnp.zeros_like(arc)) < 0
     sign = jnp.where(backwards, -1.0, 1.0)
-    tangent, off = sign * point.tangent, at - point.pos
+    tangent, off = sign * point.tangent, lookahead_pos - point.pos
     cross = tangent[0] * heading[1] - tangent[1] * heading[0]
     dot = tangent[0] * heading[0] + tangent[1] * heading[1]
     if time is None:
@@ -124,19 +124,11 @@ class PathController:
         dataclasses.dataclass(frozen=True, eq=False)(cls)
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ConfigError: If one has another type than its field, or a number is not finite or out of its range.
-        """
+        """Check the settings."""
         check_settings(self)
 
     def check(self, vehicle: VehicleModel, path: Path) -> None:
-        """Check that the controller suits vehicle and path.
-
-        Raises:
-            ConfigError: If it does not.
-        """
+        """Check that the controller suits vehicle and path."""
         name = type(self).__name__
         if path.goes_backwards and not self.backwards:
             raise ConfigError(
@@ -207,10 +199,10 @@ class PurePursuit(PathController):
         distance = self.lookahead + self.lookahead_time * jnp.abs(state.body_vel[0])
         goal = at.path.at(at.index, at.arc[0] + distance).pos
         axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
-        seen = to_world_frame(-state.yaw, goal - axle)
-        square = seen[:1] * seen[:1] + seen[1:] * seen[1:]
+        offset = to_world_frame(-state.yaw, goal - axle)
+        square = offset[:1] * offset[:1] + offset[1:] * offset[1:]
         # Past the end of an open path the point is that end, as near as one likes.
-        curvature = 2 * seen[1:] / jnp.maximum(square, 0.25 * self.lookahead * self.lookahead + 1e-4)
+        curvature = 2 * offset[1:] / jnp.maximum(square, 0.25 * self.lookahead * self.lookahead + 1e-4)
         return jnp.arctan((car.front + car.rear) * curvature), memory
 
 

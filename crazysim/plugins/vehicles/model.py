@@ -88,18 +88,14 @@ class VehicleModel:
     """Constants of a ground vehicle, as plain numbers in SI units."""
 
     name: str
-    """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without one."""
+    """Name: the key ``name``, or else the file's stem; ``custom`` for a dict without a name."""
     dynamics: str
     """Dynamics of the vehicle, one of ``DYNAMICS_NAMES``."""
     numbers: Mapping[str, NDArray[np.float64]]
     """All numbers by table and key, such as ``rigid_body.mass``."""
 
     def value(self, key: str) -> NDArray[np.float64]:
-        """Return one number or array by its table and key, such as ``rigid_body.mass``.
-
-        Raises:
-            ConfigError: If the vehicle has none.
-        """
+        """Return one number or array by its table and key, such as ``rigid_body.mass``."""
         if key not in self.numbers:
             raise ConfigError(f"vehicle {self.name!r} has no value {key!r}. Add it; {GUIDE} lists all keys.")
         return self.numbers[key]
@@ -157,12 +153,12 @@ def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
     name = str(tables.get("name", stem))
     base = _load_model(tables["base"], bases) if "base" in tables else None
     numbers = dict(base.numbers) if base is not None else {}
-    own = dict(LAYOUT.numbers(f"vehicle {name!r}{origin}", tables))
+    own_numbers = dict(LAYOUT.numbers(f"vehicle {name!r}{origin}", tables))
     for kind, other in (("torque", "force"), ("force", "torque")):
-        if f"drive.{kind}" in own:
+        if f"drive.{kind}" in own_numbers:
             numbers = {key: x for key, x in numbers.items() if not key.startswith(f"drive.{other}")}
     dynamics = tables.get("model", base.dynamics if base is not None else DYNAMICS_NAMES[0])
-    vehicle = VehicleModel(name, dynamics, numbers | own)
+    vehicle = VehicleModel(name, dynamics, numbers | own_numbers)
     _check_model(vehicle)
     return vehicle
 
@@ -177,8 +173,8 @@ def _check_model(vehicle: VehicleModel) -> None:
         )
     tyres = ("tyres.front", "tyres.rear") if vehicle.dynamics == "single_track" else ()
     trailer = tuple(key for key in KEYS if key.startswith("trailer.")) if vehicle.has_trailer else ()
-    needed = [key for key in KEYS if not key.startswith(OPTIONAL_KEYS)]
-    missing = [key for key in (*needed, *tyres, *trailer) if key not in numbers]
+    required = [key for key in KEYS if not key.startswith(OPTIONAL_KEYS)]
+    missing = [key for key in (*required, *tyres, *trailer) if key not in numbers]
     if missing:
         raise ConfigError(
             f"vehicle {name!r}: expected {', '.join(missing)}, which it lacks. Add them, or start from another vehicle "

@@ -84,9 +84,6 @@ class Path(PyTree):
         Args:
             trajectory: Trajectory of one vehicle.
             backwards: True to drive along it backwards.
-
-        Raises:
-            ConfigError: If the path has no length, stops on its way, or repeats without ending at its start.
         """
         pieces, curve = _level_curve(trajectory)
 
@@ -107,9 +104,6 @@ class Path(PyTree):
             points: Points, x and y, world frame, m; of a closed path without the first one again. (n_points, 2)
             speed: Speed, m/s; negative to drive backwards.
             closed: True for a path that ends at its start.
-
-        Raises:
-            ConfigError: If there are fewer than three points, two neighbours are equal, or the speed is zero.
         """
         xy = np.asarray(points, float)
         if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 3 or not np.all(np.isfinite(xy)):
@@ -131,10 +125,10 @@ class Path(PyTree):
             )
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         trajectory = spline(knots, np.pad(xy, ((0, 0), (0, 1))), at_rest=False)
-        begin, end = (knots[N_REPEATED_POINTS], knots[-1 - N_REPEATED_POINTS]) if closed else (0.0, knots[-1])
+        start, end = (knots[N_REPEATED_POINTS], knots[-1 - N_REPEATED_POINTS]) if closed else (0.0, knots[-1])
         _, curve = _level_curve(trajectory)
 
-        times = np.linspace(begin, end, N_SAMPLES)
+        times = np.linspace(start, end, N_SAMPLES)
         rate = np.hypot(*curve(times, 1).T)
         length = _arc_length(times, rate)[-1]
         progress = np.stack([np.linspace(0.0, length, N_TIMES), np.full(N_TIMES, abs(speed))], axis=1)
@@ -142,20 +136,16 @@ class Path(PyTree):
 
     @staticmethod
     def stack(paths: Sequence[Path]) -> Path:
-        """Return the slots of several records as one record.
-
-        Raises:
-            ConfigError: If there is none.
-        """
+        """Return the slots of several records as one record."""
         if not paths:
             raise ConfigError("expected at least one path, got none. Use Path.stack([Path.of_points(points)]).")
         n = max(path.n_pieces for path in paths)
         padded = []
         for path in paths:
-            more = n - path.n_pieces
-            last = np.repeat(path.coefficients[:, -1:], more, axis=1)
+            n_missing = n - path.n_pieces
+            last = np.repeat(path.coefficients[:, -1:], n_missing, axis=1)
             coefficients = np.concatenate([path.coefficients, last], axis=1)
-            speeds = np.concatenate([path.speeds, np.repeat(path.speeds[:, -1:], more, axis=1)], axis=1)
+            speeds = np.concatenate([path.speeds, np.repeat(path.speeds[:, -1:], n_missing, axis=1)], axis=1)
             padded.append(path.replace(coefficients=coefficients, speeds=speeds))
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *padded)
 
@@ -187,8 +177,8 @@ class Path(PyTree):
     def speed_at(self, index: Array | int, s: Array) -> Array:
         """Return the speed at an arc length, m/s; it decreases to zero before the end of an open path. (1,)"""
         piece, _ = self._locate(index, s)
-        rest = safe_clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
-        share = jnp.where(_entry_at(self.closed, index), 1.0, rest)
+        slowdown = safe_clip((_entry_at(self.length, index) - s) / STOPPING_LENGTH, 0.0, 1.0)
+        share = jnp.where(_entry_at(self.closed, index), 1.0, slowdown)
         return (share * _entry_at(self.speeds, index, piece))[None]
 
     def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
@@ -237,9 +227,9 @@ class Path(PyTree):
             point = self.at(index, s)
             off = pos - point.pos
             along = off[0] * point.tangent[0] + off[1] * point.tangent[1]
-            left = point.tangent[0] * off[1] - point.tangent[1] * off[0]
+            lateral = point.tangent[0] * off[1] - point.tangent[1] * off[0]
             s = s + safe_clip(
-                along / jnp.maximum(1 - point.curvature[0] * left, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
+                along / jnp.maximum(1 - point.curvature[0] * lateral, 0.2), -MAX_NEWTON_STEP, MAX_NEWTON_STEP
             )
             s = jnp.where(closed, s, safe_clip(s, 0.0, length))
         return s
@@ -254,8 +244,8 @@ class Path(PyTree):
         count = round(float(self.length[index]) / float(self.spacing[index]))
         u = np.linspace(0.0, 1.0, 9)[:-1]
         powers = u[:, None] ** np.arange(6)
-        at = np.einsum("uk,pak->pua", powers, np.asarray(self.coefficients[index][:count], float)).reshape(-1, 2)
-        k = int(np.argmin(np.sum((at - np.asarray(pos, float)[:2]) ** 2, axis=1)))
+        points = np.einsum("uk,pak->pua", powers, np.asarray(self.coefficients[index][:count], float)).reshape(-1, 2)
+        k = int(np.argmin(np.sum((points - np.asarray(pos, float)[:2]) ** 2, axis=1)))
         return k / 8 * float(self.spacing[index])
 
     def at_time(self, index: int, start: float) -> tuple[Floats, float, float]:
@@ -329,7 +319,7 @@ def _path_of_curve(
         )
     n = max(4, int(np.ceil(arc[-1] / MAX_PIECE_LENGTH)))
     nodes = np.interp(np.linspace(0.0, arc[-1], n + 1), arc, times)
-    inner = np.clip(nodes, times[moving[0]], times[moving[-1]])  # at rest there is no tangent
+    inner = np.clip(nodes, times[moving[0]], times[moving[-1]])  # at rest the tangent is undefined
     pos, vel, acc = curve(nodes, 0), curve(inner, 1), curve(inner, 2)
     if closed and not np.allclose(pos[0], pos[-1], atol=1e-3):
         raise ConfigError(

@@ -97,8 +97,8 @@ def lateral_gains(
     """Return the gain of the regulator at a speed and the feed-forward of curvature. (5,)"""
     A, B = lateral_model(model, car, speed)
     block = jnp.zeros((5, 5), A.dtype).at[:4, :4].set(A).at[:4, 4:].set(B)
-    held = matrix_exponential(block * period)  # the input is held for a period
-    K = gain_discrete(held[:4, :4], held[:4, 4:], Q, R)[0]
+    discrete = matrix_exponential(block * period)  # the input is held for a period
+    K = gain_discrete(discrete[:4, :4], discrete[:4, 4:], Q, R)[0]
     # Steady cornering of curvature 1: the yaw rate is the speed, and sideways velocity and steering angle balance it.
     # Of vehicles without slip the two equations are multiples of the tangent of the steering angle, and still regular.
     rows = jnp.array([1, 3])
@@ -128,7 +128,7 @@ def matrix_exponential(matrix: Array) -> Array:
     In float64 its relative error is below 1e-12 for norms up to 100.
     """
     eye, small = jnp.eye(len(matrix), dtype=matrix.dtype), matrix / 2**N_SQUARINGS
-    found = eye
+    total = eye
     for k in range(6, 0, -1):
-        found = eye + small @ found / k
-    return lax.fori_loop(0, N_SQUARINGS, lambda _, x: x @ x, found)
+        total = eye + small @ total / k
+    return lax.fori_loop(0, N_SQUARINGS, lambda _, x: x @ x, total)

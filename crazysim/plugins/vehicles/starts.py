@@ -28,9 +28,6 @@ def member_array(name: str, value: ArrayLike, counts: tuple[int, int], core: tup
         value: Positions, m, or headings, rad.
         counts: Numbers of worlds and of cars.
         core: Shape for one car.
-
-    Raises:
-        ConfigError: If it has another shape or is not finite.
     """
     array = np.asarray(value, float)
     shapes, finite = [core, (counts[1], *core), (*counts, *core)], np.all(np.isfinite(array))
@@ -51,9 +48,6 @@ def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int 
         value: Number or numbers.
         counts: Numbers of worlds and of cars.
         n: Number of paths, for indices of paths; None for real numbers.
-
-    Raises:
-        ConfigError: If it has another shape or an invalid value.
     """
     array = np.asarray(value)
     whole = n is None or (array.dtype.kind in "iu" and np.all((array >= 0) & (array < n)))
@@ -85,12 +79,12 @@ def path_poses(
     """
     index, start = (np.broadcast_to(x, (*counts, 1)) for x in (index, start))
     pos, yaw, arc = np.zeros((*counts, 2)), np.zeros((*counts, 1)), np.zeros((*counts, 1))
-    found: dict[tuple[int, float], tuple[ArrayLike, float, float]] = {}
-    for at in np.ndindex(counts):
-        key = int(index[at][0]), float(start[at][0])
-        if key not in found:
-            found[key] = paths.at_time(*key)
-        pos[at], yaw[at], arc[at] = found[key]
+    poses: dict[tuple[int, float], tuple[ArrayLike, float, float]] = {}
+    for member in np.ndindex(counts):
+        key = int(index[member][0]), float(start[member][0])
+        if key not in poses:
+            poses[key] = paths.at_time(*key)
+        pos[member], yaw[member], arc[member] = poses[key]
     return pos, yaw, arc
 
 
@@ -103,21 +97,21 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
         pos: Positions of the cars, m. (n_worlds, n_members, 2)
         arc: References, m: on closed paths the result is in the round nearest to them. (n_worlds, n_members, 1)
     """
-    index, found = np.broadcast_to(index, arc.shape), np.empty_like(arc)
-    for at in np.ndindex(arc.shape[:2]):
-        k = int(index[at][0])
-        nearest, length = paths.nearest(k, pos[at]), float(paths.length[k])
-        rounds = round((float(arc[at][0]) - nearest) / length) if paths.closed[k] else 0
-        found[at] = nearest + rounds * length
-    return found
+    index, projections = np.broadcast_to(index, arc.shape), np.empty_like(arc)
+    for member in np.ndindex(arc.shape[:2]):
+        k = int(index[member][0])
+        nearest, length = paths.nearest(k, pos[member]), float(paths.length[k])
+        rounds = round((float(arc[member][0]) - nearest) / length) if paths.closed[k] else 0
+        projections[member] = nearest + rounds * length
+    return projections
 
 
 def spread_start_times(paths: Path, index: NDArray, n: int) -> NDArray:
     """Return start times of n cars, s: spaced equally over the duration of a closed path, zero on others. (n,)"""
-    own = np.broadcast_to(index.reshape(-1)[:n], (n,))
+    indices = np.broadcast_to(index.reshape(-1)[:n], (n,))
     times = np.zeros(n)
-    for path in np.unique(own):
-        cars = np.flatnonzero(own == path)
+    for path in np.unique(indices):
+        cars = np.flatnonzero(indices == path)
         if np.asarray(paths.closed)[path]:
             times[cars] = -np.arange(len(cars)) / len(cars) * float(paths.duration[path])
     return times

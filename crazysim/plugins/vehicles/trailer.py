@@ -15,9 +15,6 @@ def trailer_rates(state: CarState, params: CarParams) -> Array:
 
     The hitch moves with the vehicle. Its velocity across the drawbar turns the drawbar, that along it moves the front
     axle, and the front axle's velocity across the deck turns the deck.
-
-    Raises:
-        ConfigError: If the parameters have no trailer.
     """
     if params.trailer is None or state.joints is None:
         raise ConfigError(
@@ -36,7 +33,7 @@ def trailer_axles(state: CarState, params: CarParams) -> tuple[Array, Array]:
     """Return the positions of the middles of the trailer's front and rear axle, world frame, m. (..., 2) each"""
     hitch, drawbar, axles = (params.trailer[..., k : k + 1] for k in range(3))  # type: ignore[index]
     zero = jnp.zeros_like(state.yaw)
-    at = state.pos[..., :2] + to_world_frame(state.yaw, jnp.concatenate([zero - hitch, zero], axis=-1))
-    front = at + to_world_frame(state.joints[..., :1], jnp.concatenate([zero - drawbar, zero], axis=-1))  # type: ignore[index]
+    hitch_pos = state.pos[..., :2] + to_world_frame(state.yaw, jnp.concatenate([zero - hitch, zero], axis=-1))
+    front = hitch_pos + to_world_frame(state.joints[..., :1], jnp.concatenate([zero - drawbar, zero], axis=-1))  # type: ignore[index]
     rear = front + to_world_frame(state.joints[..., 1:], jnp.concatenate([zero - axles, zero], axis=-1))  # type: ignore[index]
     return front, rear

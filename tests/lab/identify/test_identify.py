@@ -142,7 +142,7 @@ def test_missing_columns_are_named(flights):
 
 
 def test_times_of_few_digits_are_refused(flights):
-    with pytest.raises(ConfigError, match="expected a time of its own for each sample, got 21 times of 500"):
+    with pytest.raises(ConfigError, match="expected a different time for each sample, got 21 times of 500"):
         read_log(flights[0] | {"t": np.round(flights[0]["t"], 1)})
 
 

@@ -359,7 +359,7 @@ def test_law_09_channels_times_and_links_are_checked():
         link.channels[4] = 70000
         with pytest.raises(ConfigError, match="channels to be from 0 to 65535"):
             link.send(SoftwareInTheLoop(Sim(control="rotor_vel"), link).measure()[0])
-        with pytest.raises(ConfigError, match="a link of its own for each of 2 drones, got one twice"):
+        with pytest.raises(ConfigError, match="one link for each of 2 drones, got one twice"):
             SoftwareInTheLoop(Sim(n_drones=2, control="rotor_vel"), [link, link])
         with pytest.raises(ConfigError, match="a link to firmware or a list of them, got 'ardupilot'"):
             SoftwareInTheLoop(Sim(control="rotor_vel"), "ardupilot")

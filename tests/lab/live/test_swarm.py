@@ -378,7 +378,7 @@ def test_a_loop_calls_the_swarm_and_shows_its_colours(swarm):
     live = Live(swarm.sim)
     swarm(live)
     np.testing.assert_array_equal(live.lights[0], swarm.colors)
-    with pytest.raises(ConfigError, match="that of another"):
+    with pytest.raises(ConfigError, match="got the loop of another simulation"):
         swarm(Live(Sim(control="state")))
 
 

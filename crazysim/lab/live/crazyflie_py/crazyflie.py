@@ -29,11 +29,11 @@ class TimeHelper:
         return self.node.time
 
     def sleep(self, duration: float) -> None:
-        """Let time pass, s."""
+        """Wait for a time, s."""
         self.node.sleep(duration)
 
     def sleepForRate(self, rateHz: float) -> None:
-        """Let time pass until a loop that calls this at its end has run at a rate, Hz."""
+        """Wait at the end of a loop so that it runs at a rate, Hz."""
         if self.nextTime is None or self.rateHz != rateHz:
             self.rateHz, self.nextTime = rateHz, self.time() + 1 / rateHz
         self.sleep(max(self.nextTime - self.time(), 0.0))
@@ -78,7 +78,7 @@ class Crazyflie:
         self._command(lambda c: c.go_to(goal, yaw, duration, relative), groupMask)
 
     def uploadTrajectory(self, trajectoryId: int, pieceOffset: int, trajectory: Trajectory) -> None:
-        """Store a trajectory; pieces have memory of their own, so the offset is not used."""
+        """Store a trajectory; the offset is not used, since pieces are not kept in the memory of commands."""
         self._command(lambda c: c.upload(trajectoryId, trajectory.path()))
 
     def startTrajectory(
@@ -93,7 +93,7 @@ class Crazyflie:
         self._command(lambda c: c.start_trajectory(trajectoryId, timescale, relative, reverse), groupMask)
 
     def notifySetpointsStop(self, remainValidMillisecs: float = 100, groupMask: int = 0) -> None:
-        """Let high-level commands take over from streamed setpoints after a time, ms."""
+        """Return from streamed setpoints to high-level commands after a time, ms."""
         self._command(lambda c: c.notify_setpoints_stop(remainValidMillisecs / 1000), groupMask)
 
     def arm(self, arm: bool = True) -> None:
@@ -123,11 +123,7 @@ class Crazyflie:
             self.setParam(f"ring.solid{color}", int(255 * value))
 
     def getParam(self, name: str) -> float:
-        """Return a parameter.
-
-        Raises:
-            ConfigError: If the simulation has no such parameter.
-        """
+        """Return a parameter."""
         return self._swarm.parameters[self._index].get_value(name)
 
     def setParam(self, name: str, value: float) -> None:
@@ -151,7 +147,7 @@ class Crazyflie:
         """Return name, time, bits of the supervisor, battery voltage, V, state of the power management and radio.
 
         The battery's values come from the plugin ``Battery``; without it the battery is never empty. There is no radio:
-        its strength is the one without loss, and no packets are counted.
+        its strength is perfect, and no packets are counted.
         """
         now, c = self._swarm.time, self._commander
         supervisor = (0 if c.locked else 1) | c.armed << 1 | c.armed << 3 | c.motors_on << 4 | c.locked << 6
@@ -186,7 +182,7 @@ class CrazyflieServer:
     crazyfliesByName: dict[str, Crazyflie]
     """Drones by name."""
     crazyfliesById: dict[int, Crazyflie]
-    """Drones by number: that at the end of their names, or their place from 1 on."""
+    """Drones by the number at the end of their names, or else by their position in the order, from 1 on."""
 
     def __init__(self, swarm: Swarm):
         self._swarm = swarm
@@ -199,11 +195,11 @@ class CrazyflieServer:
         self._all(lambda cf: cf.emergency())
 
     def takeoff(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
-        """Let all rise to a height, m, within a time, s."""
+        """Make all rise to a height, m, within a time, s."""
         self._all(lambda cf: cf.takeoff(targetHeight, duration, groupMask))
 
     def land(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
-        """Let all sink to a height, m, within a time, s, and stop their motors."""
+        """Make all sink to a height, m, within a time, s, and stop their motors."""
         self._all(lambda cf: cf.land(targetHeight, duration, groupMask))
 
     def goTo(self, goal: ArrayLike, yaw: float, duration: float, groupMask: int = 0) -> None:
@@ -218,7 +214,7 @@ class CrazyflieServer:
         relative: bool = True,
         groupMask: int = 0,
     ) -> None:
-        """Let all follow the trajectory of a number, each its own."""
+        """Start the trajectory that each drone has stored under a number."""
         self._all(lambda cf: cf.startTrajectory(trajectoryId, timescale, reverse, relative, groupMask))
 
     def arm(self, arm: bool = True) -> None:

@@ -20,7 +20,7 @@ _chosen_swarm: Swarm | None = None
 
 
 def use(swarm: Swarm | None) -> None:
-    """Let the next ``Crazyswarm()`` of a script fly this swarm; None for one of its own."""
+    """Make the next ``Crazyswarm()`` of a script fly this swarm; None for a new one."""
     global _chosen_swarm
     _chosen_swarm = swarm
 

@@ -69,7 +69,7 @@ class Trajectory:
         """Read pieces: in each row the duration and eight coefficients each of x, y, z and yaw.
 
         Raises:
-            ConfigError: If the file is none of these.
+            ConfigError: If the file has another format.
         """
         try:
             rows = np.loadtxt(filename, delimiter=",", skiprows=int(skip_first_row), usecols=range(33), ndmin=2)
@@ -88,15 +88,17 @@ class Trajectory:
     def eval(self, t: float) -> TrajectoryOutput:
         """Return the point at a time, s; beyond the ends, the end point."""
         path = self.path()
-        found = path.derivatives(t, 2)
-        return TrajectoryOutput(found[0, :3], found[1, :3], found[2, :3], np.array([0, 0, found[1, 3]]), found[0, 3])
+        derivatives = path.derivatives(t, 2)
+        return TrajectoryOutput(
+            derivatives[0, :3],
+            derivatives[1, :3],
+            derivatives[2, :3],
+            np.array([0, 0, derivatives[1, 3]]),
+            derivatives[0, 3],
+        )
 
     def path(self) -> HostTrajectory:
-        """Return the trajectory for ``Commander.upload``.
-
-        Raises:
-            ConfigError: If there are no pieces, or they have different degrees or a wrong duration.
-        """
+        """Return the trajectory for ``Commander.upload``."""
         axes = [[p.px.p, p.py.p, p.pz.p, p.pyaw.p] for p in self.polynomials]
         durations = np.array([p.duration for p in self.polynomials], float)
         n = max((len(c) for piece in axes for c in piece), default=0)

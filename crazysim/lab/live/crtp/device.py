@@ -1,4 +1,4 @@
-"""A simulated Crazyflie at the other end of CRTP: answers to packets, and packets of its own.
+"""A simulated Crazyflie at the other end of CRTP: answers to packets, and packets that it sends unasked.
 
 Ports, channels and layouts are as in cflib 0.1.34 and crazyflie-firmware, protocol version 12. A packet is a byte
 with port and channel, and up to 30 more. Packets of another form are reported and ignored.
@@ -43,7 +43,7 @@ MEMORY_SIZE = 4096
 TRAJECTORY_MEMORY, LED_MEMORY, DECK_MEMORY = 0x12, 0x10, 0x19
 """Types of the memories of trajectories, of the LED ring and of decks (``MemoryElement`` of cflib)."""
 DECKS = bytes([3]) + bytes(8 * 32)
-"""Memory of decks: its version, and eight descriptions, none of which is valid, as no deck has a memory of its own."""
+"""Memory of decks: its version, and eight invalid descriptions, since no deck has memory."""
 MAX_LINES = 256
 """Most packets of console text that wait for a client."""
 
@@ -104,7 +104,7 @@ class CrtpDevice:
     # Packets --------------------------------------------------------------------------------------------------------
 
     def handle(self, packet: bytes) -> list[bytes]:
-        """Return the answers to a packet, whatever it is."""
+        """Return the answers to any packet."""
         if not packet:
             return []
         if packet == b"\xff":  # probe of a scan
@@ -125,10 +125,10 @@ class CrtpDevice:
 
     def due(self) -> list[bytes]:
         """Return the packets that have become due at the swarm's time: lines of the console, and logs."""
-        now, found = self.swarm.time, []
+        now, packets = self.swarm.time, []
         with self.swarm.lock:
             while self._console:
-                found.append(bytes([CONSOLE << 4 | 0x0C]) + self._console.popleft())
+                packets.append(bytes([CONSOLE << 4 | 0x0C]) + self._console.popleft())
             state = self.commander.estimate(self.swarm.state(self.drone))
             for identity, block in self.blocks.items():
                 if block.period is None or now < block.due - 1e-9:
@@ -138,8 +138,8 @@ class CrtpDevice:
                 block.due = max(block.due + block.period, now)
                 stamp = struct.pack("<I", round(now * 1000) & 0xFFFFFF)[:3]
                 values = b"".join(self._value(k, layout, state) for k, layout in block.variables)
-                found.append(bytes([LOGGING << 4 | 0x0C | 2, identity]) + stamp + values)
-        return found
+                packets.append(bytes([LOGGING << 4 | 0x0C | 2, identity]) + stamp + values)
+        return packets
 
     def _value(self, k: int, layout: str, state: object) -> bytes:
         name = self.log.variables[k].name
@@ -151,7 +151,7 @@ class CrtpDevice:
         return pack(layout, value)
 
     def _report(self, text: str) -> None:
-        """Report what was refused, on the drone's console too."""
+        """Report a refused command, on the drone's console too."""
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
         line = f"{text}\n".encode("ascii", "replace")
         self._console.extend(line[k : k + MAX_DATA] for k in range(0, len(line), MAX_DATA))
@@ -196,7 +196,7 @@ class CrtpDevice:
     def _setpoint(self, channel: int, data: bytes) -> list[Packet]:
         """Take roll, pitch, yaw and thrust in the modes of ``flightmode``; no thrust stops the motors.
 
-        crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with that of the world.
+        crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with the sign of the world frame.
         """
         roll, pitch, yaw, thrust = struct.unpack("<fffH", data)
         if thrust == 0:
@@ -316,11 +316,11 @@ class CrtpDevice:
         command = data[0]
         if command == 0:
             group, name, rest = data[1:].split(b"\0", 2)
-            full = f"{group.decode()}.{name.decode()}"
+            full_name = f"{group.decode()}.{name.decode()}"
             code = errno.ENOENT
             formats = {number: layout for number, layout in PARAM_TYPES.values()}
-            if full in self.values and rest[0] in formats:
-                self._set(full, struct.unpack(formats[rest[0]], rest[1:])[0])
+            if full_name in self.values and rest[0] in formats:
+                self._set(full_name, struct.unpack(formats[rest[0]], rest[1:])[0])
                 code = 0
             return [(PARAM, 3, data[: len(data) - len(rest)] + bytes([code]))]
         (k,) = struct.unpack("<H", data[1:3])
@@ -350,8 +350,8 @@ class CrtpDevice:
         length = content[0] if channel == 1 else len(content)
         ok = address + length <= len(memory) and length <= 24
         if channel == 1:
-            found = bytes(memory[address : address + length]) if ok else b""
-            return [(MEM, 1, data[:5] + bytes([0 if ok else errno.EIO]) + found)]
+            contents = bytes(memory[address : address + length]) if ok else b""
+            return [(MEM, 1, data[:5] + bytes([0 if ok else errno.EIO]) + contents)]
         if channel != 2:
             return []
         if not isinstance(memory, bytearray):

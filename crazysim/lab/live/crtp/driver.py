@@ -14,9 +14,9 @@ _drivers: dict[int, type] = {}
 
 
 def add_cflib_driver(swarm: Swarm) -> list[str]:
-    """Let ``cflib`` connect to the drones of a swarm in this process, and return their URIs, ``sim://cf1`` and so on.
+    """Make the drones of a swarm in this process available to ``cflib``; return their URIs, ``sim://cf1`` and so on.
 
-    It may be called before or after ``cflib.crtp.init_drivers()``. A later swarm hides an earlier one with its names.
+    It may be called before or after ``cflib.crtp.init_drivers()``. A later swarm hides an earlier one of equal names.
 
     Raises:
         ConfigError: If cflib is not installed.
@@ -70,7 +70,7 @@ def _driver(swarm: Swarm) -> type:
                     self._enqueue(answer)
 
         def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
-            """Return the next packet; None if there is none within a time, s."""
+            """Return the next packet; None if none arrives within a time, s."""
             try:
                 return self._queue.get(wait != 0, None if wait < 0 else wait)
             except queue.Empty:

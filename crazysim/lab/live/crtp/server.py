@@ -70,7 +70,6 @@ class CrtpServer(Closing):
         return [f"udp://{host if host != '0.0.0.0' else '127.0.0.1'}:{port}" for host, port in addresses]
 
     def close(self) -> None:
-        """Stop listening."""
         self._stopped.set()
         self._thread.join()
         self.swarm.listeners.remove(self._send_due)
@@ -93,7 +92,7 @@ class CrtpServer(Closing):
                         self._sockets[k].sendto(answer, address)
                 except OSError:  # of a client that is gone
                     continue
-                except Exception:  # the other drones are answered nevertheless
+                except Exception:  # the other drones still get answers
                     log.exception("%s: a packet was not answered", self.swarm.names[k])
 
     def _send_due(self) -> None:

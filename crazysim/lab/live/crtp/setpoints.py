@@ -126,15 +126,15 @@ def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     units = np.array([0.001, 0.001, 0.001, math.radians(0.1)])
     durations, pieces = [], []
     try:
-        last, at = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
-        while (head := struct.unpack_from("<BH", memory, at))[1] > 0:
+        last, position = np.array(struct.unpack_from("<4h", memory, offset)) * units, offset + 8
+        while (head := struct.unpack_from("<BH", memory, position))[1] > 0:
             kinds, ms = head
-            at += 3
+            position += 3
             rows = []
             for axis in range(4):
                 n_points = N_POINTS[kinds >> (2 * axis) & 3]
-                points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, at)) * units[axis]]
-                at += 2 * n_points
+                points = [last[axis], *np.array(struct.unpack_from(f"<{n_points}h", memory, position)) * units[axis]]
+                position += 2 * n_points
                 c = power_coefficients(np.array(points)[:, None])[0]
                 rows.append(np.pad(c, (0, 8 - len(c))))
                 last[axis] = points[-1]

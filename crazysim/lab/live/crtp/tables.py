@@ -28,7 +28,7 @@ PARAM_TYPES = {
 READ_ONLY_BIT = 0x40
 """Bit of the type of a parameter that cannot be written."""
 OUT_OF_RANGE_DISTANCE = 32767
-"""Distance where nothing is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
+"""Distance if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
 RANGES = {"down": "zrange"}
 """Log variables of directions that have another name."""
 
@@ -51,11 +51,7 @@ class Table:
     """Variables with consecutive numbers, as the protocol transfers them."""
 
     def __init__(self, variables: list[Variable], types: Mapping[str, tuple[int, str]]):
-        """Create a table with numbered variables.
-
-        Raises:
-            ConfigError: If a name has no group, is there twice or is too long for a packet, or a type does not exist.
-        """
+        """Create a table with numbered variables."""
         self.variables, self.types = variables, types
         self.ids = {variable.name: k for k, variable in enumerate(variables)}
         for variable in variables:
@@ -78,7 +74,7 @@ class Table:
 
 
 def pack(layout: str, value: float) -> bytes:
-    """Return a number in a format; integers are rounded, and all are limited to what the format holds."""
+    """Return a number in a format; integers are rounded, and all are clipped to the range of the format."""
     if layout in ("<f", "<e"):
         largest = 3.4e38 if layout == "<f" else 65504.0
         return struct.pack(layout, value if math.isnan(value) else min(max(value, -largest), largest))

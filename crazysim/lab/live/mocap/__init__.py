@@ -1,4 +1,4 @@
-"""Motion capture: sources of poses, the rules for what they send, recordings, and twins in the scene."""
+"""Motion capture: sources of poses, rules for their measurements, recordings, and twins in the scene."""
 
 from crazysim.lab.live.mocap.capture import SYSTEMS, MotionCaptureSource
 from crazysim.lab.live.mocap.frames import Convention, Frame

@@ -1,7 +1,7 @@
 """Motion capture systems of laboratories, read through the package ``motioncapture`` (libmotioncapture).
 
 That package holds Python's global lock while it waits for the network (seen with its version 1.1, for OptiTrack and
-Vicon), which would stop the simulation with the source. It therefore runs in a process of its own, and a thread reads
+Vicon), which would stop the simulation with the source. It therefore runs in another process, and a thread reads
 the frames from a pipe.
 """
 
@@ -65,7 +65,6 @@ class MotionCaptureSource(ThreadSource):
         self.start()
 
     def stream(self, stopped: threading.Event) -> Iterator[Frame]:
-        """Yield the frames that the worker prints."""
         while not stopped.is_set():
             line = self._worker.stdout.readline(MAX_LINE)
             if not line:
@@ -76,7 +75,6 @@ class MotionCaptureSource(ThreadSource):
             yield parse(message)
 
     def close(self) -> None:
-        """Disconnect: end the worker and the thread."""
         self._stopped.set()
         self._worker.kill()
         super().close()
@@ -89,7 +87,7 @@ def parse(message: dict) -> Frame:
     """Return the frame of a worker's message: ``{"t": s, "bodies": [[name, x, y, z, qx, qy, qz, qw], ...]}``.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If the message is malformed.
     """
     bodies = message["bodies"]
     if not all(len(body) == 8 and isinstance(body[0], str) for body in bodies):

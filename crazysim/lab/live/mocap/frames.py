@@ -33,9 +33,6 @@ class Frame:
             stamp: Time of the measurement, s.
             bodies: Position and attitude of each body.
             received: Time of arrival, s; None for ``stamp``.
-
-        Raises:
-            ConfigError: If a pose has a wrong shape.
         """
         try:
             pos = np.array([p for p, _ in bodies.values()], float).reshape(len(bodies), 3)

@@ -49,11 +49,6 @@ class Playback(Plugin):
     name: str = "playback"
 
     def record(self, sim: Simulation) -> PlaybackData:
-        """Return the samples, with velocities from their differences.
-
-        Raises:
-            ConfigError: If shapes do not fit, or a number is not finite.
-        """
         pos, quat, start = (np.asarray(x, float) for x in (self.pos, self.quat, self.start))
         n = len(self.handles)
         if pos.ndim != 3 or pos.shape[1:] != (n, 3) or quat.shape != (*pos.shape[:2], 4) or len(pos) < 2:
@@ -76,7 +71,6 @@ class Playback(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stage that moves the objects."""
         del sim
         return [StagePlacement(stage("world")(self.move))]
 
@@ -84,9 +78,9 @@ class Playback(Plugin):
         """Return the data of one world with the objects at their poses."""
         record = self.read(data)
         last = record.pos.shape[0] - 1
-        at = jnp.clip((data.core.steps / data.core.freq + record.start) * record.freq, 0, last)
-        before = jnp.minimum(jnp.floor(at), last - 1)
-        share, k = at - before, before.astype(jnp.int32)
+        sample = jnp.clip((data.core.steps / data.core.freq + record.start) * record.freq, 0, last)
+        before = jnp.minimum(jnp.floor(sample), last - 1)
+        share, k = sample - before, before.astype(jnp.int32)
         pos, quat, vel = (x[k] + share * (x[k + 1] - x[k]) for x in (record.pos, record.quat, record.vel))
         quat = quat / jnp.sqrt(jnp.sum(quat * quat, axis=-1, keepdims=True))
         objects = data.objects
@@ -96,9 +90,9 @@ class Playback(Plugin):
             parts = [new[rows[k]] if k in rows else old[..., k, :].reshape(old.shape[-1]) for k in range(old.shape[-2])]
             return jnp.stack(parts).reshape(old.shape)
 
-        moved = objects.replace(
+        moved_objects = objects.replace(
             pos=replace_rows(objects.pos, pos),
             quat=replace_rows(objects.quat, quat),
             vel=replace_rows(objects.vel, vel),
         )
-        return data.replace(objects=moved)
+        return data.replace(objects=moved_objects)

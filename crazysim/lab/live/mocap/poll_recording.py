@@ -39,7 +39,7 @@ class MocapRecorder(Closing):
         self._ids: dict[str, int] = {}
 
     def write(self, poll: Poll) -> None:
-        """Append a poll with its frames; nothing of it is kept in memory."""
+        """Append a poll with its frames, without keeping them in memory."""
         new = [name for frame in poll.frames for name in frame.names if name not in self._ids]
         if new:
             new = list(dict.fromkeys(new))
@@ -53,7 +53,6 @@ class MocapRecorder(Closing):
         self._journal.append(POLL_CHUNK, b"".join(parts))
 
     def close(self) -> None:
-        """Close the file."""
         self._journal.close()
 
 
@@ -62,7 +61,7 @@ def read_polls(path: str | Path) -> Iterator[Poll]:
 
     Raises:
         ConfigError: If the file does not exist.
-        DamagedFileError: If it is no recording.
+        DamagedFileError: If the file is not a recording.
     """
     remedy = "Write a recording with Twins(..., record=path)."
     names: list[str] = []
@@ -78,13 +77,13 @@ def read_polls(path: str | Path) -> Iterator[Poll]:
 
 def _poll(content: bytes, names: list[str]) -> Poll:
     now, n_frames, lost = POLL_LAYOUT.unpack_from(content)
-    at, frames = POLL_LAYOUT.size, []
+    offset, frames = POLL_LAYOUT.size, []
     for _ in range(n_frames):
-        stamp, received, n = FRAME_LAYOUT.unpack_from(content, at)
-        at += FRAME_LAYOUT.size
-        ids = np.frombuffer(content, "<u4", n, at)
-        poses = np.frombuffer(content, "<f8", 7 * n, at + 4 * n).reshape(n, 7)
-        at += 60 * n
+        stamp, received, n = FRAME_LAYOUT.unpack_from(content, offset)
+        offset += FRAME_LAYOUT.size
+        ids = np.frombuffer(content, "<u4", n, offset)
+        poses = np.frombuffer(content, "<f8", 7 * n, offset + 4 * n).reshape(n, 7)
+        offset += 60 * n
         frames.append(Frame(stamp, tuple(names[k] for k in ids), poses[:, :3], poses[:, 3:], received))
     return Poll(now, frames, lost)
 
@@ -102,7 +101,7 @@ class ReplaySource(MocapSource):
         """Open a recording.
 
         Raises:
-            ConfigError: If it does not exist or is none, or ``by`` is neither ``"poll"`` nor ``"time"``.
+            ConfigError: If the file does not exist or is not a recording.
         """
         if by not in ("poll", "time"):
             raise ConfigError(f"expected by as 'poll' or 'time', got {by!r}")
@@ -130,7 +129,6 @@ class ReplaySource(MocapSource):
 
     @property
     def ended(self) -> str | None:
-        """Reason for which there are no more frames; None while there are."""
         n = len(self._polls) if self.by == "poll" else len(self._frames)
         return "the recording ended" if self._next >= n else None
 

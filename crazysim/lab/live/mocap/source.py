@@ -1,4 +1,4 @@
-"""Sources of motion capture frames: threads of their own, functions of time, and trajectories of a show."""
+"""Sources of motion capture frames: threads, functions of time, and trajectories of a show."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class MocapSource(Closing):
 
 
 class FunctionSource(MocapSource):
-    """Poses as a function of simulated time, sampled at a rate of their own; a run can be repeated bit for bit."""
+    """Poses as a function of simulated time, sampled at a rate in simulated time; a run can be repeated bit for bit."""
 
     simulated = True
 
@@ -81,9 +81,6 @@ class FunctionSource(MocapSource):
             freq: Frames per second, Hz.
             convention: Convention of the poses; None for crazysim's.
             name: Name in reports.
-
-        Raises:
-            ConfigError: If the rate is not positive.
         """
         if not 0 < freq < np.inf:
             raise ConfigError(f"expected a positive number of frames per second, got {freq!r}. Use freq=120.")
@@ -113,27 +110,24 @@ def show_source(
         trajectories: One trajectory for each body, or one record with a leading axis.
         names: Names of the bodies; None for ``vcf0``, ``vcf1``, ...
         freq: Frames per second, Hz.
-
-    Raises:
-        ConfigError: If there is not one name for each trajectory.
     """
-    given = host_trajectories(trajectories)
-    names = [f"vcf{k}" for k in range(len(given))] if names is None else list(names)
-    if len(names) != len(given) or len(set(names)) < len(names):
+    paths = host_trajectories(trajectories)
+    names = [f"vcf{k}" for k in range(len(paths))] if names is None else list(names)
+    if len(names) != len(paths) or len(set(names)) < len(names):
         raise ConfigError(
-            f"expected {len(given)} different names, one for each trajectory, got {names}. Leave them out for vcf0, "
+            f"expected {len(paths)} different names, one for each trajectory, got {names}. Leave them out for vcf0, "
             f"vcf1, ..."
         )
 
     def bodies(stamp: float) -> dict[str, tuple[ArrayLike, ArrayLike]]:
-        points = [path.at(stamp) for path in given]
+        points = [path.at(stamp) for path in paths]
         return {n: (p[:3], from_yaw(p[3])) for n, p in zip(names, points, strict=True)}
 
     return FunctionSource(bodies, freq, name="show")
 
 
 class ThreadSource(MocapSource):
-    """Base of sources that wait for frames in a thread of their own, such as network clients.
+    """Base of sources that wait for frames in a thread, such as network clients.
 
     A subclass yields frames from ``stream`` in the convention of its system. An error there ends the source, not the
     simulation; ``ended`` has the reason.
@@ -163,7 +157,6 @@ class ThreadSource(MocapSource):
         raise NotImplementedError
 
     def poll(self, step: int, freq: int) -> Poll:
-        """Return the frames that have arrived since the last call."""
         frames = []
         while self._frames:
             frames.append(self._frames.popleft())
@@ -174,7 +167,6 @@ class ThreadSource(MocapSource):
 
     @property
     def ended(self) -> str | None:
-        """Reason for which the source sends no more frames; None while it may."""
         return self._ended
 
     def close(self) -> None:
@@ -211,11 +203,10 @@ class RealTimeSource(ThreadSource):
         self._source, self._speed = source, speed
 
     def stream(self, stopped: threading.Event) -> Iterator[Frame]:
-        """Yield the frames at their times."""
-        begin, k = time.monotonic(), 0
+        start_time, k = time.monotonic(), 0
         while not stopped.is_set():
             stamp = k / self._source.freq
-            wait = begin + stamp / self._speed - time.monotonic()
+            wait = start_time + stamp / self._speed - time.monotonic()
             if wait > 0 and stopped.wait(wait):
                 return
             frame = self._source.frame(stamp)

@@ -1,4 +1,4 @@
-"""Reports of live sources: what happened, to which name, at which time."""
+"""Reports of live sources: kind of event, name and time."""
 
 from __future__ import annotations
 

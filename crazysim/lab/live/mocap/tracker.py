@@ -28,7 +28,7 @@ class Rules:
     max_speed: float = setting(default=10.0, low=0.0)
     """Largest speed of a body, m/s; a body that is faster has jumped."""
     slack: float = setting(default=0.05, low=0.0)
-    """Distance that is no jump, m."""
+    """Longest distance that is not a jump, m."""
     confirm: int = setting(default=3, low=1)
     """Number of consecutive frames that agree on a new place after which a jump is accepted."""
     late: float = setting(default=0.05, low=0.0)
@@ -41,11 +41,7 @@ class Rules:
     """Step back of the source's clock that counts as its restart, s; a smaller one is an old frame."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ConfigError: If one is not finite, or out of its range.
-        """
+        """Check the numbers."""
         check_settings(self)
 
 
@@ -77,9 +73,6 @@ class Tracker:
             names: Names of the bodies in the stream.
             rules: Limits; None for the defaults.
             source: Name of the source in reports.
-
-        Raises:
-            ConfigError: If a name is there twice.
         """
         if len(set(names)) < len(names):
             raise ConfigError(f"expected different names, got {list(names)}. List each body once.")
@@ -143,7 +136,7 @@ class Tracker:
         return True
 
     def restart(self) -> None:
-        """Accept the next frame whatever its time; poses stay, and velocities begin again at zero."""
+        """Accept the next frame with any time; poses stay, and velocities restart at zero."""
         self._stamps[self.seen] = -np.inf
         self._least_delay, self._least_at, self._stamp, self._received = np.inf, -np.inf, None, None
 
@@ -190,20 +183,20 @@ class Tracker:
 
     def _rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
         """Return the entries of a frame that are used, and the rows of their bodies."""
-        found = self._maps.get(names)
-        if found is None:
+        mapping = self._maps.get(names)
+        if mapping is None:
             twice = sorted({name for name in names if names.count(name) > 1} & set(self._rows_of))
             entries = [i for i, name in enumerate(names) if name in self._rows_of and name not in twice]
             rows = np.array([self._rows_of[names[i]] for i in entries], int)
-            found = np.array(entries, int), rows, twice
+            mapping = np.array(entries, int), rows, twice
             if len(self._maps) > 1000:
                 self._maps.clear()
-            self._maps[names] = found
+            self._maps[names] = mapping
             for name in set(names) - set(self._rows_of) - self._unknown:
                 if len(self._unknown) < 1000:
                     self._unknown.add(name)
                     self._report("unknown", name, now, "no object of the scene has this name; it is ignored")
-        entries, rows, twice = found
+        entries, rows, twice = mapping
         for name in twice:
             self._report("duplicate", name, now, "name twice in a frame; it keeps its pose")
         return entries, rows
@@ -218,10 +211,10 @@ class Tracker:
                 self._report("invalid", self.names[k], now, "pose not finite, or quaternion zero; it keeps its pose")
             rows, pos, quat, norm = rows[valid], pos[valid], quat[valid], norm[valid]
         dt = now - self._stamps[rows]
-        moved = pos - self.pos[rows]
-        known = self.seen[rows] & np.isfinite(dt)
-        far = np.sqrt((moved * moved).sum(-1))
-        ok = ~known | (far <= self.rules.max_speed * np.where(known, dt, 0.0) + self.rules.slack)
+        step = pos - self.pos[rows]
+        was_seen = self.seen[rows] & np.isfinite(dt)
+        far = np.sqrt((step * step).sum(-1))
+        ok = ~was_seen | (far <= self.rules.max_speed * np.where(was_seen, dt, 0.0) + self.rules.slack)
         relocated = np.zeros(len(rows), bool)
         if not ok.all():
             relocated = self._suspects(rows, pos, far, ok, now)
@@ -229,10 +222,10 @@ class Tracker:
         self._n_suspect[rows[ok]] = 0
         for k in rows[ok & self._lost[rows]]:
             self._report("found", self.names[k], now, "valid pose again")
-        rows, pos, quat, norm, dt, moved = rows[ok], pos[ok], quat[ok], norm[ok], dt[ok], moved[ok]
-        still = ~known[ok] | relocated[ok] | self._lost[rows]
+        rows, pos, quat, norm, dt, step = rows[ok], pos[ok], quat[ok], norm[ok], dt[ok], step[ok]
+        still = ~was_seen[ok] | relocated[ok] | self._lost[rows]
         dt = np.where(still, np.inf, np.maximum(dt, far[ok] / self.rules.max_speed))
-        self.vel[rows] = moved / np.where(dt > 0, dt, np.inf)[:, None]
+        self.vel[rows] = step / np.where(dt > 0, dt, np.inf)[:, None]
         self.pos[rows], self.quat[rows] = pos, quat / norm[:, None]
         self._stamps[rows], self.seen[rows], self._lost[rows] = now, True, False
 
@@ -241,8 +234,8 @@ class Tracker:
         accepted = np.zeros(len(rows), bool)
         for i in np.flatnonzero(~ok):
             k = rows[i]
-            near = np.linalg.norm(pos[i] - self._suspect[k]) <= self.rules.slack
-            self._n_suspect[k] = self._n_suspect[k] + 1 if near and self._n_suspect[k] else 1
+            is_near = np.linalg.norm(pos[i] - self._suspect[k]) <= self.rules.slack
+            self._n_suspect[k] = self._n_suspect[k] + 1 if is_near and self._n_suspect[k] else 1
             self._suspect[k] = pos[i]
             if self._n_suspect[k] >= self.rules.confirm:
                 accepted[i] = True

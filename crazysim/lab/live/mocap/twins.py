@@ -60,11 +60,7 @@ class Twin:
     joint, the drawbar's length for a trailer."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ConfigError: If one is not finite, or has another shape or sign.
-        """
+        """Check the numbers."""
         check_settings(self)
         is_row = isinstance(self.fixed, Sequence) and not isinstance(self.fixed, str)
         angles = [0.0 if x is None else x for x in self.fixed] if is_row else self.fixed
@@ -80,7 +76,7 @@ class Twin:
 
 
 def twin_of(name: str, twins: Mapping[str, Twin]) -> Twin | None:
-    """Return the twin of the longest key that a name of the stream starts with; None if there is none."""
+    """Return the twin whose key is the longest that a name of the stream starts with; None without one."""
     keys = [key for key in twins if name.startswith(key)]
     return twins[max(keys, key=len)] if keys else None
 
@@ -116,39 +112,36 @@ class Twins(Closing):
             names: Names of the bodies in the stream; ``discover`` finds them. Others are reported and ignored.
             rules: Limits of the rules; None for the defaults.
             record: Path of a recording to write; None for none.
-
-        Raises:
-            ConfigError: If a name has no twin, or parents are missing or form a circle.
         """
         self.names, self.source = tuple(names), source
-        found = {}
+        twin_by_name = {}
         for name in self.names:
             twin = twin_of(name, twins)
             if twin is None:
                 raise UnknownNameError(
                     f"expected names that begin with one of {list(twins)}, got {name!r}. Add a twin for it."
                 )
-            found[name] = twin
-        self.twins = found
-        self._order = _parents_first(found)
+            twin_by_name[name] = twin
+        self.twins = twin_by_name
+        self._order = _parents_first(twin_by_name)
         with sim.scene.unchanged_on_error():
             self.handles: dict[str, Handle] = {
                 name: sim.scene.add(t.what, name, pos=HIDDEN_POSITION, mocap=True, **t.options)
-                for name, t in found.items()
+                for name, t in twin_by_name.items()
             }
         self._rows = np.array([handle.rows[0] for handle in self.handles.values()], np.int32)
         self.tracker = Tracker(self.names, rules, source.name)
         self._frozen, self._step = np.zeros(len(self.names), bool), 0
         self._recorder = None if record is None else MocapRecorder(record)
-        of_twins = found.values()
+        of_twins = twin_by_name.values()
         self._turn = from_rpy([t.turn for t in of_twins]).reshape(-1, 4)
         self._offset = np.array([t.offset for t in of_twins], float).reshape(-1, 3)
         fixed = np.array([[np.nan if x is None else x for x in t.fixed] for t in of_twins], float).reshape(-1, 3)
         self._fixed, self._is_fixed = fixed, np.isfinite(fixed).any(-1)
         self._poses = (
-            np.tile(HIDDEN_POSITION, (len(found), 1)),
-            np.tile([0.0, 0, 0, 1], (len(found), 1)),
-            np.zeros((len(found), 3)),
+            np.tile(HIDDEN_POSITION, (len(twin_by_name), 1)),
+            np.tile([0.0, 0, 0, 1], (len(twin_by_name), 1)),
+            np.zeros((len(twin_by_name), 3)),
         )
         self._lock = threading.Lock()
 
@@ -185,11 +178,11 @@ class Twins(Closing):
         sim.data = data.replace(objects=objects.replace(pos=new[0], quat=new[1], vel=new[2]))
 
     def freeze(self, *names: str) -> None:
-        """Let bodies stay where they are, whatever the source sends; all without names."""
+        """Keep bodies at their poses and ignore the source; all bodies without names."""
         self._frozen[self._indices(names)] = True
 
     def thaw(self, *names: str) -> None:
-        """Let frozen bodies follow the source again; all without names."""
+        """Make frozen bodies follow the source again; all bodies without names."""
         self._frozen[self._indices(names)] = False
 
     def pose(self, name: str) -> tuple[NDArray, NDArray, NDArray]:
@@ -209,13 +202,10 @@ class Twins(Closing):
             freq: Samples per second, Hz; poses between them are interpolated.
             start: Time of the recording at the reset of a world, s. () or (n_worlds,)
             name: Name of the plugin.
-
-        Raises:
-            ConfigError: If the time is shorter than two samples.
         """
         if not 2 <= seconds * freq <= 1e7:
             raise ConfigError(f"expected a time of at least two samples, {2 / freq} s, got {seconds} s")
-        kept = self.tracker, self._poses
+        state_before = self.tracker, self._poses
         self.tracker = Tracker(self.names, self.tracker.rules, source.name)
         samples = []
         try:
@@ -226,12 +216,11 @@ class Twins(Closing):
                 self._compute()
                 samples.append(self._poses[:2])
         finally:
-            self.tracker, self._poses = kept
+            self.tracker, self._poses = state_before
         pos, quat = (np.stack(x) for x in zip(*samples, strict=True))
         return Playback(list(self.handles.values()), pos, quat, float(freq), start, name)
 
     def close(self) -> None:
-        """Close the source and the recording."""
         self.source.close()
         if self._recorder is not None:
             self._recorder.close()
@@ -259,25 +248,25 @@ class Twins(Closing):
             fixed = self._fixed[self._is_fixed]
             quat[self._is_fixed] = from_rpy(np.where(np.isfinite(fixed), fixed, rpy))
         pos += rotate(quat, self._offset)
-        shown = tracker.seen & ~self._frozen
+        is_shown = tracker.seen & ~self._frozen
         for k in self._order:
-            shown[k] &= tracker.seen[self.names.index(self.twins[self.names[k]].parent)]  # type: ignore[arg-type]
+            is_shown[k] &= tracker.seen[self.names.index(self.twins[self.names[k]].parent)]  # type: ignore[arg-type]
         old_pos, old_quat, old_vel = self._poses
         self._poses = (
-            np.where(shown[:, None], pos, old_pos),
-            np.where(shown[:, None], quat, old_quat),
-            np.where(shown[:, None], vel, 0.0 * old_vel),
+            np.where(is_shown[:, None], pos, old_pos),
+            np.where(is_shown[:, None], quat, old_quat),
+            np.where(is_shown[:, None], vel, 0.0 * old_vel),
         )
 
 
 def discover(source: MocapSource, twins: Mapping[str, Twin], seconds: float = 1.0) -> tuple[str, ...]:
     """Return the names of a running source's bodies that have a twin, after listening for some time, s."""
-    wait, found = threading.Event(), dict[str, None]()
+    wait, names = threading.Event(), dict[str, None]()
     for k in range(max(round(seconds / 0.05), 1)):
         for frame in source.poll(k, 20).frames:
-            found.update(dict.fromkeys(frame.names))
+            names.update(dict.fromkeys(frame.names))
         wait.wait(0.05)
-    return tuple(name for name in found if twin_of(name, twins) is not None)
+    return tuple(name for name in names if twin_of(name, twins) is not None)
 
 
 @jax.jit
@@ -287,21 +276,17 @@ def _write_poses(old: tuple[Array, Array, Array], rows: Array, new: tuple[NDArra
 
 
 def _parents_first(twins: Mapping[str, Twin]) -> list[int]:
-    """Return the indices of the parts of skeletons, parents first.
-
-    Raises:
-        ConfigError: If a parent is missing, or parents form a circle.
-    """
+    """Return the indices of the parts of skeletons, parents first."""
     names, order = list(twins), list[int]()
     for name, twin in twins.items():
-        chain, at = [name], twin.parent
-        while at is not None:
-            if at not in twins or at in chain:
+        chain, parent = [name], twin.parent
+        while parent is not None:
+            if parent not in twins or parent in chain:
                 raise ConfigError(
                     f"expected parents among {names} without a circle, got {twin.parent!r} as the parent of {name!r}"
                 )
-            chain.append(at)
-            at = twins[at].parent
+            chain.append(parent)
+            parent = twins[parent].parent
         for member in reversed(chain):
             k = names.index(member)
             if twins[member].parent is not None and k not in order:

@@ -48,7 +48,7 @@ class ArduPilot(FirmwareLink):
         self._link = Datagrams(host, port)
 
     def send(self, measured: Measurements) -> None:
-        """Answer the last packet with the state; before the first one there is nothing to answer."""
+        """Answer the last packet with the state, if there was one."""
         line = {
             "timestamp": measured.time,
             "imu": {"gyro": frd(measured.gyro).tolist(), "accel_body": frd(measured.accel).tolist()},
@@ -59,11 +59,9 @@ class ArduPilot(FirmwareLink):
         self._link.answer(f"\n{json.dumps(line)}\n".encode())
 
     def receive(self, timeout: float) -> NDArray | None:
-        """Return the newest motor commands, or None if none arrived in time. (4,)"""
         return self._link.newest(timeout, _commands)
 
     def close(self) -> None:
-        """Close the port."""
         self._link.close()
 
 

@@ -29,7 +29,7 @@ class Betaflight(FirmwareLink):
 
     It receives what ``IMU`` and ``GPS`` measure, and the pressure at the height that the ``Barometer`` measures, which
     a firmware with ``gazebo`` replaces by that at the altitude of the ``GPS``. Its attitude is the true one, which it
-    takes in place of its own estimate unless it was built with ``USE_IMU_CALC``, and from which it simulates a compass.
+    uses instead of its estimate unless it was built with ``USE_IMU_CALC``, and from which it simulates a compass.
     """
 
     positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))
@@ -79,9 +79,6 @@ class Betaflight(FirmwareLink):
         """Remote control, us: roll, pitch, throttle, yaw, and the switches, 1,000 to 2,000. (16,)
 
         Set all of them, or single ones, which are checked when they are sent.
-
-        Raises:
-            ConfigError: If they are not 16 whole numbers that fit into a packet.
         """
         return self._channels
 
@@ -90,7 +87,6 @@ class Betaflight(FirmwareLink):
         self._channels = _pulses(values).astype(np.float64)
 
     def send(self, measured: Measurements) -> None:
-        """Send the state, and the remote control when it is due."""
         gyro, (x, y, z, w) = frd(measured.gyro), measured.quat
         latitude, longitude, altitude = self.origin.geodetic_position(measured.gps_pos)
         if self.gazebo:
@@ -107,11 +103,9 @@ class Betaflight(FirmwareLink):
             self._link.send(struct.pack(f"<d{N_CHANNELS}H", measured.time, *_pulses(self._channels)), self._rc)
 
     def receive(self, timeout: float) -> NDArray | None:
-        """Return the newest motor commands, or None if none arrived in time. (4,)"""
         return self._link.newest(timeout, _commands)
 
     def close(self) -> None:
-        """Close the ports."""
         self._link.close()
 
 

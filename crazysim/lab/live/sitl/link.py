@@ -40,7 +40,7 @@ class FirmwareLink(Closing):
     remedy: ClassVar[str]
     """Remedy for an airframe whose rotors turn the other way round, for a message."""
     lockstep: ClassVar[bool]
-    """True for a firmware that waits for the simulation, False for one with a clock of its own."""
+    """True for a firmware that waits for the simulation, False for one that follows another clock."""
 
     @abstractmethod
     def send(self, measured: Measurements) -> None:
@@ -56,7 +56,7 @@ class FirmwareLink(Closing):
 
 
 class Rate:
-    """Times at which something is due, at a rate in simulated time."""
+    """Schedule of an action at a rate in simulated time."""
 
     def __init__(self, name: str, freq: float):
         """Create a rate whose first time is due at once.
@@ -64,9 +64,6 @@ class Rate:
         Args:
             name: Name of the rate, for messages.
             freq: Rate, Hz.
-
-        Raises:
-            ConfigError: If the rate is not positive.
         """
         self._period, self._next = 1 / read_number(name, freq, POSITIVE), 0.0
 
@@ -85,9 +82,6 @@ def check_address(host: str, port: int, least: int = 0) -> None:
         host: Name or address of a host.
         port: Port.
         least: Least port; 0 allows any free one.
-
-    Raises:
-        ConfigError: If the host is not text, or the port is not a whole number up to 65535.
     """
     if not isinstance(host, str):
         raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
@@ -131,10 +125,10 @@ class Datagrams(Closing):
             timeout: Time to wait for one, s; 0 to read only what has arrived.
             read: Function that returns the contents of a packet, or None for another format, which is skipped.
         """
-        found, now = None, time.monotonic()
+        newest, now = None, time.monotonic()
         deadline, end = now + timeout, now + timeout + MAX_DRAIN_TIME
         while now < end:
-            self._socket.settimeout(max(deadline - now, 0.0) if found is None else 0.0)
+            self._socket.settimeout(max(deadline - now, 0.0) if newest is None else 0.0)
             try:
                 packet, sender = self._socket.recvfrom(MAX_DATAGRAM)
             except (TimeoutError, BlockingIOError):
@@ -143,9 +137,8 @@ class Datagrams(Closing):
                 packet, sender = b"", self._sender
             contents, now = read(packet), time.monotonic()
             if contents is not None:
-                found, self._sender = contents, sender
-        return found
+                newest, self._sender = contents, sender
+        return newest
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()

@@ -29,13 +29,13 @@ from crazysim.tables import NOT_NEGATIVE, read_number
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
 """Magnetic field where there is no ``Magnetometer``, world frame, T: about the field in central Europe."""
 SILENCE_LIMIT = 1.0
-"""Time of a run from which a firmware that sends no motor commands in it is an error, s."""
+"""Time of a run within which a firmware must send motor commands, s."""
 GPS_FREQ = 5
 """Rate of satellite navigation where there is no ``GPS``, Hz."""
 SENSOR_KINDS = (IMU, Barometer, Magnetometer, GPS)
 """Sensors whose measurements firmware receives."""
 MOUNTED_SENSORS = (IMU, Magnetometer)
-"""Sensors that measure in a frame of their own, at an attitude in the body."""
+"""Sensors whose frame is turned against the body."""
 
 
 class SoftwareInTheLoop(Closing):
@@ -65,9 +65,6 @@ class SoftwareInTheLoop(Closing):
             motors: Meaning of a motor command from 0 to 1: part of the largest speed of a rotor, or of its thrust.
             reversed: True for a firmware that is set up for rotors that turn the other way round.
             timeout: Time to wait for the motor commands of a firmware in lockstep, s.
-
-        Raises:
-            ConfigError: If the level, the links, the rate, the timeout or the rotors of an airframe do not fit.
         """
         self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT), motors
         self.links = _as_links(links)
@@ -114,7 +111,7 @@ class SoftwareInTheLoop(Closing):
         seconds = read_number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
-        if not self._compiled:  # a firmware with a clock of its own does not wait
+        if not self._compiled:  # a firmware that follows another clock does not wait
             compile_step(self.sim, self._n_steps)
             self._compiled = True
         dt, began = self._n_steps / self.sim.freq, time.monotonic()
@@ -133,8 +130,8 @@ class SoftwareInTheLoop(Closing):
     def exchange(self) -> None:
         """Send measurements, and apply the motor commands that come back."""
         measured, self._taken = self._measurements()
-        for link, each in zip(self.links, measured, strict=True):
-            link.send(each)
+        for link, measurements in zip(self.links, measured, strict=True):
+            link.send(measurements)
         for k, link in enumerate(self.links):
             command = link.receive(self.timeout if link.lockstep else 0.0)
             if command is not None:
@@ -164,9 +161,9 @@ class SoftwareInTheLoop(Closing):
         for k, kind in enumerate(SENSOR_KINDS):
             when[:, k] = counts.get(kind, self._exchanges) if taken[k] is None else taken[k]
         is_new = np.ones_like(when, bool) if self._taken is None else when != self._taken
-        found = []
+        measurements = []
         for k in range(len(self.links)):
-            found.append(
+            measurements.append(
                 Measurements(
                     time=time_now,
                     gyro=imu[k, :3],
@@ -182,12 +179,12 @@ class SoftwareInTheLoop(Closing):
                     new=frozenset(kind for kind, changed in zip(SENSOR_KINDS, is_new[k], strict=True) if changed),
                 )
             )
-        return found, when
+        return measurements, when
 
     def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
         """Return the latest measurements of a sensor, vectors in the body frame, and when they were taken, in steps.
 
-        Before the first measurement they are a perfect sensor's. Without the sensor there are none.
+        Before the first measurement they are the values of a perfect sensor. Without the sensor they are missing.
         """
         sensor = self._sensors[kind]
         if sensor is None:
@@ -209,7 +206,6 @@ class SoftwareInTheLoop(Closing):
                 raise _silence_error(link, seconds)
 
     def close(self) -> None:
-        """Close all links."""
         for link in self.links:
             link.close()
 
@@ -224,22 +220,17 @@ class SoftwareInTheLoop(Closing):
 
 
 def _as_links(links: object) -> tuple[FirmwareLink, ...]:
-    """Return links to firmware.
-
-    Raises:
-        ConfigError: If there is something else, or one is there twice.
-    """
-    found = (links,) if isinstance(links, FirmwareLink) else links
-    if not isinstance(found, Sequence) or not all(isinstance(link, FirmwareLink) for link in found):
+    """Return links to firmware."""
+    sequence = (links,) if isinstance(links, FirmwareLink) else links
+    if not isinstance(sequence, Sequence) or not all(isinstance(link, FirmwareLink) for link in sequence):
         raise ConfigError(
             f"expected a link to firmware or a list of them, got {short_repr(links)}. Use ArduPilot(), say."
         )
-    if len(set(map(id, found))) < len(found):
+    if len(set(map(id, sequence))) < len(sequence):
         raise ConfigError(
-            f"expected a link of its own for each of {len(found)} drones, got one twice. Make one for each, with other "
-            f"ports."
+            f"expected one link for each of {len(sequence)} drones, got one twice. Make a link of other ports for each."
         )
-    return tuple(found)
+    return tuple(sequence)
 
 
 def _rows(values: Any) -> NDArray:
@@ -256,11 +247,7 @@ def _silence_error(link: FirmwareLink, seconds: float) -> ConfigError:
 
 
 def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) -> NDArray:
-    """Return which rotor of an airframe each motor of a firmware drives. (4,)
-
-    Raises:
-        ConfigError: If the airframe has no rotor in a quadrant, or its rotors turn the other way round.
-    """
+    """Return which rotor of an airframe each motor of a firmware drives. (4,)"""
     if airframe.n_rotors != 4:
         raise ConfigError(f"expected an airframe with 4 rotors, got {airframe.name!r} with {airframe.n_rotors}")
     signs = [tuple(map(int, np.sign(pos[:2]))) for pos in airframe.value("rotors.position")]

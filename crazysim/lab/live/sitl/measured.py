@@ -53,7 +53,7 @@ class Measurements(NamedTuple):
     field: NDArray
     """Magnetic field, body frame, T. (3,)"""
     new: frozenset[type[Sensor]]
-    """Sensors that have a measurement which the one before did not have: ``IMU``, ``Barometer``, ``Magnetometer`` and
+    """Sensors with a new measurement: ``IMU``, ``Barometer``, ``Magnetometer`` and
     ``GPS``. All of them in the first."""
 
 
@@ -69,11 +69,7 @@ class Origin:
     """Altitude above sea level, m."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ConfigError: If one is not finite or out of its range.
-        """
+        """Check the numbers."""
         check_settings(self)
 
     def geodetic_position(self, pos: NDArray) -> tuple[float, float, float]:
@@ -96,11 +92,7 @@ class Origin:
 
 
 def as_origin(origin: object) -> Origin:
-    """Return an origin.
-
-    Raises:
-        ConfigError: If it is something else.
-    """
+    """Return an origin."""
     if not isinstance(origin, Origin):
         raise ConfigError(f"expected an Origin, got {short_repr(origin)}. Use Origin(latitude, longitude, altitude).")
     return origin

@@ -32,7 +32,7 @@ CHUNK = 65536
 
 
 class Px4(FirmwareLink):
-    """A process of PX4 that was started without a simulator of its own, as ``make px4_sitl none_iris``.
+    """A process of PX4 that was started without a simulator, as ``make px4_sitl none_iris``.
 
     PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
     ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts it needs the clock and does not
@@ -81,7 +81,7 @@ class Px4(FirmwareLink):
         self._server.listen(1)
         self._client: socket.socket | None = None
         self._mav: Any = common.MAVLink(None, srcSystem=1, srcComponent=1)
-        self._mav.robust_parsing = True  # bytes that are no message are skipped
+        self._mav.robust_parsing = True  # bytes that are not a message are skipped
         self._began: tuple[float, float] | None = None
         self._time = 0.0
         self._asked = self._answers = False
@@ -121,7 +121,6 @@ class Px4(FirmwareLink):
         self._send(mav.MAVLink_hil_state_quaternion_message(micros, quat, *rates, *place, *vel, 0, 0, *accel))
 
     def receive(self, timeout: float) -> NDArray | None:
-        """Return the newest motor commands, or None if none arrived in time. (4,)"""
         now = time.monotonic()
         if self._began is None:
             self._began = now, self._time
@@ -130,28 +129,27 @@ class Px4(FirmwareLink):
             must_answer, patience = self._asked, timeout * self._asked
         else:
             must_answer, patience = passed > timeout, min(max(simulated + START - passed, 0.0), timeout)
-        found = self._newest(now + patience)
-        if found is not None:
-            self._answers, self._motors = True, found
-        return None if found is None and must_answer else self._motors
+        motors = self._newest(now + patience)
+        if motors is not None:
+            self._answers, self._motors = True, motors
+        return None if motors is None and must_answer else self._motors
 
     def close(self) -> None:
-        """Close the connection."""
-        for each in (self._client, self._server):
-            if each is not None:
-                each.close()
+        for connection in (self._client, self._server):
+            if connection is not None:
+                connection.close()
 
     def _newest(self, deadline: float) -> NDArray | None:
         """Return the newest motor commands, or None if none arrived until a time of ``time.monotonic``. (4,)"""
-        found, now = None, time.monotonic()
+        motors, now = None, time.monotonic()
         end = max(deadline, now) + MAX_DRAIN_TIME
-        while now < end and self._readable(max(deadline - now, 0.0) if found is None else 0.0):
+        while now < end and self._readable(max(deadline - now, 0.0) if motors is None else 0.0):
             for message in self._messages():
                 if message.get_type() == "HIL_ACTUATOR_CONTROLS":
                     self.armed = bool(message.mode & self._mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-                    found = np.clip(np.nan_to_num(message.controls[:4]), 0, 1) * self.armed  # NaN: no command
+                    motors = np.clip(np.nan_to_num(message.controls[:4]), 0, 1) * self.armed  # NaN: no command
             now = time.monotonic()
-        return found
+        return motors
 
     def _geodetic_integers(self, pos: NDArray) -> tuple[int, int, int]:
         """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a position in the world, m. (3,)"""

@@ -1,4 +1,4 @@
-"""Commander of one drone: which setpoint is in force, as in the firmware of the Crazyflie.
+"""Commander of one drone: the choice of the active setpoint, as in the firmware of the Crazyflie.
 
 High-level commands plan smooth moves. Streamed setpoints take precedence until they stop: after 0.5 s without one the
 drone stays in its place, after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
@@ -73,7 +73,7 @@ class Commander:
 
     @property
     def motors_on(self) -> bool:
-        """True while a command is in force."""
+        """True while a command is active."""
         return self.armed and not self.locked and (self._plan is not None or self._stream is not None)
 
     @property
@@ -82,7 +82,7 @@ class Commander:
         return self._plan is None or self._plan.finished(self.now)
 
     def goal(self) -> NDArray:
-        """Return position and yaw, their rates and second derivatives in force, or of the drone itself. (3, 4)"""
+        """Return position, yaw and their derivatives of the active setpoint, or else of the drone. (3, 4)"""
         if self._stream is not None:
             return self._last
         if self._plan is not None:
@@ -112,11 +112,11 @@ class Commander:
     def go_to(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, linear: bool = False) -> None:
         """Move to a position, m (3,), and yaw, rad; relative ones are added to the present setpoint."""
         goal, (yaw,) = _numbers("goal", goal, 3), _numbers("yaw", [yaw], 1)
-        begin = self._motion_start("go_to")
+        start = self._motion_start("go_to")
         if relative:
-            goal, yaw = goal + begin[0, :3], yaw + begin[0, 3]
-        end = [*goal, nearest_yaw(begin[0, 3], yaw)]
-        self._plan = PlannedMotion(move(begin, end, _duration(duration), linear), self.now)
+            goal, yaw = goal + start[0, :3], yaw + start[0, 3]
+        end = [*goal, nearest_yaw(start[0, 3], yaw)]
+        self._plan = PlannedMotion(move(start, end, _duration(duration), linear), self.now)
 
     def stop(self) -> None:
         """Stop the motors."""
@@ -129,9 +129,6 @@ class Commander:
             identity: Number of the trajectory.
             path: Its path.
             compressed: True for one that the firmware keeps compressed, and can neither stretch nor reverse.
-
-        Raises:
-            ConfigError: If its number is not from 0 to 255.
         """
         if not 0 <= identity < N_TRAJECTORIES:
             raise ConfigError(f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {identity}")
@@ -154,10 +151,6 @@ class Commander:
             relative: True to begin at the present setpoint.
             reversed: True to follow it from its end to its start.
             relative_yaw: True to begin at the present yaw too.
-
-        Raises:
-            ConfigError: If there is none, the factor is out of range, or a compressed one is to be stretched or
-                reversed.
         """
         if identity not in self.trajectories:
             raise ConfigError(
@@ -171,22 +164,18 @@ class Commander:
                 f"reversed {bool(reversed)}. The firmware supports others for uncompressed trajectories alone."
             )
         plan = PlannedMotion(self.trajectories[identity], self.now, timescale, bool(reversed))
-        begin, first = self._motion_start("start_trajectory")[0], plan.at(self.now)[0]
+        start, first = self._motion_start("start_trajectory")[0], plan.at(self.now)[0]
         shift = np.zeros(4)
         if relative:
-            shift[:3] = begin[:3] - first[:3]
+            shift[:3] = start[:3] - first[:3]
             if relative_yaw and identity not in self._compressed:
-                shift[3] = begin[3] - nearest_yaw(begin[3], first[3])
+                shift[3] = start[3] - nearest_yaw(start[3], first[3])
         self._plan = plan._replace(shift=shift)
 
     # Streamed setpoints ---------------------------------------------------------------------------------------------
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Stream a command of the simulator's own: the numbers of ``sim.state_control`` and so on, of one drone. (k,)
-
-        Raises:
-            ConfigError: If the simulation has another command level, or a number is not finite.
-        """
+        """Stream a command of the simulator, as to ``sim.state_control`` and so on, for this drone. (k,)"""
         level = Control(level)
         self._require(level)
         size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
@@ -223,7 +212,7 @@ class Commander:
         self._stream_setpoint("attitude", _numbers("attitude setpoint", [roll, pitch, yaw_rate, thrust], 4))
 
     def notify_setpoints_stop(self, remain_valid: float = 0.0) -> None:
-        """Let high-level commands take over after some time, s, in which the last setpoint stays in force."""
+        """Return to high-level commands after a time, s, in which the last setpoint stays active."""
         self._released = self.now + max(float(remain_valid), 0.0)
 
     # Safety ---------------------------------------------------------------------------------------------------------
@@ -258,7 +247,7 @@ class Commander:
     # The loop -------------------------------------------------------------------------------------------------------
 
     def tick(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
-        """Return the command in force, of the simulation's level and in the world's frame; None with the motors off.
+        """Return the active command, of the simulation's level and in the world's frame; None with the motors off.
 
         Args:
             now: Time, s.
@@ -273,7 +262,7 @@ class Commander:
         return None if command is None else frame.command(self.control, command)
 
     def _command(self, now: float, pos: NDArray, vel: NDArray, yaw: float) -> NDArray | None:
-        """Return the command in force; all in the frame of the estimate."""
+        """Return the active command in the frame of the estimate."""
         dt, self.now = now - self.now, now
         self.pos, self.vel, self.yaw = pos, vel, yaw
         if self._stream is not None:
@@ -293,12 +282,12 @@ class Commander:
             return self._streamed(dt)
         if plan is None or not plan.finished(now) or plan.lands:
             return _state_command(*self.goal())
-        if self._held is None or self._held[0] is not plan:  # a drone that hovers costs nothing
+        if self._held is None or self._held[0] is not plan:  # not evaluated again for a drone that hovers
             self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
         return self._held[1]
 
     def _has_landed(self, plan: PlannedMotion) -> bool:
-        """Return True if the drone is as low as its landing goes, or stands on something."""
+        """Return True if the drone has reached the height of its landing, or stands on a surface."""
         stands = self.now > plan.end + REST_TIME and abs(self.vel[2]) < RESTING_SPEED
         return stands or self.pos[2] <= plan.at(self.now)[0, 2] + LANDED_HEIGHT
 
@@ -339,13 +328,13 @@ class Commander:
 
     def _vertical(self, height: float, duration: float, yaw: float | None, lands: bool) -> None:
         (height,) = _numbers("height", [height], 1)
-        here = self._motion_start("land" if lands else "take_off")[0]
-        goal = here.copy()
+        start_pos = self._motion_start("land" if lands else "take_off")[0]
+        goal = start_pos.copy()
         goal[2] = height
         if yaw is not None:
-            goal[3] = nearest_yaw(here[3], _numbers("yaw", [yaw], 1)[0])
-        begin = np.array([here, np.zeros(4), np.zeros(4)])
-        self._plan = PlannedMotion(move(begin, goal, _duration(duration)), self.now, lands=lands)
+            goal[3] = nearest_yaw(start_pos[3], _numbers("yaw", [yaw], 1)[0])
+        start = np.array([start_pos, np.zeros(4), np.zeros(4)])
+        self._plan = PlannedMotion(move(start, goal, _duration(duration)), self.now, lands=lands)
 
     def _motion(self) -> NDArray:
         """Return the drone's position and yaw, their rates and second derivatives. (3, 4)"""

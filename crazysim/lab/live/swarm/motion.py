@@ -44,13 +44,13 @@ class PlannedMotion(NamedTuple):
         """Return position and yaw, their rates and second derivatives at a time, s. (3, 4)"""
         since = (t - self.start) / self.timescale
         rate = (-1.0 if self.reversed else 1.0) / self.timescale
-        found = self.path.derivatives(self.path.duration - since if self.reversed else since, 2)
-        found = found * np.array([1.0, rate, rate * rate])[:, None]
-        found[0] += self.shift
-        return found
+        derivatives = self.path.derivatives(self.path.duration - since if self.reversed else since, 2)
+        derivatives = derivatives * np.array([1.0, rate, rate * rate])[:, None]
+        derivatives[0] += self.shift
+        return derivatives
 
 
-def move(begin: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> HostTrajectory:
+def move(start: ArrayLike, goal: ArrayLike, duration: float, linear: bool = False) -> HostTrajectory:
     """Return the move to rest at a goal.
 
     It is the polynomial of degree 7 with the given position, velocity and acceleration at its start, at rest at its
@@ -58,19 +58,19 @@ def move(begin: ArrayLike, goal: ArrayLike, duration: float, linear: bool = Fals
     constant speed.
 
     Args:
-        begin: Position, m, and yaw, rad, their rates and second derivatives at the start. (3, 4)
+        start: Position, m, and yaw, rad, their rates and second derivatives at the start. (3, 4)
         goal: Position, m, and yaw, rad, at the end. (4,)
         duration: Duration, s.
         linear: True for the straight line.
     """
-    p, v, a = np.asarray(begin, float) * np.array([1.0, duration, duration**2 / 2])[:, None]
+    p, v, a = np.asarray(start, float) * np.array([1.0, duration, duration**2 / 2])[:, None]
     goal = np.asarray(goal, float)
     if linear:
         coefficients = np.stack([p, goal - p], axis=-1)
     else:
-        known = np.stack([p, v, a, np.zeros(4)])
+        boundary = np.stack([p, v, a, np.zeros(4)])
         ends = np.stack([goal - p - v - a, -v - 2 * a, -2 * a, np.zeros(4)])
-        coefficients = np.concatenate([known, NO_JERK_INVERSE @ ends]).T
+        coefficients = np.concatenate([boundary, NO_JERK_INVERSE @ ends]).T
     return HostTrajectory(np.array([duration]), coefficients[None], False)
 
 

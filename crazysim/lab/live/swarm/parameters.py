@@ -70,13 +70,13 @@ def parameters_of(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter
         airframe: Airframe; one without the gains of ``controller="pid"`` has no group ``pid_attitude``.
         multi_ranger: True for a drone with a multi-ranger deck.
     """
-    found = PARAMETERS | {"deck.bcMultiranger": Parameter("uint8_t", multi_ranger, read_only=True)}
+    parameters = PARAMETERS | {"deck.bcMultiranger": Parameter("uint8_t", multi_ranger, read_only=True)}
     if "pid.attitude.kp" in airframe.values:
         for gain in ("kp", "ki", "kd"):
             values = np.asarray(airframe.value(f"pid.attitude.{gain}"), float)
             for axis, value in zip(("roll", "pitch", "yaw"), values.tolist(), strict=True):
-                found[f"pid_attitude.{axis}_{gain}"] = Parameter("float", value, simulated=False)
-    return found
+                parameters[f"pid_attitude.{axis}_{gain}"] = Parameter("float", value, simulated=False)
+    return parameters
 
 
 class Parameters(Mapping[str, float]):
@@ -106,11 +106,7 @@ class Parameters(Mapping[str, float]):
         return np.array([self._values[name] for name in INITIAL_POSE])
 
     def get_value(self, name: str) -> float:
-        """Return a value.
-
-        Raises:
-            ConfigError: If there is no such parameter.
-        """
+        """Return a value."""
         self._require(name)
         return self._values[name]
 
@@ -119,11 +115,7 @@ class Parameters(Mapping[str, float]):
             raise ConfigError(f"expected a parameter that the simulation has, got {name!r}. {PAGE}")
 
     def set(self, name: str, value: float, now: float) -> None:
-        """Set a value.
-
-        Raises:
-            ConfigError: If there is no such parameter, it is read-only, not finite, or its effect is not simulated.
-        """
+        """Set a value."""
         self._require(name)
         kind = self.kinds[name]
         if kind.read_only or not math.isfinite(value):

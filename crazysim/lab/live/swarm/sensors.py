@@ -46,8 +46,8 @@ def battery_of(sim: Sim, drone: int) -> BatteryState:
 def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
     """Return the distances that a ``MultiRanger``, or a ``RangeFinder``, measures along ``MULTI_RANGER``, m, by name.
 
-    They are infinite where nothing is within its range. Other directions, and drones without one, have none. Before the
-    first measurement of a ``MultiRanger`` they are the true ones.
+    They are infinite if no object is within range. Other directions, and drones without the sensor, are missing.
+    Before the first measurement of a ``MultiRanger`` they are the true distances.
     """
     ranger = _plugin(sim, MultiRanger)
     plugin = _plugin(sim, RangeFinder) if ranger is None else sim.plugins[ranger.range_finder]
@@ -59,16 +59,16 @@ def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
         samples = ranger.read(sim.data).samples
         if samples.taken[0, drone, 0] >= 0:
             distances = np.asarray(samples.value)[0, drone].tolist()
-    found = {}
+    ranges = {}
     for direction, distance in zip(np.asarray(record.direction), distances, strict=True):
         name = next(
             (name for name, axis in MULTI_RANGER_DIRECTIONS.items() if np.allclose(axis, direction, atol=1e-6)), None
         )
         if name is not None:
-            found[name] = distance if distance < far else math.inf
-    return found
+            ranges[name] = distance if distance < far else math.inf
+    return ranges
 
 
 def _plugin(sim: Sim, kind: type[P]) -> P | None:
-    """Return the plugin of a class; None if there is none."""
+    """Return the plugin of a class, or None."""
     return next((plugin for plugin in sim.plugins.values() if isinstance(plugin, kind)), None)

@@ -1,4 +1,4 @@
-"""A simulation whose drones take the commands of Crazyflies, each through a commander of its own."""
+"""A simulation whose drones take the commands of Crazyflies, each through a commander."""
 
 from __future__ import annotations
 
@@ -54,15 +54,12 @@ class Swarm(Closing):
     """Colour of the light of each drone, red, green, blue from 0 to 1. (n_drones, 3)"""
 
     def __init__(self, sim: Sim, names: Sequence[str] | None = None):
-        """Let commands drive a simulation.
+        """Connect commanders to the drones of a simulation.
 
         Args:
             sim: Simulation of one world. High-level commands need ``control="state"``; attitudes and body rates need
                 those command levels.
             names: Names of the drones; None for ``cf1``, ``cf2``, ...
-
-        Raises:
-            ConfigError: If there are several worlds, or not one name for each drone.
         """
         if sim.n_worlds != 1:
             raise ConfigError(f"expected a simulation of one world, got {sim.n_worlds} worlds. Use Sim(n_worlds=1).")
@@ -79,7 +76,7 @@ class Swarm(Closing):
         self._size = {Control.state: 16, Control.rotor_vel: sim.data.controls.rotor_vel.shape[-1]}.get(sim.control, 4)
         self._motors = self._add_motors()
         estimators = [plugin for plugin in sim.plugins.values() if isinstance(plugin, Estimator)]
-        self._estimator = next((each for each in estimators if each.control), None)
+        self._estimator = next((estimator for estimator in estimators if estimator.control), None)
         self._estimate = jax.jit(vmap_worlds(vmap_drones(self._estimated)))
         self._on = np.ones(len(names), bool)
         self._states: list[DroneState] = []
@@ -96,11 +93,7 @@ class Swarm(Closing):
         return self.commanders[self.index(name)]
 
     def index(self, name: str) -> int:
-        """Return the index of a drone.
-
-        Raises:
-            UnknownNameError: If there is none of that name.
-        """
+        """Return the index of a drone."""
         if name not in self.names:
             raise UnknownNameError(f"expected one of the drones {list(self.names)}, got {name!r}")
         return self.names.index(name)
@@ -121,11 +114,7 @@ class Swarm(Closing):
     # Parameters -----------------------------------------------------------------------------------------------------
 
     def set_parameter(self, drone: int | str, name: str, value: float) -> None:
-        """Set a parameter of a drone's firmware, with its effect on commands, estimate and light.
-
-        Raises:
-            ConfigError: If there is no such parameter, or its effect is not simulated.
-        """
+        """Set a parameter of a drone's firmware, with its effect on commands, estimate and light."""
         k = self.index(drone) if isinstance(drone, str) else drone
         parameters = self.parameters[k]
         with self.lock:
@@ -153,21 +142,13 @@ class Swarm(Closing):
     # Time -----------------------------------------------------------------------------------------------------------
 
     def __call__(self, live: Live) -> None:
-        """Stage the commands in force, and let viewers show the colours.
-
-        Raises:
-            ConfigError: If it is another simulation.
-        """
+        """Stage the active commands, and show the colours in viewers."""
         self._check_loop(live)
         self.update()
         live.lights[0] = self.colors
 
     def run_in(self, live: Live) -> None:
-        """Let ``advance`` and ``sleep`` run a live loop, with its speed and its viewers.
-
-        Raises:
-            ConfigError: If it is the loop of another simulation, or a thread advances the simulation.
-        """
+        """Make ``advance`` and ``sleep`` run a live loop, with its speed and its viewers."""
         self._check_loop(live)
         if self._thread is not None:
             raise ConfigError("expected a swarm that no thread advances, got a running one. Call close first.")
@@ -176,10 +157,12 @@ class Swarm(Closing):
 
     def _check_loop(self, live: Live) -> None:
         if live.sim is not self.sim:
-            raise ConfigError("expected the loop of the swarm's simulation, got that of another. Make a Swarm for it.")
+            raise ConfigError(
+                "expected the loop of the swarm's simulation, got the loop of another simulation. Make a Swarm for it."
+            )
 
     def update(self) -> None:
-        """Read the states and stage the commands in force, between two control steps."""
+        """Read the states and stage the active commands, between two control steps."""
         with self.lock:
             self._read()
             self._write()
@@ -190,11 +173,7 @@ class Swarm(Closing):
                 listener()
 
     def advance(self, seconds: float) -> None:
-        """Advance by a time, s, rounded to control steps: as fast as possible, or at the speed of the ``run_in`` loop.
-
-        Raises:
-            ConfigError: If a thread advances the simulation.
-        """
+        """Advance by a time, s, rounded to control steps, at the speed of the loop of ``run_in`` if it runs in one."""
         if self._thread is not None:
             raise ConfigError("expected a swarm that no thread advances, got a running one. Use sleep.")
         if self._live is not None:
@@ -217,16 +196,12 @@ class Swarm(Closing):
             time.sleep(0.001)
 
     def compile_step(self) -> None:
-        """Compile what a control step needs, before programs wait for answers: they give up sooner than it takes."""
+        """Compile a control step before programs wait for answers, as compilation takes longer than their timeouts."""
         with self.lock:
             compile_step(self.sim, self._period)
 
     def start(self, speed: float = 1.0) -> Swarm:
-        """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm.
-
-        Raises:
-            ConfigError: If a live loop advances the simulation.
-        """
+        """Compile a step, then advance in a thread, in real time or at another speed, and return the swarm."""
         if self._live is not None:
             raise ConfigError("expected a swarm without a live loop, got one after run_in. Use advance or sleep.")
         self.compile_step()
@@ -277,8 +252,8 @@ class Swarm(Closing):
                 commander.reset()
             before, self._on = [], np.ones(len(self.names), bool)
         dt = now - before[0].time if before else 0.0
-        moved = np.stack([state.vel for state in before]) if before else vel
-        force = (vel - moved) / dt if dt > 0 else np.zeros_like(vel)
+        vel_before = np.stack([state.vel for state in before]) if before else vel
+        force = (vel - vel_before) / dt if dt > 0 else np.zeros_like(vel)
         acc = rotate(quat * (-1, -1, -1, 1), force + [0.0, 0.0, GRAVITY_MAGNITUDE])
         if before and dt == 0:
             acc = np.stack([state.acc for state in before])
@@ -289,8 +264,8 @@ class Swarm(Closing):
     def _estimated(self, data: SimData) -> list[Array]:
         """Return the estimate of one drone and the reading of its accelerometer, as fields of ``DroneState``."""
         estimator, s = self._estimator, data.states
-        known = {"pos": s.pos, "quat": s.quat, "vel": s.vel, "ang_vel": s.ang_vel} | estimator.measured_states(data)
-        return [known[name] for name in ("pos", "quat", "vel", "ang_vel")] + [estimator.inertial(data)[1]]
+        states = {"pos": s.pos, "quat": s.quat, "vel": s.vel, "ang_vel": s.ang_vel} | estimator.measured_states(data)
+        return [states[name] for name in ("pos", "quat", "vel", "ang_vel")] + [estimator.inertial(data)[1]]
 
     def _write(self) -> None:
         sim = self.sim
@@ -298,10 +273,10 @@ class Swarm(Closing):
         on = np.ones(len(self.names), bool)
         drones = zip(self.commanders, self._states, self._yaws, strict=True)
         for k, (commander, state, yaw) in enumerate(drones):
-            found = commander.tick(state.time, state.pos, state.vel, yaw)
-            on[k] = found is not None
-            if found is not None:
-                command[0, k] = found
+            new_command = commander.tick(state.time, state.pos, state.vel, yaw)
+            on[k] = new_command is not None
+            if new_command is not None:
+                command[0, k] = new_command
             elif sim.control == Control.state:
                 command[0, k, :3], command[0, k, 9:13] = state.pos, from_yaw(yaw)
         getattr(sim, f"{sim.control.value}_control")(command)
