@@ -11,11 +11,7 @@ newest JAX that are supported. What each use would be replaced by, if a release 
   rely (``engine/host_call.py``). Without them the compiled step runs, and ``jit_donating`` donates nothing. A fallback
   here.
 - **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
-  of XLA's foreign function interface, a ``ctypes`` callback registered by ``jax.ffi.register_ffi_target`` for
-  ``"CUDA"``. It would read the addresses of operands and results and the attributes (kernel, grid, block) from
-  ``XLA_FFI_CallFrame``, get the stream by ``XLA_FFI_Stream_Get``, load the PTX once in each context by
-  ``cuModuleLoadData``, and launch it by ``cuLaunchKernel``. Not written, since it can only be tried on a GPU; without
-  it ``engine="lanes"`` runs there.
+  of XLA's foreign function interface that launches them (``engine/backends/ffi_handlers.py``). A fallback there.
 - **Primitives of our own** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
   ``jax.custom_batching.custom_vmap``, ``jax.custom_jvp`` and ``jax.lax.platform_dependent``. No fallback.
 - **Rules that read equations** (``Equation``, ``bind``, ``as_function``, ``expand_primitive``): nothing else shows what
@@ -86,7 +82,7 @@ __all__ = [
     "primitive_by_platform",
     "put_host_array",
     "read_equation",
-    "register_host_target",
+    "register_target",
     "select_inputs",
     "threefry2x32_p",
     "threefry_prng_impl",
@@ -481,9 +477,9 @@ def ffi_include_folder() -> str:
     return jax.ffi.include_dir()
 
 
-def register_host_target(name: str, function: Any) -> None:
-    """Make a C function, from ``ctypes``, known to XLA as the target of a custom call on the CPU."""
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
+def register_target(name: str, function: Any, platform: str) -> None:
+    """Make a C function, from ``ctypes``, known to XLA as the target of a custom call on ``"cpu"`` or ``"CUDA"``."""
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform=platform)
 
 
 def compute_capability(device: Any) -> int:

@@ -395,5 +395,6 @@ PLUGINS = {name: build.plugins for name, build in CASES.items() if hasattr(build
 """Functions that return the plugins of these simulations."""
 SPLIT = ("bodies", "collisions", "stages of all scopes", "many members")
 """Simulations with stages that no engine fuses."""
-TOLERANCES = {"shared": LOADS, "hook": LOADS, "impact": 0.02}  # a box on a floor touches with any corner
-"""Tolerances other than ``ROUNDING``."""
+TOLERANCES = {"impact": 0.005}
+"""Tolerances other than ``ROUNDING``. A box on a floor touches with any corner: float32 and float64 on a CPU differ by
+0.001 rad/s after 40 steps, and by 0.1 rad/s after 100."""

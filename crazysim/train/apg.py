@@ -17,7 +17,7 @@ from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import QUICK_COMPILATION, Layers, Policy, all_finite, init_mlp
+from crazysim.train.networks import Layers, Policy, all_finite, init_mlp
 
 STATS_ITERATIONS = 20
 """Iterations during which the observation statistics are updated."""
@@ -76,7 +76,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     return Learner(policy, _optimizer(config).init(policy), stats, key, state, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK_COMPILATION)
+@partial(jax.jit, static_argnames=("env", "config"))
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and one update, and the metrics of the iteration.
 

@@ -41,29 +41,39 @@ class Recipe:
     """Iterations between evaluations; a checkpoint is written at each."""
 
 
+_LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
+"""Hyperparameters of tasks in which a reward follows seconds after what earned it."""
+
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80, "learning_rate": 2e-3}),
+    "reach_vel": Recipe(config={"iterations": 100}),
     "recover": Recipe(config={"iterations": 150}),
     "race": Recipe(
         n_worlds=2048,
         config={"iterations": 150, "n_steps": 64, "minibatches": 16, "entropy": 0.01, "init_std": 0.7},
         practice={"practice": True},
     ),
-    "avoid": Recipe(
+    "multi_race": Recipe(
         n_worlds=2048,
         config={
-            "iterations": 150,
+            "iterations": 250,
             "n_steps": 64,
-            "minibatches": 16,
-            "hidden": (128, 128),
-            "learning_rate": 2e-3,
-            "discount": 0.998,
+            "minibatches": 32,
+            "discount": 0.99,
+            "entropy": 0.003,
+            "init_std": 0.7,
         },
+        practice={"practice": True},
     ),
-    "transport": Recipe(n_worlds=4096, config={"iterations": 400, "discount": 0.99}),
-    "chase": Recipe(config={"iterations": 200, "discount": 0.99}),
-    "deliver": Recipe(n_worlds=4096, config={"iterations": 1000, "discount": 0.99}),
-    "land": Recipe(n_worlds=2048, config={"iterations": 150, "n_steps": 64, "minibatches": 16, "discount": 0.99}),
+    "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
+    "transport": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400}),
+    "deliver": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 800}),
+    "swarm": Recipe(config={**_LONG_ROLLOUTS, "iterations": 200, "entropy": 0.003}),
+    "chase": Recipe(n_worlds=2048, config={"iterations": 300, "n_steps": 64, "minibatches": 16, "discount": 0.99}),
+    "land": Recipe(
+        n_worlds=2048,
+        config={"iterations": 200, "n_steps": 64, "minibatches": 32, "discount": 0.99, "entropy": 0.003},
+    ),
     "track": Recipe("apg", n_worlds=64, config={"iterations": 100}),
 }
 """Recipes by task."""

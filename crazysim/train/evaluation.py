@@ -17,7 +17,6 @@ from crazysim.envs.rollout import Transition, rollout
 from crazysim.envs.state import Obs
 from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
-from crazysim.train.networks import QUICK_COMPILATION
 
 EVALUATION_SEED = 0x5EED
 """Seed of the held-out initial states; keys of training are folded, so they never coincide with it."""
@@ -41,7 +40,7 @@ def as_tree(policy: Callable[[Obs], Array]) -> Any:
     return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
 
 
-@partial(jax.jit, static_argnames=("env",), compiler_options=QUICK_COMPILATION)
+@partial(jax.jit, static_argnames=("env",))
 def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     """Fly one episode in every world and return its record.
 

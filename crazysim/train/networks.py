@@ -15,9 +15,6 @@ from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 
-QUICK_COMPILATION = {"xla_gpu_autotune_level": 0}
-"""Compiler options: autotuning matrix products on a GPU takes longer than it saves for networks of this size."""
-
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
 

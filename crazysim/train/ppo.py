@@ -19,7 +19,7 @@ from crazysim.envs.statistics import EPSILON, RunningStats
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import QUICK_COMPILATION, Layers, Policy, all_finite, init_mlp, mlp
+from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Config:
     epochs: int = 4
     """Passes over the samples of a rollout."""
     minibatches: int = 8
-    """Minibatches, and so updates, per epoch."""
+    """Minibatches, and so updates, per epoch; each has all samples of some worlds."""
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of policy and value function."""
     learning_rate: float = 1e-3
@@ -104,12 +104,10 @@ class Sample(PyTree):
 
 def init(env: Env, config: Config, key: Array) -> Learner:
     """Return an untrained learner; ``env`` resets automatically within the step that ends an episode."""
-    n_samples = config.n_steps * env.sim.n_worlds * env.sim.n_drones
-    if n_samples % config.minibatches:
+    if env.sim.n_worlds % config.minibatches:
         raise ConfigError(
-            f"expected minibatches that divide the {n_samples} samples of a rollout ({config.n_steps} steps, "
-            f"{env.sim.n_worlds} worlds, drones in each: {env.sim.n_drones}), got {config.minibatches}. Use for "
-            f"example {math.gcd(n_samples, 8)}."
+            f"expected minibatches that divide the {env.sim.n_worlds} worlds, got {config.minibatches}. Use for "
+            f"example {math.gcd(env.sim.n_worlds, 8)}."
         )
     k_policy, k_value, k_env, key = jax.random.split(key, 4)
     state = env.reset(k_env)
@@ -122,7 +120,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
     return Learner(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, state, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"), compiler_options=QUICK_COMPILATION)
+@partial(jax.jit, static_argnames=("env", "config"))
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and its updates, and the metrics of the iteration.
 
@@ -194,7 +192,10 @@ def _learn(
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after the updates on a rollout."""
     data = (samples.obs, samples.action, samples.log_prob, advantages, targets)
-    data = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), data)
+
+    def of_worlds(numbers: Array) -> Any:
+        """Return the samples of some worlds. (n_samples, ...)"""
+        return jax.tree.map(lambda x: x[:, numbers].reshape(-1, *x.shape[3:]), data)
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
@@ -214,8 +215,8 @@ def _learn(
         return (optax.apply_updates(parameters, updates), optimizer), losses
 
     def epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        order = jax.random.permutation(key, data[-1].shape[0]).reshape(config.minibatches, -1)
-        return jax.lax.scan(lambda c, i: update(c, jax.tree.map(lambda x: x[i], data)), carry, order)
+        order = jax.random.permutation(key, targets.shape[1]).reshape(config.minibatches, -1)
+        return jax.lax.scan(lambda c, numbers: update(c, of_worlds(numbers)), carry, order)
 
     carry, losses = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)

@@ -39,7 +39,7 @@ def place(tmp_path, monkeypatch):
     """An empty cache folder, and nothing loaded from an earlier one."""
     monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
     monkeypatch.setattr(native, "_LIBRARIES", {})
-    monkeypatch.setattr("crazysim.jaxcompat.register_host_target", lambda name, function: None)
+    monkeypatch.setattr("crazysim.jaxcompat.register_target", lambda name, function, platform: None)
     native.toolchain.cache_clear()
     yield tmp_path
     native.toolchain.cache_clear()

@@ -298,8 +298,20 @@ def test_practice_begins_behind_gates():
         np.testing.assert_allclose(inside[:, 1:], 0, atol=1e-5)
     env.sim.data = data
     assert not np.any(env.sim.contact_report().any)
-    with pytest.raises(ConfigError, match="expected a single drone for practice, got 2"):
-        make("multi_race", practice=True)
+
+
+def test_drones_that_practice_together_begin_behind_different_gates():
+    env = make("multi_race", 200, practice=True, n_drones=3)
+    data = jax.jit(lambda key: env.reset(key).data)(jax.random.key(0))
+    passed = np.asarray(rules.race_of(data).passed)
+    assert np.bincount(passed[:, 0], minlength=4).min() > 30, "each gate as often as the others"
+    assert np.all((passed == 0).all(axis=1) | (np.sort(passed, axis=1) == [1, 2, 3]).all(axis=1))
+    apart = np.asarray(data.states.pos)[:, :, None] - np.asarray(data.states.pos)[:, None]
+    assert np.linalg.norm(apart + np.eye(3)[..., None], axis=-1).min() > 0.2
+    env.sim.data = data
+    assert not np.any(env.sim.contact_report().any)
+    with pytest.raises(ConfigError, match="expected fewer drones than gates for practice, got 4 drones and 4 gates"):
+        make("multi_race", practice=True, n_drones=4)
 
 
 def test_ranks_are_a_draw_without_replacement():

@@ -1,5 +1,10 @@
 """Steps, their laws and queries on an accelerator, compared with the CPU."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +17,8 @@ from sweep import ROUNDING, agree, flying
 from crazysim import Downwash, Kalman, Sim, Wind
 
 N_STEPS = 100
+FEW = "law_01 or law_10 or on_each_other_are_differentiated or tangents or what_drones_share"
+"""Tests of kernels of all kinds."""
 
 
 def both(run):
@@ -27,7 +34,7 @@ def test_simulations_are_those_of_the_cpu(name):
         lines = sim.explain().splitlines()
         assert lines[0] == "engine: fused"
         assert lines[-1].startswith("kernel: ") or name in sweep.SPLIT
-        sim.step(N_STEPS)
+        sim.step(40 if name == "impact" else N_STEPS)
         return sim.data
 
     agree(*both(run), sweep.TOLERANCES.get(name, ROUNDING))
@@ -117,3 +124,16 @@ def test_queries_of_the_scene_are_those_of_the_cpu():
     seen = [np.isfinite(x[1]) for x in (found, expected)]
     agree(*seen, 0)
     agree(*(jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), x) for x in (found, expected)), 1e-5)
+
+
+def test_kernels_are_launched_without_the_custom_call_of_xla():
+    """Steps, gradients and commands with CRAZYSIM_JAX_FALLBACKS=1, where a handler of ours launches all kernels."""
+    tests = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", str(tests), "-p", "no:cacheprovider", "-n", "0", "-k", FEW],
+        env={k: v for k, v in os.environ.items() if "PYTEST" not in k} | {"CRAZYSIM_JAX_FALLBACKS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -185,7 +185,7 @@ def target(kernel: Kernel) -> str:
         library = _library(words, key, kernel.text)
         with _LIBRARIES_LOCK:
             if name not in _LIBRARIES:
-                jaxcompat.register_host_target(name, library.crazysim_advance)
+                jaxcompat.register_target(name, library.crazysim_advance, "cpu")
                 _LIBRARIES[name] = library
     return name
 

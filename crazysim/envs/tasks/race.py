@@ -76,13 +76,14 @@ class Race(Task):
     reward: Rewards = dense
     """Function that returns the terms of the reward; ``race_rules.sparse`` is another."""
     practice: bool = False
-    """True to start anywhere on the course, for learning: as often as at the start, a drone is behind a gate that
-    counts as passed."""
+    """True to start anywhere on the course, for learning: as often as at the start, a drone is behind the first gate,
+    the second and so on, which count as passed. Several drones are all at the start, or each behind another gate."""
 
     def install(self, sim: Sim) -> None:
-        if self.practice and sim.n_drones > 1:
+        if self.practice and sim.n_drones >= max(self.track.n_gates, 2):
             raise ConfigError(
-                f"expected a single drone for practice, got {sim.n_drones}: there is no room behind a gate"
+                f"expected fewer drones than gates for practice, got {sim.n_drones} drones and {self.track.n_gates} "
+                f"gates: each is behind another gate. Use practice=False."
             )
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
@@ -140,7 +141,7 @@ class Race(Task):
         if self.level == 3:
             sizes["course"] = random_count(course)
         if self.practice:
-            sizes |= {"passed": 1, "behind": (1, 2)}
+            sizes |= {"passed": 1, "behind": (n_drones, 2)}
         x = draw(key, **sizes)
         start = np.asarray(course.start, float).astype(dtype)
         if self.level >= 2:
@@ -152,6 +153,8 @@ class Race(Task):
         record, vel = race_of(data), jnp.zeros((), dtype)
         if self.practice:
             passed = (x["passed"] * course.n_gates).astype(jnp.int32)
+            others = 1 + (passed - 1 + np.arange(n_drones, dtype=np.int32)) % max(course.n_gates - 1, 1)
+            passed = jnp.where(passed > 0, others, 0)
             behind, vel = _pos_behind_gate(data, passed, x["behind"])
             pos = jnp.where(passed[..., None] > 0, behind, pos)
             record = record.replace(passed=passed)
@@ -244,11 +247,11 @@ def _pos_behind_gate(data: SimData, passed: Array, x: Array) -> tuple[Array, Arr
 
     Args:
         data: The data of one world.
-        passed: Number of gates passed. (1,)
-        x: Numbers in [0, 1). (1, 2)
+        passed: Number of gates passed. (n_drones,)
+        x: Numbers in [0, 1). (n_drones, 2)
 
     Returns:
-        (1, 3) each
+        (n_drones, 3) each
     """
     pos, quat = (pick(v, jnp.maximum(passed - 1, 0)) for v in gates_of(data))
     ahead = rotation.rotate(quat, jnp.asarray([1.0, 0.0, 0.0], pos.dtype))

@@ -110,7 +110,7 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
     """
     upright = rot[2, 2] > MIN_TILT_COSINE
     cosine = jnp.where(upright, rot[2, 2], 1.0)
-    tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum(1 - cosine**2, 0.0)), cosine)
+    tilt = rotation.safe_arctan2(rotation.safe_sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0)), cosine)
     gain = 1 / jnp.cos(jnp.maximum(tilt - HALF_CONE_ANGLE, 0.0))
     after = update(estimate, [POS[2]], gain[None], distance - gain * estimate.pos[2], deviation)
     return select_estimate(upright, after, estimate)
@@ -211,7 +211,7 @@ def update_sweep(
     sees = radicand > 1e-4
     squared, radicand = jnp.where(sees, squared, 1.0), jnp.where(sees, radicand, 1.0)
     ratio = jnp.where(sees, z * tangent, 0.0) / jnp.sqrt(squared)
-    predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt(1 - ratio**2))
+    predicted = rotation.safe_arctan2(y, x) + rotation.safe_arctan2(ratio, jnp.sqrt((1 - ratio) * (1 + ratio)))
     q = tangent / jnp.sqrt(radicand)
     h = frame @ jnp.stack([(-y - x * z * q) / squared, (x - y * z * q) / squared, q])
     return select_estimate(sees, update(estimate, POS, h, angle - predicted, deviation), estimate)

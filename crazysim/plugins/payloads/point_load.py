@@ -161,7 +161,7 @@ def hanging_state(
     arm = jnp.zeros(3, s.pos.dtype) if attach is None else attach
     top = s.pos + rotation.matvec(rot, arm)
     drop = jnp.clip(top[..., 2:] - clearance, -length, length)
-    back = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt(length * length - drop * drop)
+    back = jnp.zeros_like(drop) if is_cable else rotation.safe_sqrt((length - drop) * (length + drop))
     heading = rotation.yaw(s.quat)[..., None]
     offset = jnp.concatenate([-back * jnp.cos(heading), -back * jnp.sin(heading), -drop], axis=-1)
     vel = s.vel + rotation.matvec(rot, rotation.cross(s.ang_vel, jnp.broadcast_to(arm, s.ang_vel.shape)))

@@ -73,7 +73,7 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
     mean = states.pos.mean(axis=1, keepdims=True)
     # As low as the cables of the drones around it allow.
     level = rotation.safe_norm((states.pos - mean)[..., :2])
-    drop = rotation.safe_sqrt(length * length - level * level)
+    drop = rotation.safe_sqrt((length - level) * (length + level))
     height = jnp.maximum(jnp.max(states.pos[..., 2:] - drop, axis=1, keepdims=True), clearance)
     return jnp.concatenate([mean[..., :2], height], axis=-1), states.vel.mean(axis=1, keepdims=True)
 

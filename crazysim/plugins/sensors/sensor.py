@@ -259,4 +259,4 @@ def gauss_markov_step(state: Array, deviation: Array, time: Array, dt: float, no
         noise: Standard normal numbers. (..., k)
     """
     keep = jnp.exp(-dt / time)
-    return keep * state + deviation * rotation.safe_sqrt(1 - keep * keep) * noise
+    return keep * state + deviation * rotation.safe_sqrt((1 - keep) * (1 + keep)) * noise
