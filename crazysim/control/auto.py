@@ -278,7 +278,7 @@ class Auto(Controller):
             on: Any = True
         else:
             thrust = command[..., 3:]
-            error, rate = self._of_command(s, command, data.controls.mode)
+            error, rate = self._command_errors(s, command, data.controls.mode)
             on = thrust > 0
 
         rotors = matvec(p.mixing_matrix, quadratic_curve(s.rotor_vel, p.allocation.rpm2thrust))
@@ -288,8 +288,8 @@ class Auto(Controller):
         total = momentum - rotation.along_z((p.reaction * rotors[..., 2:])[..., 0])
         impulse = p.torque_max / self.freq
         measured = jnp.clip(total - memory.momentum, -impulse, impulse)
-        held = dot(s.ang_vel, s.ang_vel) == 0  # the floor holds it
-        unknown = (1 - p.observer) * memory.torque + jnp.where(held, 0.0, p.observer * self.freq) * measured
+        at_rest = dot(s.ang_vel, s.ang_vel) == 0  # the floor holds it
+        unknown = (1 - p.observer) * memory.torque + jnp.where(at_rest, 0.0, p.observer * self.freq) * measured
         expected = total + (rotors - gyroscopic) / self.freq
         torque = gyroscopic - unknown - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)
         if error is not None:
@@ -305,7 +305,7 @@ class Auto(Controller):
         driven = jnp.maximum(driven, 1.0)  # zero would be off
         return jnp.where(on, driven, 0.0), memory.replace(momentum=expected, torque=unknown)
 
-    def _of_command(self, s: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
+    def _command_errors(self, s: FlightState, command: Array, mode: Control) -> tuple[Array | None, Array]:
         """Return the rotation error, rad, None at the level of body rates, and the desired body rates, rad/s. (3,)"""
         if mode == Control.body_rate:
             return None, command[..., :3]

@@ -33,7 +33,7 @@ def find_controller(controller: Any, switch: Any = None) -> Controller:
         switch: Function or indices, as for ``Switch``; None for a single controller.
     """
     if isinstance(controller, (list, tuple)):
-        return make_switch([find_controller(each) for each in controller], switch)
+        return make_switch([find_controller(item) for item in controller], switch)
     if switch is not None:
         raise ConfigError(f"expected a list of controllers for a switch, got {controller!r}. Use controller=[...].")
     if isinstance(controller, Controller):

@@ -100,17 +100,17 @@ class CFirmware(Controller):
         s, controls = data.states, data.controls
         level, n_motors = COMMAND_LEVELS.index(controls.mode), params.allocation_matrix.shape[0]
         if controls.mode == Control.state:
-            given, feedforward = controls.state.cmd, controls.state.feedforward
+            setpoint, feedforward = controls.state.cmd, controls.state.feedforward
         else:
-            given, feedforward = jnp.zeros(N_COMMAND).at[:4].set(command), jnp.zeros(N_FEEDFORWARD)
+            setpoint, feedforward = jnp.zeros(N_COMMAND).at[:4].set(command), jnp.zeros(N_FEEDFORWARD)
         clock = jnp.stack([data.core.steps / data.core.freq, jnp.asarray(1 / self.freq)])
-        row = jnp.concatenate([clock, s.pos, s.quat, s.vel, s.ang_vel, given, feedforward]).astype(jnp.float32)
+        row = jnp.concatenate([clock, s.pos, s.quat, s.vel, s.ang_vel, setpoint, feedforward]).astype(jnp.float32)
 
         @jax.custom_jvp
         def call(words: Array, row: Array) -> tuple[Array, Array]:
             shapes = (jax.ShapeDtypeStruct(words.shape, np.uint32), jax.ShapeDtypeStruct((n_motors,), np.float32))
-            own = functools.partial(_call_library, self._copy, level, n_motors)
-            return jax.pure_callback(own, shapes, words, row, vmap_method="broadcast_all")
+            library = functools.partial(_call_library, self._copy, level, n_motors)
+            return jax.pure_callback(library, shapes, words, row, vmap_method="broadcast_all")
 
         call.defjvp(self._refuse_derivative)
         words, motors = call(memory.words, row)

@@ -124,15 +124,15 @@ def geometric_control(
     if integral is not None:
         feedback = feedback + integral
 
-    def undragged(motion: Array, rate: Array) -> Array:
+    def subtract_drag(motion: Array, rate: Array) -> Array:
         """Return the acceleration, or a derivative of it, that the rotors give for a motion under drag."""
         if not feedforward:
             return rate
         return rate - matvec(matrix, matvec(p.drag_matrix, matvec(jnp.swapaxes(matrix, -1, -2), motion))) / p.mass
 
-    specific = undragged(sp.vel, sp.acc) - p.gravity_vec + feedback
+    specific = subtract_drag(sp.vel, sp.acc) - p.gravity_vec + feedback
     desired = attitude_of_thrust(
-        specific, undragged(sp.acc, sp.jerk), undragged(sp.jerk, sp.snap), sp.yaw, sp.yaw_rate, sp.yaw_acc
+        specific, subtract_drag(sp.acc, sp.jerk), subtract_drag(sp.jerk, sp.snap), sp.yaw, sp.yaw_rate, sp.yaw_acc
     )
     thrust = p.mass * dot(specific, matrix[..., 2])
     torque = attitude_torque(matrix, ang_vel, desired, params=p)

@@ -85,15 +85,15 @@ def load_derivative(
         lever = cross(attach, matvec(matrix.T, q))
         turn = jnp.linalg.solve(J, lever)
 
-        def of_joint(acc: Array, ang_acc: Array) -> Array:
+        def joint_acceleration(acc: Array, ang_acc: Array) -> Array:
             """Return the acceleration of the joint."""
             return acc + matvec(matrix, cross(ang_acc, attach) + cross(ang_vel, cross(ang_vel, attach)))
 
         acc = force / mass + gravity_vec
-        along = dot(q, gravity_vec - of_joint(acc, ang_acc)) + length * dot(q_rate, q_rate)
+        along = dot(q, gravity_vec - joint_acceleration(acc, ang_acc)) + length * dot(q_rate, q_rate)
         pull = along / (1 + load_mass / mass + load_mass * dot(lever, turn))
         acc, ang_acc = acc + load_mass / mass * pull * q, ang_acc + load_mass * pull * turn
-        q_acc = (gravity_vec - pull * q - of_joint(acc, ang_acc)) / length
+        q_acc = (gravity_vec - pull * q - joint_acceleration(acc, ang_acc)) / length
     # q'' = J a'' + J' a': the columns of J are orthogonal, so the angles' accelerations are two projections.
     slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (rates,))
     rest = q_acc - slope_rate @ rates

@@ -103,10 +103,10 @@ def weight_matrix(name: str, weights: ArrayLike, n: int) -> np.ndarray:
     is_symmetric = np.allclose(array, array.T)
     least, rounding = np.linalg.eigvalsh(array)[0], 1e-12 * np.abs(array).max()
     if not is_symmetric or (least <= 0 if name == "R" else least < -rounding):
-        found = f"the eigenvalue {least:.3g}" if is_symmetric else "a matrix that is not symmetric"
+        reason = f"the eigenvalue {least:.3g}" if is_symmetric else "a matrix that is not symmetric"
         kind = "definite" if name == "R" else "semidefinite"
         raise ConfigError(
-            f"expected weights {name} as a symmetric, positive {kind} matrix, got {found}. Give a diagonal of {n} "
+            f"expected weights {name} as a symmetric, positive {kind} matrix, got {reason}. Give a diagonal of {n} "
             f"{'positive numbers' if name == 'R' else 'numbers that are at least zero'}."
         )
     return array

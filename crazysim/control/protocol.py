@@ -192,8 +192,8 @@ def controller_chain(
         controller: Controller of the command level; None if commands need none.
         control: Command level, which is the last output if there is no controller.
     """
-    found = []
+    chain = []
     while controller is not None:
-        found.append((control, controller))
+        chain.append((control, controller))
         control, controller = controller.output, controller.inner
-    return found, control
+    return chain, control

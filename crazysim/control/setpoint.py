@@ -55,23 +55,23 @@ class Setpoint(PyTree):
         """Return the setpoint of a state command.
 
         Args:
-            cmd: Position, velocity, acceleration, quaternion of any length, of which only the yaw is used, and body
+            cmd: Position, velocity, acceleration, quaternion of any length (only its yaw is used), and body
                 rates. (..., 16)
             feedforward: Jerk, snap, yaw rate, second derivative of the yaw; None for the yaw rate in the command and
                 zeros. (..., 8)
         """
         if feedforward is None:
             zeros = jnp.zeros_like(cmd[..., :6])
-            further = jnp.concatenate([zeros, cmd[..., 15:16], zeros[..., :1]], axis=-1)
+            rates = jnp.concatenate([zeros, cmd[..., 15:16], zeros[..., :1]], axis=-1)
         else:
-            further = feedforward
+            rates = feedforward
         return Setpoint(
             pos=cmd[..., 0:3],
             vel=cmd[..., 3:6],
             acc=cmd[..., 6:9],
-            jerk=further[..., 0:3],
-            snap=further[..., 3:6],
+            jerk=rates[..., 0:3],
+            snap=rates[..., 3:6],
             yaw=rotation.yaw(cmd[..., 9:13])[..., None],
-            yaw_rate=further[..., 6:7],
-            yaw_acc=further[..., 7:8],
+            yaw_rate=rates[..., 6:7],
+            yaw_acc=rates[..., 7:8],
         )

@@ -82,21 +82,21 @@ class Switch(Controller):
         index = self._index(data, command, params)
         switched = (memory.active[0] >= 0) & (memory.active[0] != index)
         rotor_vel, after = memory.rotor_vel, []
-        for k, (controller, own, p) in enumerate(
+        for k, (controller, state, p) in enumerate(
             zip(self.controllers, memory.controllers, params.controllers, strict=True)
         ):
             chosen = index == k
             starts = chosen & switched
-            own = _select_tree(starts, controller.take_over(data, command, own, p, memory.rotor_vel), own)
+            state = _select_tree(starts, controller.take_over(data, command, state, p, memory.rotor_vel), state)
             if isinstance(command, Setpoint) and controller.has_outer:
                 due = chosen & (starts | _is_due(data, controller.outer_freq))
-                own = _select_tree(due, controller.outer(data, command, own, p), own)
+                state = _select_tree(due, controller.outer(data, command, state, p), state)
             due = chosen & (starts | _is_due(data, controller.freq))
-            out, new = controller.update(data, command, own, p)
+            out, new = controller.update(data, command, state, p)
             if controller.output == Control.force_torque:
                 out = force_torque2rotor_vel(out, params=params.allocation)
             rotor_vel = jnp.where(due, out, rotor_vel)
-            after.append(_select_tree(due, new, own))
+            after.append(_select_tree(due, new, state))
         active = jnp.full_like(memory.active, index)
         return rotor_vel, SwitchMemory(tuple(after), active, rotor_vel)
 

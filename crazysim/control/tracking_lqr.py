@@ -113,7 +113,7 @@ def tracking_gains(
 
     A, B = jax.vmap(matrices)(setpoints)
     eye, h = jnp.eye(12, dtype=J.dtype), dt / substeps
-    moved, pushed = eye + h * A + h * h / 2 * A @ A, h * B + h * h / 2 * A @ B
+    transition, input_matrix = eye + h * A + h * h / 2 * A @ A, h * B + h * h / 2 * A @ B
     end = gain_continuous(A[-1], B[-1], Q, R)
     P = solve_lyapunov(A[-1] - B[-1] @ end, Q + end.T @ R @ end)
 
@@ -130,7 +130,7 @@ def tracking_gains(
         (P, K), _ = jax.lax.scan(once, (P, end), length=substeps)
         return P, K
 
-    _, gains = jax.lax.scan(backward, P, (moved, pushed), reverse=True)
+    _, gains = jax.lax.scan(backward, P, (transition, input_matrix), reverse=True)
     return gains
 
 

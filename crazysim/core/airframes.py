@@ -109,7 +109,7 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
         return records[0]
     counts = [kind.n_rotors for kind in kinds]
     if len(set(counts)) > 1:
-        records = [_with_mask(record, n) for record, n in zip(records, counts, strict=True)]
+        records = [_add_rotor_masks(record, n) for record, n in zip(records, counts, strict=True)]
     structures = [jax.tree.structure(record) for record in records]
     for kind, structure in zip(kinds, structures, strict=True):
         if structure != structures[0]:
@@ -119,32 +119,34 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
             )
     numbers = [kinds.index(airframe) for airframe in airframes]
 
-    def joined(path: tuple[object, ...], *values: ArrayLike) -> np.ndarray:
+    def stack_leaf(path: tuple[object, ...], *values: ArrayLike) -> np.ndarray:
         name = jax.tree_util.keystr(path[-1:]).strip("[].'\"")
-        arrays = _of_one_shape([np.asarray(x) for x in values], name)
+        arrays = _pad_to_longest([np.asarray(x) for x in values], name)
         if all(np.array_equal(x, arrays[0]) for x in arrays):
             return arrays[0]
-        each = np.stack([arrays[k] for k in numbers])
-        return np.array(np.broadcast_to(each, (n_worlds, *each.shape)))
+        per_drone = np.stack([arrays[k] for k in numbers])
+        return np.array(np.broadcast_to(per_drone, (n_worlds, *per_drone.shape)))
 
-    return jax.tree_util.tree_map_with_path(joined, *records)
+    return jax.tree_util.tree_map_with_path(stack_leaf, *records)
 
 
-def _of_one_shape(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
+def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
     """Return arrays with their axes over rotors, along which their lengths differ, as long as the longest."""
     shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
     out = []
     for x in arrays:
-        missing = [(0, n - own) for n, own in zip(shape, x.shape, strict=True)]
-        alike = [own == 1 and n > 1 for n, own in zip(shape, x.shape, strict=True)]
-        if any(alike):
-            x = np.broadcast_to(x, [n if one else own for n, own, one in zip(shape, x.shape, alike, strict=True)])
-            missing = [(0, n - own) for n, own in zip(shape, x.shape, strict=True)]
+        missing = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
+        is_repeated = [size == 1 and n > 1 for n, size in zip(shape, x.shape, strict=True)]
+        if any(is_repeated):
+            x = np.broadcast_to(
+                x, [n if repeat else size for n, size, repeat in zip(shape, x.shape, is_repeated, strict=True)]
+            )
+            missing = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
         out.append(np.pad(x, missing, mode="edge" if name in PER_ROTOR_FIELDS else "constant"))
     return out
 
 
-def _with_mask(record: Any, n_rotors: int) -> Any:
+def _add_rotor_masks(record: Any, n_rotors: int) -> Any:
     """Return a record with the masks over rotors that it and the records within it declare."""
     if not isinstance(record, PyTree):
         return record
@@ -156,6 +158,8 @@ def _with_mask(record: Any, n_rotors: int) -> Any:
         elif isinstance(value, (PyTree, tuple, list)):
             of_parts = isinstance(value, (tuple, list))
             changes[f.name] = (
-                type(value)(_with_mask(x, n_rotors) for x in value) if of_parts else _with_mask(value, n_rotors)
+                type(value)(_add_rotor_masks(x, n_rotors) for x in value)
+                if of_parts
+                else _add_rotor_masks(value, n_rotors)
             )
     return record.replace(**changes) if changes else record

@@ -26,30 +26,30 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
     def controller_ticks(data: SimData) -> Array | None:
         return tick(data, getattr(data.controls, level).controller.freq)
 
-    def outer(data: SimData) -> SimData:
-        data = _with_staged_command(data, control)
-        own = getattr(data.controls, level).controller
+    def run_outer(data: SimData) -> SimData:
+        data = _apply_staged_command(data, control)
+        ctrl = getattr(data.controls, level).controller
         setpoint: Any = _command_in_force(data, control)
-        return _with_memory(data, control, controller.outer(data, setpoint, own.memory, own.params))
+        return _replace_memory(data, control, controller.outer(data, setpoint, ctrl.memory, ctrl.params))
 
-    def inner(data: SimData) -> SimData:
-        own = getattr(data.controls, level).controller
-        command, memory = controller.update(data, _command_in_force(data, control), own.memory, own.params)
-        return _with_memory(_staged_below(data, controller.output, command), control, memory)
+    def run_inner(data: SimData) -> SimData:
+        ctrl = getattr(data.controls, level).controller
+        command, memory = controller.update(data, _command_in_force(data, control), ctrl.memory, ctrl.params)
+        return _replace_memory(_stage_below(data, controller.output, command), control, memory)
 
-    def both(data: SimData) -> SimData:
-        return inner(_with_staged_command(data, control))
+    def run_both(data: SimData) -> SimData:
+        return run_inner(_apply_staged_command(data, control))
 
     name = f"{level}_controller"
     if control == Control.state and controller.has_outer:
         return {
-            name: Stage(outer, "drone", command_ticks, name=name),
-            "attitude_controller": Stage(inner, "drone", controller_ticks, name="attitude_controller"),
+            name: Stage(run_outer, "drone", command_ticks, name=name),
+            "attitude_controller": Stage(run_inner, "drone", controller_ticks, name="attitude_controller"),
         }
-    return {name: Stage(both, "drone", controller_ticks, name=name)}
+    return {name: Stage(run_both, "drone", controller_ticks, name=name)}
 
 
-def _with_staged_command(data: SimData, level: Control) -> SimData:
+def _apply_staged_command(data: SimData, level: Control) -> SimData:
     """Return the data of one drone with the staged command of a level in force."""
     controls = controls_of(data)
     ctrl = getattr(controls, level.value)
@@ -65,7 +65,7 @@ def _command_in_force(data: SimData, level: Control) -> Setpoint | Array:
     return Setpoint.of_command(ctrl.cmd, ctrl.feedforward) if level == Control.state else ctrl.cmd
 
 
-def _staged_below(data: SimData, level: Control, command: Array) -> SimData:
+def _stage_below(data: SimData, level: Control, command: Array) -> SimData:
     """Return the data of one drone with the command of its controller staged; rotor speeds are in force at once."""
     controls = controls_of(data)
     if level == Control.rotor_vel:
@@ -76,7 +76,7 @@ def _staged_below(data: SimData, level: Control, command: Array) -> SimData:
     return data.replace(controls=controls.replace(**{level.value: ctrl}))
 
 
-def _with_memory(data: SimData, level: Control, memory: Any) -> SimData:
+def _replace_memory(data: SimData, level: Control, memory: Any) -> SimData:
     """Return the data of one drone with the memory of the controller that follows a level."""
     ctrl = getattr(data.controls, level.value)
     ctrl = ctrl.replace(controller=ctrl.controller.replace(memory=memory))

@@ -31,7 +31,7 @@ class ControllerData(PyTree):
     def create(n_worlds: int, n_drones: int, controller: Controller, airframes: Airframes) -> ControllerData:
         """Return a controller at rest, with the gains of each drone's airframe."""
         params = create_per_drone(airframes, controller.params, n_worlds)
-        memory, one = (
+        memory, template = (
             create_per_drone(airframes, controller.memory, n_worlds),
             controller.memory(as_airframes(airframes)[0]),
         )
@@ -52,12 +52,12 @@ class ControllerData(PyTree):
                     f"leading axes (n_worlds, n_drones) = {counts}, got shape {np.shape(x)}. Use np.broadcast_to."
                 )
 
-        def of_all(x: np.ndarray, like: np.ndarray) -> np.ndarray:
+        def of_all(x: np.ndarray, core_template: np.ndarray) -> np.ndarray:
             dtype = float_dtype() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
-            core = np.shape(x)[np.ndim(x) - np.ndim(like) :]  # it may have rows of drones, and more rotors
+            core = np.shape(x)[np.ndim(x) - np.ndim(core_template) :]  # it may have rows of drones, and more rotors
             return host_array(x, n_worlds, n_drones, *core, dtype=dtype)
 
-        return ControllerData(jax.tree.map(of_all, memory, one), params, controller.freq)
+        return ControllerData(jax.tree.map(of_all, memory, template), params, controller.freq)
 
 
 class _LevelData(PyTree):
@@ -74,24 +74,24 @@ class _LevelData(PyTree):
     @property
     def pos_err_i(self) -> Array | None:
         """Integral of the position error, m s. (n_worlds, n_drones, 3)"""
-        return self._remembered("pos_err_i")
+        return self._memory_field("pos_err_i")
 
     @property
     def ang_vel_des(self) -> Array | None:
         """Desired body rates in force, rad/s. (n_worlds, n_drones, 3)"""
-        return self._remembered("ang_vel_des")
+        return self._memory_field("ang_vel_des")
 
     @property
     def r_int_error(self) -> Array | None:
         """Integral of the rotation error, rad s. (n_worlds, n_drones, 3)"""
-        return self._remembered("r_int_error")
+        return self._memory_field("r_int_error")
 
     @property
     def prev_ang_vel(self) -> Array | None:
         """Angular velocity at the last tick, body frame, rad/s. (n_worlds, n_drones, 3)"""
-        return self._remembered("prev_ang_vel")
+        return self._memory_field("prev_ang_vel")
 
-    def _remembered(self, name: str) -> Array | None:
+    def _memory_field(self, name: str) -> Array | None:
         return None if self.controller is None else getattr(self.controller.memory, name, None)
 
     def replace(self, **changes: Any) -> Self:
@@ -156,22 +156,22 @@ class ForceTorqueControlData(PyTree):
     """Limits and constants."""
 
 
-def require_same_controllers(controls: SimControls, like: SimControls, name: str | None) -> None:
+def require_same_controllers(controls: SimControls, reference: SimControls, name: str | None) -> None:
     """Check that two simulations' controllers have the same records, with memory of the same shapes.
 
     Args:
         controls: Commands and controllers to check.
-        like: Commands and controllers of the simulation.
+        reference: Commands and controllers of the simulation.
         name: Name of the simulation's controller.
     """
-    given, needed = _controllers_of(controls), _controllers_of(like)
-    if given == needed:  # the same objects
+    records, expected = _controllers_of(controls), _controllers_of(reference)
+    if records == expected:  # the same objects
         return
-    if [_layout(controller) for controller in given] != [_layout(controller) for controller in needed]:
+    if [_layout(controller) for controller in records] != [_layout(controller) for controller in expected]:
         raise ConfigError(
-            f"expected data of controller {name!r} with {', then '.join(map(_describe, needed)) or 'no records'}, got "
-            f"{', then '.join(map(_describe, given)) or 'no records'}. Use data of this simulation, or of one with "
-            f"the same settings."
+            f"expected data of controller {name!r} with {', then '.join(map(_describe, expected)) or 'no records'}, "
+            f"got {', then '.join(map(_describe, records)) or 'no records'}. Use data of this simulation, or of one "
+            f"with the same settings."
         )
 
 
@@ -251,7 +251,7 @@ class SimControls(PyTree):
         require_controller(dynamics, control, controller)
         followers, last = controller_chain(controller, control)
         by_level = dict(followers)
-        data = {level: ControllerData.create(*shape, each, airframes) for level, each in followers}
+        data = {level: ControllerData.create(*shape, x, airframes) for level, x in followers}
 
         def zeros(n: int) -> Any:
             return host_array(0.0, *shape, n)
@@ -299,8 +299,8 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
 def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
     """Check that controllers follow their levels, and that the dynamics follow the last command."""
     followers, last = controller_chain(controller, control)
-    for level, each in followers:
-        for member in each.members:
+    for level, follower in followers:
+        for member in follower.members:
             if level not in member.levels:
                 raise ConfigError(
                     f"expected a command level that controller {member.name!r} follows, {' or '.join(member.levels)}, "

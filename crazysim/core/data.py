@@ -222,10 +222,10 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
     """
     n_rotors = n_rotors_of(airframe)
 
-    def create(one: Airframe) -> SimParams:
+    def create(airframe: Airframe) -> SimParams:
         if dynamics == Dynamics.first_principles:
-            return first_principles.pad_rotors(first_principles.Params.create(one), n_rotors)
-        return fitted.Params.create(one, dynamics)
+            return first_principles.pad_rotors(first_principles.Params.create(airframe), n_rotors)
+        return fitted.Params.create(airframe, dynamics)
 
     return create_per_drone(airframe, create, n_worlds)
 

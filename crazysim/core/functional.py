@@ -70,13 +70,13 @@ def check_setpoint(
 
     Arguments and errors as in ``state_control``; of the data, shapes and types are enough.
     """
-    given = {name: x for name, x in parts.items() if x is not None}
+    present = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
-        controls = _join_setpoint(data, given)
-    elif given:
+        controls = _join_setpoint(data, present)
+    elif present:
         raise ConfigError(
-            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(given)}. Write them "
-            f"into the vector, or leave it out."
+            f"expected one vector of 16 numbers per drone or its parts, got both, with {', '.join(present)}. Write "
+            f"them into the vector, or leave it out."
         )
     command = check_command(data, Control.state, controls, check_finite)
     if feedforward is None:
@@ -95,10 +95,10 @@ def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.nda
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
     counts = data.states.pos.shape[:2]
-    given = {name: _check_part(name, x, counts if name == "yaw" else (*counts, 3)) for name, x in parts.items()}
-    if any(isinstance(x, jax.Array) for x in given.values()):
-        return _device_setpoint(counts, data.states.pos.dtype, given)
-    return _setpoint(np, counts, float, given)
+    checked = {name: _check_part(name, x, counts if name == "yaw" else (*counts, 3)) for name, x in parts.items()}
+    if any(isinstance(x, jax.Array) for x in checked.values()):
+        return _device_setpoint(counts, data.states.pos.dtype, checked)
+    return _setpoint(np, counts, float, checked)
 
 
 def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | np.ndarray:

@@ -69,11 +69,11 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
     states = [name for name in fields if getattr(kinds, name) == plugin.scope]
     for field, rate in rates.items():
         if field not in states:
-            own = "drone" if plugin.scope == "drone" else "member"
+            owner = "drone" if plugin.scope == "drone" else "member"
             raise ConfigError(
-                f"expected {where} to return rates of leaves of {own}s in its record, which are "
+                f"expected {where} to return rates of leaves of {owner}s in its record, which are "
                 f"{', '.join(map(repr, states)) or 'none'}, got one of {field!r}. Declare such a state with "
-                f"leaf({own!r}, ...)."
+                f"leaf({owner!r}, ...)."
             )
         x = getattr(record, field)
         same_type = jnp.issubdtype(x.dtype, jnp.floating) and jnp.result_type(x, rate) == x.dtype
@@ -88,7 +88,7 @@ def plugin_rates(plugin: Plugin, data: SimData) -> dict[str, Array]:
 def apply_constraint(plugin: Plugin, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
     """Return the derivative under the constraint of a plugin; its errors carry a note with plugin and method."""
     where = f"constrain of plugin {plugin.name!r} ({type(plugin).__name__})"
-    return _call_method(where, lambda seen: plugin.constrain(seen, deriv, dt), data, plugin.coupling)
+    return _call_method(where, lambda data_seen: plugin.constrain(data_seen, deriv, dt), data, plugin.coupling)
 
 
 def _call_method(where: str, method: Callable[[SimData], T], data: SimData, scope: str = "drone") -> T:

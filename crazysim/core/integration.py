@@ -143,9 +143,9 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
         if self.couples_world:
-            seen, deriv = data, vmap_drones(lambda one: self._free(one)[1])(data)
+            influenced, deriv = data, vmap_drones(lambda drone_data: self._free(drone_data)[1])(data)
         else:
-            seen, deriv = self._free(data)
+            influenced, deriv = self._free(data)
         constraining = [plugin for plugin in self.plugins if plugin.constrains]
         if not constraining:
             return deriv
@@ -153,7 +153,7 @@ class Integration:
         if self.method is symplectic_euler:
             vel, ang_vel = deriv.vel + dt * deriv.acc, deriv.ang_vel + dt * deriv.ang_acc
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
-        return apply_constraint(constraining[0], seen, deriv, None if self.method is rk4 else dt)
+        return apply_constraint(constraining[0], influenced, deriv, None if self.method is rk4 else dt)
 
     def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data under all influences, and the derivative without constraints."""
@@ -161,8 +161,8 @@ class Integration:
             data = apply_influence(plugin, data)
         deriv = self.deriv_fn(data)
         of_drones = [plugin for plugin in self.plugins if plugin.scope == "drone"]
-        own = {plugin.name: rates for plugin in of_drones if (rates := plugin_rates(plugin, data))}
-        return data, deriv.replace(plugins=own) if own else deriv
+        plugin_derivs = {plugin.name: rates for plugin in of_drones if (rates := plugin_rates(plugin, data))}
+        return data, deriv.replace(plugins=plugin_derivs) if plugin_derivs else deriv
 
     def stage(self) -> Stage:
         """Return the stage. Plugins are written for one drone or one world, the rest takes any leading axes.

@@ -70,17 +70,17 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
     def pair(*args: Any) -> list[Array]:
         nonlocal structure
         *other, is_self = args
-        found, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, fn(treedef.unflatten(other), is_self)))
-        return found
+        values_of_pair, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, fn(treedef.unflatten(other), is_self)))
+        return values_of_pair
 
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     traced = jax.make_jaxpr(pair)(*avals, jax.ShapeDtypeStruct((), bool))
     if reduce == "sum" and any(x.dtype == bool for x in traced.out_avals):
         raise ConfigError("expected numbers to sum over the other drones, got bools. Use reduce='max' for any of them.")
-    found = reduce_over_others_p.bind(
+    reduced = reduce_over_others_p.bind(
         *traced.consts, *leaves, jaxpr=constants_to_inputs(traced), n_own=len(traced.consts), reduce=reduce
     )
-    return structure.unflatten(found)
+    return structure.unflatten(reduced)
 
 
 def _refuse_outside(*args: object, **params: object) -> NoReturn:
@@ -96,21 +96,21 @@ def _results(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list
 
 def _batched(axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> Any:
     """Return the reduction under ``vmap``: over drones it is computed, over any other axis it stays one."""
-    mapped = [None if d is None else 0 for d in dims]
+    in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:
-        out = _of_all(axis.size, rows[:n_own], mapped[:n_own], rows[n_own:], mapped[n_own:], jaxpr, reduce)
+        out = _reduce_for_all(axis.size, rows[:n_own], in_axes[:n_own], rows[n_own:], in_axes[n_own:], jaxpr, reduce)
     else:
-        of_many = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*mapped, None), axis_size=axis.size)
+        of_many = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
         pair = jax.make_jaxpr(of_many)(*rows, jax.ShapeDtypeStruct((), bool))
         out = reduce_over_others_p.bind(*rows, jaxpr=pair, n_own=n_own, reduce=reduce)
     return out, [0] * len(out)
 
 
-def _of_all(
+def _reduce_for_all(
     n: int,
-    own: Sequence[Array],
-    own_axes: Sequence[int | None],
+    captured: Sequence[Array],
+    captured_axes: Sequence[int | None],
     other: Sequence[Array],
     other_axes: Sequence[int | None],
     jaxpr: ClosedJaxpr,
@@ -118,22 +118,22 @@ def _of_all(
 ) -> list[Array]:
     """Return the reduction for each drone of a world. (n, ...) each"""
     pair, numbers = jaxpr_as_fun(jaxpr), jnp.arange(n)
-    each = [x for x, axis in zip(own, own_axes, strict=True) if axis is not None]
+    batched = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
 
-    def of_one(i: Array, some: Sequence[Array]) -> list[Array]:
-        rest = iter(some)
-        mine = [x if axis is None else next(rest) for x, axis in zip(own, own_axes, strict=True)]
+    def reduce_for_one(i: Array, row: Sequence[Array]) -> list[Array]:
+        rest = iter(row)
+        own_values = [x if axis is None else next(rest) for x, axis in zip(captured, captured_axes, strict=True)]
 
-        def of_pair(j: Array, values: Sequence[Array]) -> list[Array]:
-            return pair(*mine, *values, i == j)
+        def apply_to_pair(j: Array, values: Sequence[Array]) -> list[Array]:
+            return pair(*own_values, *values, i == j)
 
-        found = jax.vmap(of_pair, (0, list(other_axes)))(numbers, list(other))
-        return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in found]
+        pairs = jax.vmap(apply_to_pair, (0, list(other_axes)))(numbers, list(other))
+        return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in pairs]
 
     if n * n <= MAX_PAIRS:
-        return jax.vmap(of_one)(numbers, each)
-    in_turn = jax.checkpoint(lambda xs: of_one(*xs))
-    return jax.lax.map(in_turn, (numbers, each), batch_size=max(1, MAX_PAIRS // n))
+        return jax.vmap(reduce_for_one)(numbers, batched)
+    in_turn = jax.checkpoint(lambda xs: reduce_for_one(*xs))
+    return jax.lax.map(in_turn, (numbers, batched), batch_size=max(1, MAX_PAIRS // n))
 
 
 reduce_over_others_p = batched_primitive("reduce_over_others", _results, _batched, _refuse_outside)

@@ -71,7 +71,7 @@ class StagePlacement:
     stage: Callable[[SimData], SimData]
     """The stage, declared with ``crazysim.stage``."""
     before: str = "integration"
-    """Name of the stage in front of which it is inserted."""
+    """Name of the stage before which it is inserted."""
     replaces: str | None = None
     """Name of the stage that it replaces instead, if the pipeline has it; removing the plugin puts that stage back."""
     name: str | None = None
@@ -113,8 +113,8 @@ def airframe_numbers(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -
     first = next(iter(values.values()))
     if len(kinds) == 1:
         return first
-    each = np.stack([values[id(airframe)] for airframe in sim.airframes])
-    return np.broadcast_to(each, (sim.n_worlds, *each.shape))
+    per_drone = np.stack([values[id(airframe)] for airframe in sim.airframes])
+    return np.broadcast_to(per_drone, (sim.n_worlds, *per_drone.shape))
 
 
 def check_parameter(
@@ -172,7 +172,7 @@ def drone_array(sim: Simulation, value: ArrayLike, *core: int) -> Array:
 class Plugin:
     """Base class of everything that ``sim.add`` adds: an effect, a sensor, a log.
 
-    A subclass lists its settings as annotated fields, one of which is ``name``; it becomes a frozen dataclass. It
+    A subclass lists its settings as annotated fields, including ``name``; it becomes a frozen dataclass. It
     overrides what it needs of the methods below. All methods that take ``data`` are written for one drone: leaves of
     drones and worlds come without batch axes, ``data.states.pos`` is (3,).
     """
@@ -185,8 +185,8 @@ class Plugin:
     coupling: ClassVar[Literal["drone", "world"]] = "drone"
     """Scope that ``constrain`` is written for: the data of one drone, or of one world."""
     reset_before: ClassVar[str | None] = None
-    """Name of the stage of an episode's first step in front of which ``reset_episode`` is called, if it uses what that
-    step has computed so far; None to call it at resets, and in front of all stages in worlds that were not reset."""
+    """Name of the stage of an episode's first step before which ``reset_episode`` is called, if it uses results of
+    that step; None to call it at resets, and before all stages in worlds that were not reset."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -236,7 +236,7 @@ class Plugin:
         """Return the record that resets restore; by default the same as ``record``."""
         return self.record(sim)
 
-    def filled(self, sim: Simulation, kind: type[R], **given: Any) -> R:
+    def filled(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
         """Return a record for all worlds, whose other fields follow from their declarations.
 
         A parameter has the value of the plugin's setting of that name, checked; without a fixed core shape it has one
@@ -245,10 +245,10 @@ class Plugin:
         Args:
             sim: The simulation.
             kind: Class of the record.
-            given: Values of fields. If one is None, the setting of its name is checked nevertheless.
+            fields: Values of fields. If one is None, the setting of its name is checked nevertheless.
         """
-        settings = {name: each for name, each in settings_of(type(self)).items() if each.is_parameter}
-        values = dict(given)
+        settings = {name: declared for name, declared in settings_of(type(self)).items() if declared.is_parameter}
+        values = dict(fields)
         for field in dataclasses.fields(kind):  # type: ignore[arg-type]
             name, scope, core = field.name, field.metadata.get("scope"), field.metadata.get("core")
             if values.get(name) is not None:

@@ -109,7 +109,7 @@ class Population(Plugin):
         for name, value in fields.items():
             metadata = kind.__dataclass_fields__[name].metadata  # type: ignore[attr-defined]
             of_members = metadata.get("scope") == "member" and value is not None and not isinstance(value, PyTree)
-            values[name] = _of_members(name, value, metadata, counts) if of_members else value
+            values[name] = _repeat_for_members(name, value, metadata, counts) if of_members else value
         ids = np.array(np.broadcast_to(np.arange(self.n_members, dtype=np.int32), counts))
         return kind(population=self.name, n_members=self.n_members, member_id=ids, **values)  # type: ignore[call-arg]
 
@@ -145,17 +145,17 @@ class Population(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         """Return the stages of controller and integration, each if the class overrides its method."""
-        cls, found = type(self), []
+        cls, placements = type(self), []
         if cls.control is not Population.control:
             rate = self.control_freq
             when = None if rate is None else functools.partial(tick, freq=rate)
             name = f"{self.name}_control"
-            found.append(StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name))
+            placements.append(StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name))
         if cls.derivative is not Population.derivative:
             name = f"{self.name}_integration"
             step = functools.partial(self._integrated, self.scheme(sim.integrator))
-            found.append(StagePlacement(Stage(step, self.name, name=name), before="increment_steps", name=name))
-        return found
+            placements.append(StagePlacement(Stage(step, self.name, name=name), before="increment_steps", name=name))
+        return placements
 
     def with_poses(self, record: R, pos: Array, quat: Array) -> R:
         """Return a record of all worlds with other poses; by default in fields ``pos`` and ``quat``, if it has them.
@@ -172,10 +172,10 @@ class Population(Plugin):
         record, field = self.read(data), self.command_field
         if field is None:
             raise ConfigError(f"expected a population that takes commands, got {self.name!r}, which takes none")
-        like = getattr(record, field)
-        command = check_command(self.name, like.shape, command, like.dtype)
-        inside_jit = isinstance(like, jax.core.Tracer) or isinstance(command, jax.core.Tracer)
-        new = jnp.asarray(command) if inside_jit else jax.device_put(command, like.sharding)
+        staged = getattr(record, field)
+        command = check_command(self.name, staged.shape, command, staged.dtype)
+        inside_jit = isinstance(staged, jax.core.Tracer) or isinstance(command, jax.core.Tracer)
+        new = jnp.asarray(command) if inside_jit else jax.device_put(command, staged.sharding)
         return self.write(data, record.replace(**{field: new}))
 
     def _controlled(self, data: SimData) -> SimData:
@@ -246,7 +246,7 @@ def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: 
     return array.astype(dtype)
 
 
-def _of_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
+def _repeat_for_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
     """Return a value repeated for every member of every world."""
     array = np.asarray(value)
     is_integer = array.dtype.kind in "iu" and hasattr(

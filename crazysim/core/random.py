@@ -65,7 +65,7 @@ def world_keys(data: SimData, name: str) -> Array:
     Returns:
         Typed keys. (n_worlds,)
     """
-    return _over_worlds(data, lambda one: world_key(one, name))
+    return _over_worlds(data, lambda world: world_key(world, name))
 
 
 def drone_keys(data: SimData, name: str) -> Array:
@@ -79,8 +79,8 @@ def drone_keys(data: SimData, name: str) -> Array:
         Typed keys; draw with ``jax.vmap(jax.vmap(draw))(keys)``. (n_worlds, n_drones)
     """
 
-    def of_world(one: SimData) -> Array:
-        return jax.vmap(lambda drone: _key(one, name, drone))(one.core.drone_id)
+    def of_world(world: SimData) -> Array:
+        return jax.vmap(lambda drone: _key(world, name, drone))(world.core.drone_id)
 
     return _over_worlds(data, of_world)
 
@@ -143,7 +143,7 @@ def _over_worlds(data: SimData, fn: Callable[[SimData], Array]) -> Array:
     core = data.core
 
     def of_world(world_id: Array, drone_id: Array, episode: Array, steps: Array) -> Array:
-        one = core.replace(world_id=world_id, drone_id=drone_id, episode=episode, steps=steps)
-        return fn(data.replace(core=one))
+        world_core = core.replace(world_id=world_id, drone_id=drone_id, episode=episode, steps=steps)
+        return fn(data.replace(core=world_core))
 
     return jax.vmap(of_world)(core.world_id[:, 0], core.drone_id, core.episode[:, 0], core.steps[:, 0])

@@ -137,11 +137,11 @@ def settings_of(kind: type) -> dict[str, Setting]:
 
     A field that overrides one of a base class keeps the declaration of that one, unless it has its own.
     """
-    found = {}
+    declared = {}
     for base in reversed(kind.__mro__):
         fields = vars(base).get("__dataclass_fields__", {})
-        found |= {name: f.metadata["setting"] for name, f in fields.items() if "setting" in f.metadata}
-    return {field.name: found.get(field.name, Setting()) for field in dataclasses.fields(kind)}
+        declared |= {name: f.metadata["setting"] for name, f in fields.items() if "setting" in f.metadata}
+    return {field.name: declared.get(field.name, Setting()) for field in dataclasses.fields(kind)}
 
 
 def check_settings(settings: Any) -> None:
@@ -170,8 +170,8 @@ def check_settings(settings: Any) -> None:
                 read_numbers(f"{key!r} in {name}", item, declared.range, ((),), remedy=remedy)
         elif kinds & NUMERIC_TYPES and not isinstance(value, classes):
             shapes = declared.shapes if np.ndarray in kinds or declared.is_parameter else ((),)
-            whole = kinds & NUMERIC_TYPES == {int} or declared.dtype is not None
-            read_numbers(name, value, declared.range, shapes, whole=whole, remedy=remedy)
+            is_whole = kinds & NUMERIC_TYPES == {int} or declared.dtype is not None
+            read_numbers(name, value, declared.range, shapes, whole=is_whole, remedy=remedy)
         elif not isinstance(value, classes):
             names = " or ".join(sorted(TYPE_DESCRIPTIONS.get(k, k.__name__) for k in kinds))
             raise ConfigError(f"expected {name} as {names}, got {short_repr(value)}. {remedy}")
@@ -183,13 +183,13 @@ def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
 
     An array stands for ``ArrayLike`` and sequences of numbers.
     """
-    found = {}
+    types = {}
     for base in reversed(kind.__mro__):
         module = getattr(sys.modules.get(base.__module__), "__dict__", {})  # a file that was run may have none
         names = module | {"ArrayLike": Numbers}
         for name, hint in inspect.get_annotations(base).items():
-            found[name] = _types(hint, names)
-    return {field.name: found.get(field.name, ()) for field in dataclasses.fields(kind)}
+            types[name] = _types(hint, names)
+    return {field.name: types.get(field.name, ()) for field in dataclasses.fields(kind)}
 
 
 def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
@@ -262,9 +262,9 @@ def find_device(device: str | jax.Device) -> jax.Device:
         devices = jax.devices("gpu" if platform == "cuda" else platform)
         return devices[int(index or 0)]
     except (RuntimeError, ValueError, IndexError) as error:
-        found = ", ".join(str(d) for d in jax.devices())
+        available = ", ".join(str(d) for d in jax.devices())
         raise ConfigError(
-            f"device {device!r} does not exist ({error}); there is {found}. Use a platform such as 'cpu' or 'gpu', "
+            f"device {device!r} does not exist ({error}); there is {available}. Use a platform such as 'cpu' or 'gpu', "
             f"or 'gpu:1' for its second device. GPUs need the CUDA packages of JAX: pip install 'crazysim[gpu]'."
         ) from None
 
@@ -305,13 +305,13 @@ def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Arra
     return jnp.asarray(array)
 
 
-def check_rates(control: Control, freq: int, given: Mapping[Control, int | None]) -> None:
+def check_rates(control: Control, freq: int, rates: Mapping[Control, int | None]) -> None:
     """Check requested rates, Hz; None stands for the rate of a controller."""
     in_use = {
         Control.state: (Control.state, Control.attitude, Control.force_torque),
         Control.rotor_vel: (),
     }.get(control, (control, Control.force_torque))
-    for level, requested in given.items():
+    for level, requested in rates.items():
         if requested is not None and freq % positive_integer(f"{level.value}_freq", requested) and level in in_use:
             raise ConfigError(
                 f"{level.value}_freq is {requested} Hz, which does not divide freq = {freq} Hz, so it cannot fire "
@@ -320,7 +320,7 @@ def check_rates(control: Control, freq: int, given: Mapping[Control, int | None]
 
 
 def control_freqs(
-    control: Control, freq: int, given: Mapping[Control, int | None], controller: Controller | None
+    control: Control, freq: int, rates: Mapping[Control, int | None], controller: Controller | None
 ) -> dict[Control, int]:
     """Return the rate at which commands of each level in use take effect, Hz.
 
@@ -329,17 +329,17 @@ def control_freqs(
     Args:
         control: Command level.
         freq: Rate of physics steps, Hz.
-        given: Requested rates, Hz; None for the default, the largest divisor of ``freq`` up to 500 Hz.
+        rates: Requested rates, Hz; None for the default, the largest divisor of ``freq`` up to 500 Hz.
         controller: Controller of the command level, from ``controller_at_rates``; None if commands need none.
     """
     followers, last = controller_chain(controller, control)
     freqs = {}
-    for level, each in followers:
-        outer_freq = each.outer_freq if level == Control.state else None
-        freqs[level] = each.freq if outer_freq is None else outer_freq
+    for level, follower in followers:
+        outer_freq = follower.outer_freq if level == Control.state else None
+        freqs[level] = follower.freq if outer_freq is None else outer_freq
     if last != Control.rotor_vel:
         name = f"{last.value}_freq"
-        freqs[last] = given.get(last) or default_rates(freq, {name: min(500, freq)})[name]
+        freqs[last] = rates.get(last) or default_rates(freq, {name: min(500, freq)})[name]
     return freqs
 
 
@@ -379,7 +379,7 @@ def dividing_rate(name: str, rate: object, freq: int) -> int:
 
 
 def controller_at_rates(
-    controller: Controller, control: Control, freq: int, given: Mapping[Control, int | None]
+    controller: Controller, control: Control, freq: int, requested_rates: Mapping[Control, int | None]
 ) -> Controller:
     """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
 
@@ -390,28 +390,30 @@ def controller_at_rates(
         controller: The controller.
         control: Command level.
         freq: Rate of physics steps, Hz.
-        given: Requested rates, Hz; None for the rates of the controller.
+        requested_rates: Requested rates, Hz; None for the rates of the controller.
     """
     if isinstance(controller, Switch):
-        members = tuple(controller_at_rates(member, control, freq, given) for member in controller.controllers)
-        own = {rate for member in members for rate in (member.freq, member.outer_freq) if rate is not None}
-        common = max(own) if all(max(own) % rate == 0 for rate in own) else freq
+        members = tuple(
+            controller_at_rates(member, control, freq, requested_rates) for member in controller.controllers
+        )
+        member_rates = {rate for member in members for rate in (member.freq, member.outer_freq) if rate is not None}
+        common = max(member_rates) if all(max(member_rates) % rate == 0 for rate in member_rates) else freq
         return dataclasses.replace(controller, controllers=members, freq=common)
-    requested = {"freq": given.get(control)}
+    requested = {"freq": requested_rates.get(control)}
     if control == Control.state and controller.has_outer:
-        requested = {"outer_freq": given.get(control), "freq": given.get(Control.attitude)}
-    own = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
+        requested = {"outer_freq": requested_rates.get(control), "freq": requested_rates.get(Control.attitude)}
+    class_defaults = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
     rates: dict[str, Any] = {}
     defaults, of = {}, f" of controller {controller.name!r}"
     for name, given_rate in requested.items():
         rate = getattr(controller, name) if given_rate is None else given_rate
-        if given_rate is None and rate == own[name]:
+        if given_rate is None and rate == class_defaults[name]:
             defaults[name] = positive_integer(name + of, rate)
         else:
             rates[name] = dividing_rate(name + of, rate, freq)
     rates |= default_rates(freq, defaults, of)
     if inner := controller.inner:
-        rates["inner"] = controller_at_rates(inner, controller.output, freq, given)
+        rates["inner"] = controller_at_rates(inner, controller.output, freq, requested_rates)
     return dataclasses.replace(controller, **rates)  # type: ignore[type-var]
 
 

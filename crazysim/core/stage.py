@@ -175,7 +175,7 @@ class Axes:
                 f"put everything in place before the step, with sim.data = sim.data.replace(...)"
             )
         written = [i for i, (x, y) in enumerate(zip(before, new, strict=True)) if x is not y]
-        own = self.writable(stage)
+        writable_scopes = self.writable(stage)
         for i in written:
             x, y = before[i], new[i]
             if jnp.shape(x) != jnp.shape(y) or jnp.result_type(x) != jnp.result_type(y):
@@ -183,11 +183,11 @@ class Axes:
                     f"stage {name!r} turned {self.names[i]} of shape {jnp.shape(x)} and type {jnp.result_type(x)} into "
                     f"shape {jnp.shape(y)} and type {jnp.result_type(y)}; a step must keep both"
                 )
-            if own is not None and self.scopes[i] not in own:
+            if writable_scopes is not None and self.scopes[i] not in writable_scopes:
                 raise ConfigError(
                     f"stage {name!r} is declared for one {stage.scope} and writes {self.names[i]}, which is "
-                    f"{self.scopes[i]}; it may write leaves of scope {' or '.join(own)}. Give every {stage.scope} a "
-                    f"leaf of its own first, or leave the stage undeclared."
+                    f"{self.scopes[i]}; it may write leaves of scope {' or '.join(writable_scopes)}. Give every "
+                    f"{stage.scope} a leaf of its own first, or leave the stage undeclared."
                 )
         return written
 
@@ -213,10 +213,10 @@ class Axes:
 
     def shape_of_one(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
         """Return the same for the leaf with number ``i``."""
-        own, taken = self.scopes[i], 0
-        if scope != "batch" and own != "batched":
-            taken = n_batch_axes(own) if own == scope else n_world_axes(own)
-        return jax.ShapeDtypeStruct(jnp.shape(x)[taken:], x.dtype)
+        leaf_scope, n_leading = self.scopes[i], 0
+        if scope != "batch" and leaf_scope != "batched":
+            n_leading = n_batch_axes(leaf_scope) if leaf_scope == scope else n_world_axes(leaf_scope)
+        return jax.ShapeDtypeStruct(jnp.shape(x)[n_leading:], x.dtype)
 
 
 def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
@@ -239,7 +239,7 @@ def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
         split = [n_batch_axes(kind) >= least for kind in kinds]
         returned: dict[str, Any] = {}
 
-        def one(values: list[Any]) -> list[Any]:
+        def in_one_world(values: list[Any]) -> list[Any]:
             result = fn(*treedef.unflatten(values))
             paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
             returned["kinds"] = after = _kinds(result)
@@ -262,7 +262,7 @@ def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
                     )
             return [x for (_, x), number in zip(paths, unchanged, strict=True) if number is None]
 
-        changed = iter(jax.vmap(one, ([0 if divided else None for divided in split],))(rows))
+        changed = iter(jax.vmap(in_one_world, ([0 if divided else None for divided in split],))(rows))
         out = []
         for kind, number in zip(returned["kinds"], returned["unchanged"], strict=True):
             if number is not None and kinds[number] == kind:
@@ -276,21 +276,15 @@ def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
 
 
 def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
-    """Return a function of the data of one drone as a function of the data of one world; see ``vmap_members``."""
-    return vmap_members(fn, "drone")
-
-
-def vmap_members(fn: Callable[[SimData], Any], population: str) -> Callable[[SimData], Any]:
-    """Return a function of the data of one member of a population as a function of the data of one world.
+    """Return a function of the data of one drone as a function of the data of one world.
 
     Args:
-        fn: From the data of one member to any tree of arrays, each of which gets a first axis over members.
-        population: Name of the population, or ``"drone"``.
+        fn: From the data of one drone to any tree of arrays; each gets a first axis over drones.
     """
 
     def of_world(data: SimData) -> Any:
         leaves, treedef = jax.tree.flatten(data)
-        axes = [0 if scope == population else None for scope in jax.tree.leaves(scopes(data))]
+        axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
         return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=MEMBER_AXIS)(leaves)
 
     return of_world
@@ -317,14 +311,14 @@ def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
         leaves = jax.tree.leaves(world)
         written: list[int] = []
 
-        def one(values: list[Array]) -> list[Array]:
+        def apply(values: list[Array]) -> list[Array]:
             after = stage.apply_to_one(axes.treedef.unflatten(values))
             written[:] = axes.written(values, after, stage)
             new = jax.tree.leaves(after)
             return [new[i] for i in written]
 
-        own = [0 if s == stage.scope else None for s in axes.scopes]
-        out = one(leaves) if stage.scope == "world" else jax.vmap(one, (own,), axis_name=MEMBER_AXIS)(leaves)
+        in_axes = [0 if s == stage.scope else None for s in axes.scopes]
+        out = apply(leaves) if stage.scope == "world" else jax.vmap(apply, (in_axes,), axis_name=MEMBER_AXIS)(leaves)
         return axes.treedef.unflatten(replace_leaves(leaves, written, out))
 
     return of_one_world

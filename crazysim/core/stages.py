@@ -42,8 +42,8 @@ def build_step_pipeline(
     fitted_model = dynamics != Dynamics.first_principles
     stages: Pipeline = {}
     followers, last = controller_chain(controller, control)
-    for level, each in followers:
-        stages |= controller_stages(each, level)
+    for level, follower in followers:
+        stages |= controller_stages(follower, level)
     if last == Control.attitude:
         stages["commit_attitude"] = commit_attitude
     if last == Control.force_torque:
@@ -127,12 +127,12 @@ def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
     before, which ``clip_floor_pos`` has set to zero.
     """
 
-    def held(data: SimData) -> SimStateDeriv:
+    def held_derivative(data: SimData) -> SimStateDeriv:
         s, deriv = data.states, deriv_fn(data)
         stands = (s.pos[..., 2:] == FLOOR_HEIGHT) & (s.vel[..., 2:] == 0) & (deriv.acc[..., 2:] <= 0)
         return deriv.replace(acc=jnp.where(stands, 0.0, deriv.acc), ang_acc=jnp.where(stands, 0.0, deriv.ang_acc))
 
-    return held
+    return held_derivative
 
 
 def stop_below(s: SimState, lowest: Array | float) -> SimState:
@@ -176,8 +176,8 @@ def nonfinite_worlds(data: SimData) -> Array:
     n_axes = max(core.steps.ndim - 1, 0)
     pairs = zip(jax.tree.leaves(scopes(records)), jax.tree.leaves(records), strict=True)
     leaves = [x for scope, x in pairs if has_members(scope)]
-    each = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(n_axes, x.ndim))) for x in leaves])
-    return core.nonfinite | ~jnp.all(each, axis=0).reshape(core.steps.shape) | (core.steps < 0)
+    finite = jnp.stack([jnp.all(jnp.isfinite(x), axis=tuple(range(n_axes, x.ndim))) for x in leaves])
+    return core.nonfinite | ~jnp.all(finite, axis=0).reshape(core.steps.shape) | (core.steps < 0)
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:

@@ -48,9 +48,9 @@ def check_airframe(airframe: Airframe) -> None:
     for path in ("rigid_body.mass", "rotors.yaw_torque_sign", "rotors.thrust_min", "rotors.thrust_max"):
         airframe.value(path)
     for problem in (_check_inertia, _check_rotors, _check_curves, _check_forces, _check_controller, _check_camera):
-        found = problem(airframe)
-        if found:
-            raise ConfigError(f"{owner}: {found}. Check the number; {GUIDE} has the units.")
+        message = problem(airframe)
+        if message:
+            raise ConfigError(f"{owner}: {message}. Check the number; {GUIDE} has the units.")
 
 
 def _check_inertia(airframe: Airframe) -> str | None:
@@ -62,15 +62,15 @@ def _check_inertia(airframe: Airframe) -> str | None:
             f"matrix, got {short_repr(inertia.tolist())}"
         )
     excess = moments[2] / (moments[0] + moments[1]) - 1
-    found = (
+    message = (
         f"expected an inertia whose largest moment is at most the sum of the others, as for every body, got "
         f"moments of {', '.join(f'{m:.4g}' for m in moments)} kg m^2"
     )
     if excess > EXCESS:
-        return found
+        return message
     if excess > ROUNDING:
         remedy = "Measure the moments again, or lower the largest."
-        text = f"airframe {airframe.name!r}: {found}: {100 * excess:.1f}% more. {remedy}"
+        text = f"airframe {airframe.name!r}: {message}: {100 * excess:.1f}% more. {remedy}"
         warn(text, AirframeWarning)
     return None
 

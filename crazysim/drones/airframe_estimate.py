@@ -214,7 +214,6 @@ class _File:
 
 
 def _toml_string(text: str) -> str:
-    """Return a TOML string."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     if not escaped.isprintable():
         raise ConfigError(f"expected a name of printable characters, got {short_repr(text)}")
@@ -224,7 +223,7 @@ def _toml_string(text: str) -> str:
 def _toml_value(value: Any) -> str:
     """Return a number or an array with six digits, as TOML."""
     if np.ndim(value):
-        return f"[{', '.join(_toml_value(each) for each in value)}]"
+        return f"[{', '.join(_toml_value(item) for item in value)}]"
     return f"{float(value):.6g}" if isinstance(value, (float, np.floating)) else str(int(value))
 
 
@@ -365,7 +364,7 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
     """Return the columns of a motor table by quantity, in SI units and rpm."""
     columns = table if isinstance(table, Mapping) else _read_columns(Path(table))
     known = ", ".join(COLUMNS)
-    found: dict[str, NDArray] = {}
+    by_quantity: dict[str, NDArray] = {}
     for key, values in columns.items():
         if str(key).strip().lower() not in COLUMNS:
             raise ConfigError(f"expected columns of a motor table among {known}, got {short_repr(key)}")
@@ -378,33 +377,33 @@ def _motor_table(table: MotorTable) -> dict[str, NDArray]:
             raise ConfigError(
                 f"expected finite numbers of at least 0 in column {key!r}, got {short_repr(array.tolist())}"
             )
-        same = found.setdefault(quantity, array)
-        if same.shape == array.shape and np.any(np.abs(same - array) > MAX_TABLE_ERROR * np.max(same)):
-            k = int(np.argmax(np.abs(same - array)))
+        earlier = by_quantity.setdefault(quantity, array)
+        if earlier.shape == array.shape and np.any(np.abs(earlier - array) > MAX_TABLE_ERROR * np.max(earlier)):
+            k = int(np.argmax(np.abs(earlier - array)))
             raise ConfigError(
-                f"expected columns of the motor table that agree on the {quantity}, got {same[k]:.4g} and "
+                f"expected columns of the motor table that agree on the {quantity}, got {earlier[k]:.4g} and "
                 f"{array[k]:.4g} in row {k + 1}, in SI units. Remove the column that is wrong."
             )
-    if "thrust" not in found or not np.max(found["thrust"]) > 0:
+    if "thrust" not in by_quantity or not np.max(by_quantity["thrust"]) > 0:
         raise ConfigError(f"expected a motor table with a column thrust_n or thrust_g, got {short_repr(list(columns))}")
-    if len({len(array) for array in found.values()}) != 1:
+    if len({len(array) for array in by_quantity.values()}) != 1:
         raise ConfigError("expected columns of equal lengths in the motor table")
-    if "rpm" in found:
-        running = found["rpm"] > 0
+    if "rpm" in by_quantity:
+        running = by_quantity["rpm"] > 0
         if not np.any(running):
             raise ConfigError("expected a speed above 0 in column 'rpm' of the motor table, got none")
-        order = np.argsort(found["rpm"][running], kind="stable")
-        found = {quantity: array[running][order] for quantity, array in found.items()}
+        order = np.argsort(by_quantity["rpm"][running], kind="stable")
+        by_quantity = {quantity: array[running][order] for quantity, array in by_quantity.items()}
         for quantity in ("thrust", "torque"):
-            values = found.get(quantity, np.zeros(1))
+            values = by_quantity.get(quantity, np.zeros(1))
             fall = np.maximum.accumulate(values) - values
             if np.max(fall) > MAX_TABLE_ERROR * np.max(values):
                 k = int(np.argmax(fall))
                 raise ConfigError(
                     f"expected a motor table whose {quantity} grows with the speed, got {values[k]:.4g} at "
-                    f"{found['rpm'][k]:.6g} rpm, and {np.max(values[:k]):.4g} below that. Check the columns."
+                    f"{by_quantity['rpm'][k]:.6g} rpm, and {np.max(values[:k]):.4g} below that. Check the columns."
                 )
-    return found
+    return by_quantity
 
 
 def _read_columns(path: Path) -> dict[str, list[str]]:
@@ -419,11 +418,10 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
 
 
 def _add_battery(file: _File, mass: float, cells: int | None, capacity: float | None, resistance: float | None) -> None:
-    """Add the battery."""
     n = cells or next(n for n, limit in ((1, 0.1), (3, 0.5), (4, 3.0), (6, np.inf)) if mass < limit)
     charge = capacity or BATTERY_SHARE * mass * BATTERY_ENERGY / (n * CELL_VOLTAGE)
     file.add("battery", "cells", n, "1, in series", "given" if cells else "cells")
     file.add("battery", "capacity", charge, "A h", "given" if capacity else "capacity")
-    own = resistance or n * CELL_RESISTANCE / charge
-    file.add("battery", "resistance", own, "ohm, of all cells", "given" if resistance else "resistance")
+    ohms = resistance or n * CELL_RESISTANCE / charge
+    file.add("battery", "resistance", ohms, "ohm, of all cells", "given" if resistance else "resistance")
     file.add("battery", "mass", n * charge * CELL_VOLTAGE / BATTERY_ENERGY, "kg, part of the drone's", "battery_mass")

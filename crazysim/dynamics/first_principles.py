@@ -153,25 +153,29 @@ def hover_rotor_vel(params: Params) -> Array:
     n_rotors = params.mixing_matrix.shape[-1]
     weight = params.mass * rotation.safe_norm(params.gravity_vec)
     if params.rotor_vel_max.shape[-1] == 1:
-        each = jnp.broadcast_to(weight / n_rotors, (*weight.shape[:-1], n_rotors))
-        return rotor_vel_of_thrust(each, params.rpm2thrust)
+        thrusts = jnp.broadcast_to(weight / n_rotors, (*weight.shape[:-1], n_rotors))
+        return rotor_vel_of_thrust(thrusts, params.rpm2thrust)
     exists = params.rotor_vel_max > 0
-    each = jnp.broadcast_to(weight / jnp.sum(exists, axis=-1, keepdims=True), exists.shape)
+    thrusts = jnp.broadcast_to(weight / jnp.sum(exists, axis=-1, keepdims=True), exists.shape)
     curves = jnp.where(exists[..., None], params.rpm2thrust, jnp.ones(3, params.rpm2thrust.dtype))
-    return jnp.where(exists, rotor_vel_of_thrust(each, curves), 0.0)
+    return jnp.where(exists, rotor_vel_of_thrust(thrusts, curves), 0.0)
 
 
 def pad_rotors(params: Params, n_rotors: int) -> Params:
     """Return the parameters of an airframe with rotors added that do not exist: no thrust, no torque, no speed."""
-    own = params.mixing_matrix.shape[-1]
-    if own == n_rotors:
+    n_present = params.mixing_matrix.shape[-1]
+    if n_present == n_rotors:
         return params
 
-    def extended(x: Array, axis: int) -> np.ndarray:
-        one = np.asarray(x)
-        each = np.broadcast_to(one, [*one.shape[:axis], own, *one.shape[axis + 1 :]]) if one.shape[axis] == 1 else one
-        return np.pad(each, [(0, n_rotors - own if k == axis else 0) for k in range(one.ndim)])
+    def extend(x: Array, axis: int) -> np.ndarray:
+        array = np.asarray(x)
+        full = (
+            np.broadcast_to(array, [*array.shape[:axis], n_present, *array.shape[axis + 1 :]])
+            if array.shape[axis] == 1
+            else array
+        )
+        return np.pad(full, [(0, n_rotors - n_present if k == axis else 0) for k in range(array.ndim)])
 
-    curves = {name: extended(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
-    limits = {name: extended(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}
-    return params.replace(mixing_matrix=extended(params.mixing_matrix, 1), **curves, **limits)
+    curves = {name: extend(getattr(params, name), 0) for name in ("rpm2thrust", "rpm2torque")}
+    limits = {name: extend(getattr(params, name), 0) for name in ("rotor_vel_min", "rotor_vel_max")}
+    return params.replace(mixing_matrix=extend(params.mixing_matrix, 1), **curves, **limits)

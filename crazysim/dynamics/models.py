@@ -63,21 +63,23 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
         ConfigError: If steps diverge; the message has the least rate.
     """
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
-    found: dict[str, np.ndarray] = {}
+    rates_by_path: dict[str, np.ndarray] = {}
     if dynamics == Dynamics.first_principles:
         drag = "drag.coefficients"
         if "rotors.lag" in numbers:
             lag, fastest = np.atleast_2d(numbers["rotors.lag"]), airframe.rotor_vel_limits[1]
-            found["rotors.lag"] = lag[:, 0::2] + 2 * lag[:, 1::2] * fastest[:, None]
+            rates_by_path["rotors.lag"] = lag[:, 0::2] + 2 * lag[:, 1::2] * fastest[:, None]
     else:
         fit = f"fitted.{dynamics.value}."
         drag = f"{fit}drag_coefficients"
-        found = {path: numbers[path] for path in (f"{fit}rpy_rates_coef", f"{fit}thrust_dyn_coef") if path in numbers}
+        rates_by_path = {
+            path: numbers[path] for path in (f"{fit}rpy_rates_coef", f"{fit}thrust_dyn_coef") if path in numbers
+        }
         if f"{fit}rpy_coef" in numbers and f"{fit}rpy_rates_coef" in numbers:
-            found[f"{fit}rpy_coef"] = numbers[f"{fit}rpy_coef"] / numbers[f"{fit}rpy_rates_coef"]
+            rates_by_path[f"{fit}rpy_coef"] = numbers[f"{fit}rpy_coef"] / numbers[f"{fit}rpy_rates_coef"]
     if drag in numbers:
-        found[drag] = numbers[drag] / mass
-    for path, rates in found.items():
+        rates_by_path[drag] = numbers[drag] / mass
+    for path, rates in rates_by_path.items():
         rate = float(np.max(np.abs(rates)))
         if rate > MAX_LAG_RATE * freq:
             raise ConfigError(

@@ -75,10 +75,10 @@ class ZerosCache:
             return zeros
         if any(isinstance(x, jax.core.Tracer) for x in arrays):
             return ()
-        found = [
+        by_leaf = [
             (i, frozenset(np.flatnonzero(np.asarray(x) == 0).tolist())) for i, x in zip(indices, arrays, strict=True)
         ]
-        zeros = tuple([(i, some) for i, some in found if some])
+        zeros = tuple([(i, zeros_of_leaf) for i, zeros_of_leaf in by_leaf if zeros_of_leaf])
         self._last = _without_numpy(arrays), zeros
         return zeros
 
@@ -101,9 +101,9 @@ def _without_numpy(arrays: list[Any]) -> list[Any]:
     return [x if isinstance(x, jax.Array) else None for x in arrays]
 
 
-def _are_same(some: Sequence[Any], others: Sequence[Any]) -> bool:
+def _are_same(arrays: Sequence[Any], others: Sequence[Any]) -> bool:
     """Return whether two lists hold the very same arrays."""
-    return len(some) == len(others) and all(map(_is_same, some, others))
+    return len(arrays) == len(others) and all(map(_is_same, arrays, others))
 
 
 def _is_same(a: Any, b: Any) -> bool:

@@ -1,11 +1,11 @@
 """Steps on the host without XLA: compiled kernels are called on the memory of arrays.
 
-A call of a compiled function of JAX takes some 30 us, most of it for its operands and results. A loop that commands,
-steps and reads needs few of them as JAX arrays, so these are made when they are read.
+A call of a compiled JAX function takes about 30 us, most of it for its operands and results. A loop that commands,
+steps and reads needs few of them as JAX arrays, so JAX arrays are made only when they are read.
 
-Nothing that a kernel reads or has written changes afterwards. It reads arrays of JAX through views of NumPy, and as
-long as there is a view JAX copies a buffer that it would otherwise reuse for a donated array; commands, which are
-copies; and results of the call before. It writes into new memory, which nothing writes into again.
+Memory that a kernel has read or written does not change afterwards. A kernel reads JAX arrays through NumPy views; as
+long as a view exists, JAX copies the buffer instead of reusing it for a donated array. It also reads commands, which
+are copies, and results of the previous call. It writes into new memory, which is never written again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_SHARED_BYTES = 1 << 16
 
 
 class HostLeaves:
-    """Leaves of a simulation at one moment: arrays of JAX, commands of the host, or results of a kernel.
+    """Leaves of a simulation at one moment: JAX arrays, commands on the host, or results of a kernel.
 
     An index gives a leaf as an JAX array, which is made once.
     """
@@ -46,7 +46,7 @@ class HostLeaves:
             items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``CallResults``.
             addresses: Address of each leaf that kernels read.
             views: Views that keep the memory of JAX arrays.
-            sharding: Device that arrays of JAX are made on.
+            sharding: Device on which JAX arrays are made.
         """
         self.items, self.addresses, self._views, self._sharding = items, addresses, views, sharding
         self._made: dict[int, Array] = {}
@@ -67,12 +67,12 @@ class HostLeaves:
         return x.array(i) if isinstance(x, CallResults) else np.asarray(x)
 
     def replace(self, numbers: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
-        """Return leaves of which some are replaced by arrays that nothing writes into any more."""
+        """Return the leaves with some replaced by arrays that are never written again."""
         arrays = [np.ascontiguousarray(x) for x in arrays]
         return self.replace_items(numbers, arrays, [_address(x) for x in arrays])
 
     def replace_items(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
-        """Return leaves of which some are replaced."""
+        """Return the leaves with some replaced."""
         new = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
         for i, x, address in zip(numbers, items, addresses, strict=True):
             new.items[i], new.addresses[i] = x, address
@@ -163,15 +163,15 @@ class HostCall:
         """
         self.used = False
         """True once it has been called."""
-        self._n_leaves, self._nonfinite = len(leaves), nonfinite
+        self._nonfinite = nonfinite
         self._held: dict[int, tuple[Any, NDArray]] = {}
         self._launches: list[_Launch] = []
         results: list[tuple[Any, tuple[int, ...], np.dtype]] = []
         n_worlds = leaves[nonfinite].shape[0]
-        for k, (kernel, own) in enumerate(zip(kernels, owned, strict=True)):
+        for k, (kernel, owned_leaves) in enumerate(zip(kernels, owned, strict=True)):
             first, n_drones = len(results), kernel.program.n_drones
             for i in kernel.outputs:
-                key = i if own is None or i in own else (k, i)
+                key = i if owned_leaves is None or i in owned_leaves else (k, i)
                 results.append((key, leaves[i].shape, np.dtype(leaves[i].dtype)))
             results.append((("flags", k), (n_worlds, n_drones), np.dtype(bool)))
             outputs = slice(first, len(results))
@@ -204,11 +204,11 @@ class HostCall:
 
     def _view(self, i: int, x: Any) -> NDArray:
         """Return a view of a JAX array once it is computed. The view of the same array is kept."""
-        held = self._held.get(i)
-        if held is None or held[0] is not x:
+        entry = self._held.get(i)
+        if entry is None or entry[0] is not x:
             numbers = jax.random.key_data(x) if jaxcompat.is_key(x) else x
-            held = self._held[i] = x, np.ascontiguousarray(numbers)
-        return held[1]
+            entry = self._held[i] = x, np.ascontiguousarray(numbers)
+        return entry[1]
 
     def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:
         """Return the leaves some steps later."""

@@ -121,7 +121,7 @@ def write_map(block: Block, target: str) -> Kernel:
     """
     require_block_source(block)
     writer, tables = Writer(), block.inputs[1:]
-    inputs, outputs = ([type_name(x.dtype) for x in some] for some in (tables, block.outputs))
+    inputs, outputs = ([type_name(x.dtype) for x in values_of_kind] for values_of_kind in (tables, block.outputs))
     pointers = [f"const {kind}* __restrict__ p{k}" for k, kind in enumerate(inputs)]
     pointers += [f"{kind}* __restrict__ q{k}" for k, kind in enumerate(outputs)]
     values = writer.block(block, ["LANE", *(f"p{k}" for k in range(len(tables)))], 2)

@@ -36,9 +36,9 @@ def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = N
 def apply(program: Program, passes: Iterable[Pass]) -> Program:
     """Return a program after some passes, verified and dumped after each where the environment variables say so."""
     _inspect(program, "lowered")
-    for one in passes:
-        program = one(program)
-        _inspect(program, getattr(one, "__name__", "pass"))
+    for compiler_pass in passes:
+        program = compiler_pass(program)
+        _inspect(program, getattr(compiler_pass, "__name__", "pass"))
     return program
 
 

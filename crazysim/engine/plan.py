@@ -108,15 +108,15 @@ class Planner(NamedTuple):
     reported: set[str]
     """Warnings that were given before, for data of another structure."""
 
-    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], apart: SeparateLeaves = None) -> Plan:
+    def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], separate: SeparateLeaves = None) -> Plan:
         """Return the plan of some data.
 
         Args:
             data: The data, or its shapes and types.
             zeros: Elements of shared parameters that are zero.
             trace: Traces the compiled step of a plan, as its first call would, to find what fails there.
-            apart: Leaves that stay arrays of their own where the others that a call writes become rows, if one kernel
-                runs all of the step; None for no rows.
+            separate: Leaves that stay arrays of their own where the others that a call writes become rows, if one
+                kernel runs all of the step; None for no rows.
 
         Raises:
             ConfigError: If an engine chosen by name cannot run the stages; with ``strict``, if a stage is unsupported.
@@ -124,7 +124,7 @@ class Planner(NamedTuple):
         if self.engine == "plain":
             return self._plain(data, "it was chosen")
         try:
-            plan, problems = self._fast(data, zeros, apart)
+            plan, problems = self._fast(data, zeros, separate)
             if plan.direct is None:
                 trace(plan)
         except (ConfigError, MemoryError):
@@ -146,14 +146,14 @@ class Planner(NamedTuple):
         )
         return plan
 
-    def _fast(self, data: SimData, zeros: Zeros, apart: SeparateLeaves) -> tuple[Plan, list[str]]:
+    def _fast(self, data: SimData, zeros: Zeros, separate: SeparateLeaves) -> tuple[Plan, list[str]]:
         """Return a plan that runs a program, and what it does not support; a plan of ``plain`` on several devices."""
         limit = self._spread_limit(data)
         if limit:
             return self._plain(data, limit), []
         kinds = jax.tree.leaves(scopes(data))
         # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
-        known = tuple([(i, some) for i, some in zeros if kinds[i] == "shared"])
+        known = tuple([(i, indices) for i, indices in zeros if kinds[i] == "shared"])
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
         lowered = [
@@ -161,9 +161,9 @@ class Planner(NamedTuple):
         ]
         one_kernel = self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered] == [True]
         select = None
-        if apart is not None and one_kernel:
-            kept = {*apart, leaf_indices(data).core.mjx_synced}
-            select = lambda written: [i for i in written if i not in kept]  # noqa: E731
+        if separate is not None and one_kernel:
+            unpacked = {*separate, leaf_indices(data).core.mjx_synced}
+            select = lambda written: [i for i in written if i not in unpacked]  # noqa: E731
         programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
         split = [stage for program in programs for stage in program.unfused_stages]
         problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
@@ -177,7 +177,7 @@ class Planner(NamedTuple):
                     in_leaves = None if select is None else optimise(lowered[0])
                     runs, engine = [fused.build(x, self.location, in_leaves) for x in programs], "fused"
                 except UnsupportedError as error:
-                    error = self._of_one_stage(error, data)
+                    error = self._error_of_stage(error, data)
                     why = str(error)
                     problems.append(self._without_kernel(error))
             if why and self.engine == "fused":
@@ -200,8 +200,8 @@ class Planner(NamedTuple):
             return ""
         if self.location.mesh is None:
             return f"the data is spread over devices by a {type(data.states.pos.sharding).__name__}, not over a mesh"
-        whole = next((s for s in self.stages if s.scope == "batch"), None)
-        return "" if whole is None else f"a mesh needs stages of one drone or world; {whole.__name__!r}: {whole.why}"
+        stage = next((s for s in self.stages if s.scope == "batch"), None)
+        return "" if stage is None else f"a mesh needs stages of one drone or world; {stage.__name__!r}: {stage.why}"
 
     def _plain(self, data: SimData, why: str) -> Plan:
         run, written = plain.build(self.stages, data)
@@ -252,7 +252,7 @@ class Planner(NamedTuple):
         specs = [split if n_batch_axes(scope) == 2 else shared for scope in jax.tree.leaves(scopes(data))]
         specs.append(shared)  # the packed array
 
-        def spread(values: list[Any], n_steps: int | Array) -> list[Any]:
+        def sharded_step(values: list[Any], n_steps: int | Array) -> list[Any]:
             count = [] if isinstance(n_steps, int) else [n_steps]
             local = jax.shard_map(
                 lambda values, *count: advance(values, *(count or [n_steps])),
@@ -263,7 +263,7 @@ class Planner(NamedTuple):
             )
             return local(values, *count)
 
-        return spread
+        return sharded_step
 
     def _report(self, problems: list[str]) -> None:
         """Warn of the problems of a plan, all in one warning, or raise them."""
@@ -275,7 +275,7 @@ class Planner(NamedTuple):
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
-    def _of_one_stage(self, error: UnsupportedError, data: SimData) -> UnsupportedError:
+    def _error_of_stage(self, error: UnsupportedError, data: SimData) -> UnsupportedError:
         """Return the error of the stage that has no source, given the error of a kernel of several stages."""
         for stage in self.stages:
             try:
@@ -323,9 +323,11 @@ def _join_runs(
     def run_all(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         new: dict[int, Any] = {}
         flags = []
-        for program, own, run in zip(programs, owned, runs, strict=True):
+        for program, owned_leaves, run in zip(programs, owned, runs, strict=True):
             out, flagged = run(leaves[: len(program.leaves)], n_steps)
-            new |= {i: x for i, x in zip(program.written, out, strict=True) if own is None or i in own}
+            new |= {
+                i: x for i, x in zip(program.written, out, strict=True) if owned_leaves is None or i in owned_leaves
+            }
             flags.append(flagged)
         return [new[i] for i in written], functools.reduce(operator.or_, flags)
 

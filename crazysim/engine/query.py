@@ -49,8 +49,8 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
     rows: dict[str, Array] = {}
     shapes, trees, stages = [], [], []
     for number, (scope, fn) in enumerate(queries):
-        one = axes.treedef.unflatten(axes.shapes_of_one(leaves, scope))
-        outs, treedef = jax.tree.flatten(jax.eval_shape(fn, one))
+        template = axes.treedef.unflatten(axes.shapes_of_one(leaves, scope))
+        outs, treedef = jax.tree.flatten(jax.eval_shape(fn, template))
         names = [f"{number} {k}" for k in range(len(outs))]
         per_drone = [x.shape[1:] if scope == "world" else x.shape for x in outs]
         for name, x, shape in zip(names, outs, per_drone, strict=True):
@@ -59,16 +59,16 @@ def query(queries: Sequence[Query], data: SimData, platform: str) -> list[Any]:
         trees.append(treedef)
         stages.append(Stage(_writing(fn, names, scope), scope, name=f"query {number}", phase="after"))
     prepared = data.replace(plugins={RECORD_NAME: QueryResults(rows)})
-    given, treedef = jax.tree.flatten(prepared)
+    prepared_leaves, treedef = jax.tree.flatten(prepared)
     program = optimise(lower_stages(stages, prepared))
     if program.unfused_stages:
         raise program.unfused_stages[0].error
-    packed = [jnp.concatenate([given[i].ravel() for i in program.packed])] if program.packed else []
-    written, _ = on_data_leaves(program, fused.build(program, Location(platform)))([*given, *packed], 0)
-    found = treedef.unflatten(replace_leaves(given, program.written, written)).plugins[RECORD_NAME].rows
+    packed = [jnp.concatenate([prepared_leaves[i].ravel() for i in program.packed])] if program.packed else []
+    written, _ = on_data_leaves(program, fused.build(program, Location(platform)))([*prepared_leaves, *packed], 0)
+    results = treedef.unflatten(replace_leaves(prepared_leaves, program.written, written)).plugins[RECORD_NAME].rows
     return [
-        tree.unflatten([found[name].reshape(n_worlds, n_drones, *shape) for name, shape in some.items()])
-        for tree, some in zip(trees, shapes, strict=True)
+        tree.unflatten([results[name].reshape(n_worlds, n_drones, *shape) for name, shape in query_shapes.items()])
+        for tree, query_shapes in zip(trees, shapes, strict=True)
     ]
 
 

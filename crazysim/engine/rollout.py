@@ -78,8 +78,8 @@ def rollout(
         carry, _ = jax.lax.scan(lambda c, _: (control_step(c), None), carry, length=every)
         return carry, keep(start.replace(changed, carry).data())
 
-    carry, kept = jax.lax.scan(until_record, [start.leaves[i] for i in changed], length=n_control_steps // every)
-    return start.replace(changed, carry).data(), kept
+    carry, records = jax.lax.scan(until_record, [start.leaves[i] for i in changed], length=n_control_steps // every)
+    return start.replace(changed, carry).data(), records
 
 
 STATIC_ARGUMENTS = ("step", "policy", "n_control_steps", "n_substeps", "keep", "every", "zeros")
@@ -107,11 +107,11 @@ def run(
         return compiled_rollout(step, data, policy, params, n_control_steps, every=every, zeros=zeros, **settings)
     piece = max(n_control_steps // every // 100, 1) * every
     pieces, rest = divmod(n_control_steps, piece)
-    kept = []
+    chunks = []
     with progress_bar(unit="control steps", required=True, total=n_control_steps) as bar:
         for n in [piece] * pieces + [rest] * (rest > 0):
             data, part = compiled_rollout(step, data, policy, params, n, every=every, zeros=zeros, **settings)
             jax.block_until_ready(part)
-            kept.append(part)
+            chunks.append(part)
             bar.update(n)
-    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *kept)
+    return data, jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)

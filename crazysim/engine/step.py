@@ -56,23 +56,23 @@ class FlatData:
         """Return the data with other values of some leaves."""
         if any(i in rows.members for rows in self.plan.rows for i in numbers):
             raise ValueError(
-                "expected leaves that are not in rows, got one that is. Name it in apart= of Step.flatten."
+                "expected leaves that are not in rows, got one that is. Name it in separate= of Step.flatten."
             )
         if isinstance(self.leaves, HostLeaves):
             return FlatData(self.leaves.replace(numbers, values), self.plan)
         return FlatData(replace_leaves(self.leaves, numbers, values), self.plan)
 
-    def stage_command(self, like: SimData, command: Any, feedforward: Any = None) -> FlatData:
+    def stage_command(self, reference: SimData, command: Any, feedforward: Any = None) -> FlatData:
         """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does.
 
         Args:
-            like: The data, or its shapes and devices.
+            reference: The data, or its shapes and devices.
             command: Command, which nothing writes into any more. (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
         """
         numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
         on_host = isinstance(self.leaves, HostLeaves)
-        return self.replace(numbers, [x if on_host else put_command(like, x) for x in values.values()])
+        return self.replace(numbers, [x if on_host else put_command(reference, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step besides the number of steps."""
@@ -176,7 +176,7 @@ class Step:
         data: SimData,
         zeros: Zeros | None = None,
         n_steps: int | Array | None = None,
-        apart: SeparateLeaves = None,
+        separate: SeparateLeaves = None,
     ) -> FlatData:
         """Return the data flattened for ``advance``.
 
@@ -184,10 +184,10 @@ class Step:
             data: The simulation.
             zeros: As in ``__call__``.
             n_steps: A number of steps of the kind that will be taken; None for an array.
-            apart: Leaves that stay arrays of their own where others that a call writes become rows, which is faster in
-                loops over calls; None for no rows.
+            separate: Leaves that stay arrays of their own where others that a call writes become rows, which is faster
+                in loops over calls; None for no rows.
         """
-        return self._flat(data, *jax.tree.flatten(data), zeros, n_steps, apart)
+        return self._flat(data, *jax.tree.flatten(data), zeros, n_steps, separate)
 
     def _flat(
         self,
@@ -196,9 +196,9 @@ class Step:
         treedef: Any,
         zeros: Zeros | None,
         n_steps: int | Array | None,
-        apart: SeparateLeaves = None,
+        separate: SeparateLeaves = None,
     ) -> FlatData:
-        plan = self._plan(data, leaves, treedef, zeros, n_steps, apart)
+        plan = self._plan(data, leaves, treedef, zeros, n_steps, separate)
         return FlatData(self._all_leaves(plan, leaves), plan)
 
     def advance(self, flat: FlatData, n_steps: int | Array) -> FlatData:
@@ -281,11 +281,11 @@ class Step:
         treedef: Any,
         zeros: Zeros | None,
         n_steps: int | Array | None = None,
-        apart: SeparateLeaves = None,
+        separate: SeparateLeaves = None,
     ) -> Plan:
         zeros = self._zeros(data, leaves, treedef) if zeros is None else zeros
         elsewhere = self._elsewhere(data.states.pos)
-        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, elsewhere, apart)
+        key = (treedef, tuple([(x.shape, x.dtype) for x in leaves]), zeros, elsewhere, separate)
         plan = self._plans.get(key)
         if plan is None:
             check_axes(data, data.core.n_worlds, data.core.n_drones)
@@ -300,7 +300,7 @@ class Step:
                 step = plan.static if known else plan.dynamic
                 step.trace(flat.inputs(), n_steps if known else jnp.int32(1))
 
-            plan = self._plans[key] = planner.plan(data, zeros, trace, apart)
+            plan = self._plans[key] = planner.plan(data, zeros, trace, separate)
         return plan
 
     def _elsewhere(self, x: Any) -> Location | None:
@@ -308,20 +308,19 @@ class Step:
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
         if sharding is None or sharding is self._at_home:
             return None
-        here, home = location_of(x), self.location
-        if here.is_distributed:
-            at_home = home.mesh is not None and (here.mesh, here.axis) == (home.mesh, home.axis)
+        location, home = location_of(x), self.location
+        if location.is_distributed:
+            at_home = home.mesh is not None and (location.mesh, location.axis) == (home.mesh, home.axis)
         elif home.devices is None or home.mesh is not None:
             at_home = True
         else:  # one host kernel serves all devices of the host
-            at_home = here.devices == home.devices or here.platform == home.platform == "cpu"
+            at_home = location.devices == home.devices or location.platform == home.platform == "cpu"
         if at_home:
             self._at_home = sharding
-        return None if at_home else here
+        return None if at_home else location
 
 
 def _check_steps(n_steps: Any) -> None:
-    """Check a number of steps."""
     is_array = isinstance(n_steps, (jax.Array, np.ndarray, np.generic))
     is_integer = jnp.issubdtype(n_steps.dtype, jnp.integer) if is_array else isinstance(n_steps, int)
     if not is_integer or isinstance(n_steps, bool) or np.shape(n_steps):

@@ -130,24 +130,24 @@ def triangles(grid: Vector) -> tuple[Vector, Vector, Vector]:
 
 def edges(grid: Vector) -> tuple[Vector, Vector]:
     """Return the ends of all edges along x, y and the diagonals of cells, concatenated. 2 of (..., n_edges)"""
-    every, low, high = slice(None), slice(None, -1), slice(1, None)
+    full, low, high = slice(None), slice(None, -1), slice(1, None)
 
     def join(*parts: tuple[slice, slice]) -> Vector:
         columns = ([v[..., i, j].reshape(*v.shape[:-2], -1) for i, j in parts] for v in (grid.x, grid.y, grid.z))
         return Vector(*(jnp.concatenate(column, axis=-1) for column in columns))
 
-    return join((every, low), (low, every), (low, low)), join((every, high), (high, every), (high, high))
+    return join((full, low), (low, full), (low, low)), join((full, high), (high, full), (high, high))
 
 
-def height_at(shape: Shape, x: Array, y: Array, like: Vector) -> Array:
+def height_at(shape: Shape, x: Array, y: Array, vector: Vector) -> Array:
     """Return the height of the surface at positions within the field, m. (...)"""
-    grid_x, grid_y, along_x, along_y, origin = plane_at(shape, x, y, like)
+    grid_x, grid_y, along_x, along_y, origin = plane_at(shape, x, y, vector)
     return origin + along_x * grid_x + along_y * grid_y
 
 
-def plane_at(shape: Shape, x: Array, y: Array, like: Vector) -> tuple[Array, Array, Array, Array, Array]:
+def plane_at(shape: Shape, x: Array, y: Array, vector: Vector) -> tuple[Array, Array, Array, Array, Array]:
     """Return the position in its cell (0 to 1, x and y), the rises of its triangle and the height of its origin, m."""
-    heights = jnp.asarray(shape.array("heights"), like.x.dtype)
+    heights = jnp.asarray(shape.array("heights"), vector.x.dtype)
     side_x, side_y = cell_sides(shape)
     return triangle_at(heights, (x + shape.size[0]) / side_x, (y + shape.size[1]) / side_y)
 

@@ -113,11 +113,11 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     by_edge = jnp.where(faces[best] > 0, edges[pair] > faces[best] + FACE_BIAS * smaller, by_edge)
 
     is_a = best < 3
-    own = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
-    face = tuple(jnp.where(is_a, x, y) for x, y in zip(*own, strict=True))
-    other = tuple(jnp.where(is_a, y, x) for x, y in zip(*own, strict=True))
+    boxes = (half_a, pos_a, rot_a), (half_b, pos_b, rot_b)
+    face = tuple(jnp.where(is_a, x, y) for x, y in zip(*boxes, strict=True))
+    other = tuple(jnp.where(is_a, y, x) for x, y in zip(*boxes, strict=True))
     gap, normal, point = _clip_face(face, best % 3, other)
-    gap_edge, normal_edge, point_edge = _edge_contact(own, pair, axes.reshape(-1, 3)[pair], offset)
+    gap_edge, normal_edge, point_edge = _edge_contact(boxes, pair, axes.reshape(-1, 3)[pair], offset)
     gap = jnp.concatenate(
         [jnp.where(by_edge, OUTSIDE_DISTANCE, gap), jnp.where(by_edge, gap_edge, OUTSIDE_DISTANCE)[None]]
     )
@@ -161,7 +161,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     exists = first <= last
     valid = [exists, exists & (last < 1)]  # the end of an edge is the beginning of the next
     # Along an edge that is level to rounding the ends are far away: a lever of kilometres brings any point into reach.
-    found = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * along for x in (first, last)]
+    candidates = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * along for x in (first, last)]
     # Corners of the face below the inside of the other's.
     at = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
@@ -171,8 +171,8 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     q = (edge_1[0] * away[:, 1] - edge_1[1] * away[:, 0]) / det
     valid.append((jnp.abs(p) < FACE_SHARE) & (jnp.abs(q) < FACE_SHARE))
     height = middle[2] + p * edge_1[2] + q * edge_2[2]
-    found.append(jnp.concatenate([at, height[:, None]], axis=-1))
-    points = jnp.concatenate(found)
+    candidates.append(jnp.concatenate([at, height[:, None]], axis=-1))
+    points = jnp.concatenate(candidates)
     gap = jnp.where(jnp.concatenate(valid), points[:, 2], OUTSIDE_DISTANCE)
     local = jnp.concatenate([points[:, :2], half[0] + 0.5 * points[:, 2:]], axis=-1)
     return gap, normal, pos + jnp.sum(local[:, :, None] * frame[None], axis=-2)

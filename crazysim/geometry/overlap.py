@@ -69,11 +69,11 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
 def find_overlap(pair: ShapePair, is_box: bool, best: BestDirection) -> BestDirection:
     """Return the best of a direction and all candidate normals of the Minkowski difference."""
     b, edges = pair.other, pair.edges
-    own = [axis_vector(k, pair.centre.x) for k in range(3)]
-    sides = {"box": own, "cylinder": own[2:]}.get(b.kind, [])
+    box_axes = [axis_vector(k, pair.centre.x) for k in range(3)]
+    sides = {"box": box_axes, "cylinder": box_axes[2:]}.get(b.kind, [])
     faces = [*(edges if is_box else []), *sides]
     if b.kind == "box":
-        faces += [normalize(edge.cross(axis), axis, MIN_SQUARED_SINE) for edge in edges for axis in own]
+        faces += [normalize(edge.cross(axis), axis, MIN_SQUARED_SINE) for edge in edges for axis in box_axes]
     if faces:
         n = stack_vectors([*faces, *(-n for n in faces)])
         best = _select_best((pair.gap(n), n), best)
@@ -134,9 +134,9 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
     """
     # Angles start at the cross product with the coordinate axis that is closest to perpendicular.
     x, y, z = (jnp.abs(v) for v in (axis.x, axis.y, axis.z))
-    own = [axis_vector(k, axis.x) for k in range(3)]
-    farthest = select_vector((x <= y) & (x <= z), own[0], select_vector(y <= z, own[1], own[2]))
-    e = normalize(axis.cross(farthest), own[0])
+    frame_axes = [axis_vector(k, axis.x) for k in range(3)]
+    farthest = select_vector((x <= y) & (x <= z), frame_axes[0], select_vector(y <= z, frame_axes[1], frame_axes[2]))
+    e = normalize(axis.cross(farthest), frame_axes[0])
     f = axis.cross(e)
 
     def direction(n: PlaneVector) -> Vector:
@@ -159,33 +159,33 @@ def _best_perpendicular(pair: ShapePair, axis: Vector) -> BestDirection:
     def arc(
         k: Array, carry: tuple[PlaneVector, PlaneVector, Array, tuple[PlaneVector, ...]]
     ) -> tuple[PlaneVector, PlaneVector, Array, tuple[PlaneVector, ...]]:
-        n, p, gap, kept = carry
+        n, p, gap, best_arc = carry
         angle = (k + 1).astype(x.dtype) * (2 * math.pi / N_ARCS)
         m = (jnp.cos(angle) + 0 * x, jnp.sin(angle) + 0 * x)
         q = support_point(m)
         top = between(n, p, m, q)
-        here = pair.gap(direction(top))
-        larger = here > gap
-        kept = tuple(_choose(larger, new, old) for new, old in zip((n, p, m, q, top), kept, strict=True))
-        return m, q, jnp.where(larger, here, gap), kept
+        top_gap = pair.gap(direction(top))
+        larger = top_gap > gap
+        best_arc = tuple(_choose(larger, new, old) for new, old in zip((n, p, m, q, top), best_arc, strict=True))
+        return m, q, jnp.where(larger, top_gap, gap), best_arc
 
     start = (jnp.ones_like(x), jnp.zeros_like(x))
     first = support_point(start)
-    _, _, gap, kept = lax.fori_loop(
+    _, _, gap, widest_arc = lax.fori_loop(
         0, N_ARCS, arc, (start, first, jnp.full_like(x, -jnp.inf), (start, first, start, first, start))
     )
 
     def narrow(_: int, carry: tuple[Array, tuple[PlaneVector, ...]]) -> tuple[Array, tuple[PlaneVector, ...]]:
         gap, (n, p, m, q, top) = carry
         middle = between(n, p, m, q)
-        r, here = support_point(middle), pair.gap(direction(middle))
+        r, middle_gap = support_point(middle), pair.gap(direction(middle))
         # The derivative of the gap with the angle is the component of the support point along the circle.
         rises = middle[0] * r[1] - middle[1] * r[0] > 0
         n, p = _choose(rises, middle, n), _choose(rises, r, p)
         m, q = _choose(rises, m, middle), _choose(rises, q, r)
-        return jnp.where(here > gap, here, gap), (n, p, m, q, _choose(here > gap, middle, top))
+        return jnp.where(middle_gap > gap, middle_gap, gap), (n, p, m, q, _choose(middle_gap > gap, middle, top))
 
-    _, (*_, top) = lax.fori_loop(0, N_ARC_STEPS, narrow, (gap, kept))
+    _, (*_, top) = lax.fori_loop(0, N_ARC_STEPS, narrow, (gap, widest_arc))
     n = direction(top)
     n = normalize(n, e)
     return pair.gap(n), n

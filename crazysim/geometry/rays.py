@@ -196,9 +196,9 @@ LINE_INTERVAL = {
 # Normals of surface points -------------------------------------------------------------------------------------------
 
 
-def _z_axis(like: Array) -> Array:
+def _z_axis(vector: Array) -> Array:
     """Return the unit vector along z, one for each point. (..., 3)"""
-    zero = jnp.zeros_like(like[..., 0])
+    zero = jnp.zeros_like(vector[..., 0])
     return jnp.stack([zero, zero, zero + 1], axis=-1)
 
 

@@ -61,10 +61,10 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
         inverse = 1 / jnp.where(crosses, d, 1.0)
         for side in (-h, h):
             t = jnp.where(crosses, jnp.clip((side - p) * inverse, -half, half), 0.0)
-            here = slope(t)
-            falls, rises = (here <= 0) & (t > low), (here >= 0) & (t < high)
-            low, low_slope = jnp.where(falls, t, low), jnp.where(falls, here, low_slope)
-            high, high_slope = jnp.where(rises, t, high), jnp.where(rises, here, high_slope)
+            slopes = slope(t)
+            falls, rises = (slopes <= 0) & (t > low), (slopes >= 0) & (t < high)
+            low, low_slope = jnp.where(falls, t, low), jnp.where(falls, slopes, low_slope)
+            high, high_slope = jnp.where(rises, t, high), jnp.where(rises, slopes, high_slope)
     rise = high_slope - low_slope
     between = (low_slope < 0) & (high_slope > 0)
     t = low + (high - low) * jnp.where(between, -low_slope / jnp.where(between, rise, 1.0), 0.0)

@@ -53,12 +53,12 @@ class Shape:
         if self.kind not in N_SIZES:
             raise ConfigError(f"expected a shape of kind {', '.join(N_SIZES)}, got {self.kind!r}; use one of these")
         needed = N_SIZES[self.kind]
-        given = np.asarray(self.size, np.float64).reshape(-1)
-        size = given[:needed]
+        numbers = np.asarray(self.size, np.float64).reshape(-1)
+        size = numbers[:needed]
         if len(size) < needed or not np.all(np.isfinite(size)) or not np.all(size > 0):
             raise ConfigError(
                 f"expected {needed} positive, finite numbers as the size of a {self.kind}, m, got "
-                f"{tuple(given.tolist())}; use MuJoCo's conventions"
+                f"{tuple(numbers.tolist())}; use MuJoCo's conventions"
             )
         for name, kind, maker in (("vertices", "mesh", "hull"), ("heights", "hfield", "hfield")):
             if self.kind == kind and getattr(self, name) is None:
@@ -67,10 +67,10 @@ class Shape:
 
     def array(self, name: str) -> np.ndarray:
         """Return an array of the shape by name."""
-        found = getattr(self, name)
-        if found is None:
+        values = getattr(self, name)
+        if values is None:
             raise TypeError(f"expected a shape with {name}, got a {self.kind}, which has none")
-        return found
+        return values
 
     def _content(self) -> tuple[object, ...]:
         arrays = (self.vertices, self.faces, self.normals, self.offsets, self.heights)
@@ -95,8 +95,8 @@ def hull(vertices: ArrayLike, faces: ArrayLike | None = None) -> Shape:
     if v.ndim != 2 or v.shape[1] != 3 or len(v) < 4 or not np.all(np.isfinite(v)):
         raise ConfigError(f"expected four or more finite vertices, (n_vertices, 3), got shape {v.shape}")
     scale = float(np.max(np.ptp(v, axis=0)))
-    spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
-    if spread <= 1e-9 * scale:
+    thickness = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(v))
+    if thickness <= 1e-9 * scale:
         raise ConfigError(f"expected vertices that span a volume, got {len(v)} in one plane; add one outside of it")
     triangles = _find_triangles(v, 1e-9 * scale) if faces is None else np.asarray(faces)
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
@@ -218,15 +218,14 @@ def _is_closed(triangles: np.ndarray) -> bool:
 
 def _unique_normals(normals: np.ndarray) -> np.ndarray:
     """Return the unit vectors without near duplicates. (n, 3) -> (m, 3)"""
-    kept: list[np.ndarray] = []
+    unique: list[np.ndarray] = []
     for n in normals:
-        if not kept or np.min(np.linalg.norm(np.asarray(kept) - n, axis=1)) > 1e-6:
-            kept.append(n)
-    return np.asarray(kept).reshape(-1, 3)
+        if not unique or np.min(np.linalg.norm(np.asarray(unique) - n, axis=1)) > 1e-6:
+            unique.append(n)
+    return np.asarray(unique).reshape(-1, 3)
 
 
 def _read_only_copy(x: np.ndarray) -> np.ndarray:
-    """Return a read-only copy."""
     x = np.array(x)
     x.setflags(write=False)
     return x

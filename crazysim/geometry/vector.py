@@ -59,9 +59,9 @@ def stack_vectors(vectors: list[Vector]) -> Vector:
     return Vector(*(jnp.stack(xs) for xs in zip(*((v.x, v.y, v.z) for v in vectors), strict=True)))
 
 
-def axis_vector(axis: int, like: Array) -> Vector:
+def axis_vector(axis: int, array: Array) -> Vector:
     """Return the unit vector along an axis, with the batch shape of an array. (...)"""
-    zero = jnp.zeros_like(like)
+    zero = jnp.zeros_like(array)
     return Vector(*(zero + 1 if k == axis else zero for k in range(3)))
 
 

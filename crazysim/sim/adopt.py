@@ -72,15 +72,15 @@ def read_vehicles(
     return spec, drones, populations
 
 
-def vehicle_poses(vehicles: list[Vehicle], like: Array) -> tuple[Array, Array]:
+def vehicle_poses(vehicles: list[Vehicle], template: Array) -> tuple[Array, Array]:
     """Return positions, m (n_worlds, n, 3), and attitudes, xyzw (n_worlds, n, 4), of vehicles in all worlds.
 
     Args:
         vehicles: The vehicles.
-        like: An array of worlds, in whose type they are.
+        template: An array of worlds, in whose type they are.
     """
     rows = [v.pos for v in vehicles], [v.quat for v in vehicles]
-    pos, quat = (jnp.asarray(np.broadcast_to(x, (like.shape[0], *np.shape(x))), like.dtype) for x in rows)
+    pos, quat = (jnp.asarray(np.broadcast_to(x, (template.shape[0], *np.shape(x))), template.dtype) for x in rows)
     return pos, quat
 
 
@@ -93,7 +93,7 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list
         spec: The spec.
         kinds: Airframe or population by prefix.
     """
-    found = []
+    vehicles = []
     for body in spec.worldbody.bodies:
         match = VEHICLE_NAME.fullmatch(body.name)
         if match is None or not (body.mocap or len(body.joints)):
@@ -104,14 +104,14 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list
                 f"expected a body with one of the prefixes {', '.join(kinds)}, got {body.name!r}. Use "
                 f"kinds={{{prefix!r}: ...}} with an airframe or a population, or a body without joints."
             )
-        found.append((body, Vehicle(body.name, kinds[prefix], np.array(body.pos), np.roll(body.quat, -1))))
-    names = [vehicle.name for _, vehicle in found]
+        vehicles.append((body, Vehicle(body.name, kinds[prefix], np.array(body.pos), np.roll(body.quat, -1))))
+    names = [vehicle.name for _, vehicle in vehicles]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise ConfigError(f"expected bodies with different names, got {twice[0]!r} twice. Rename one.")
-    for body, _ in found:
+    for body, _ in vehicles:
         spec.delete(body)
-    return [vehicle for _, vehicle in found]
+    return [vehicle for _, vehicle in vehicles]
 
 
 def _is_population(kind: VehicleKind) -> TypeGuard[type[Population]]:

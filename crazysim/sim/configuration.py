@@ -68,30 +68,30 @@ class Configuration:
     strict: bool
     """True to raise an error where a slower engine would be taken with a warning."""
 
-    def check(self, data: Any, like: SimData) -> None:
+    def check(self, data: Any, reference: SimData) -> None:
         """Check that data belong to a simulation with these settings; it takes some microseconds.
 
         The axes of each leaf are checked by the step.
 
         Args:
             data: Data to check.
-            like: Data of the simulation.
+            reference: Data of the simulation.
         """
         try:
             core, controls = data.core, data.controls
-            given = core.n_worlds, core.n_drones, core.freq, controls.mode, controls.rotor_vel is None
+            settings = core.n_worlds, core.n_drones, core.freq, controls.mode, controls.rotor_vel is None
         except AttributeError:
             raise ConfigError(
                 f"expected the data of a simulation, got {type(data).__name__}. Use sim.data = sim.data.replace(...)."
             ) from None
         fitted = self.dynamics != Dynamics.first_principles
-        needed = self.n_worlds, self.n_drones, self.freq, self.control, fitted
-        if given != needed:
+        expected = self.n_worlds, self.n_drones, self.freq, self.control, fitted
+        if settings != expected:
             raise ConfigError(
-                f"expected data of {_describe_settings(*needed)}, got data of {_describe_settings(*given)}. Use data "
-                f"of this simulation, or of one with the same settings."
+                f"expected data of {_describe_settings(*expected)}, got data of {_describe_settings(*settings)}. Use "
+                f"data of this simulation, or of one with the same settings."
             )
-        require_same_controllers(controls, like.controls, getattr(self.controller, "name", None))
+        require_same_controllers(controls, reference.controls, getattr(self.controller, "name", None))
 
     @staticmethod
     def create(
@@ -124,8 +124,8 @@ class Configuration:
         for airframe in dict.fromkeys(airframes):
             require_support(airframe, dynamics)
         controller = find_controller(controllers, switch)
-        for each in controller.members:
-            check_settings(each)
+        for member in controller.members:
+            check_settings(member)
         controller = controller.adapted(control, None if dynamics == Dynamics.first_principles else dynamics)
         require_controller(dynamics, control, controller)
         check_rates(control, freq, rates)
@@ -141,18 +141,18 @@ class Configuration:
 
 def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None, aero: str | None) -> list[Plugin]:
     """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones."""
-    found: list[Plugin] = []
+    initial: list[Plugin] = []
     if estimator is not None:
         estimator = find_estimator(estimator)
-        found.extend([*estimator.sensors, estimator])
+        initial.extend([*estimator.sensors, estimator])
     if aero is not None:
         if aero != "identified":
             raise ConfigError(
                 f"expected aero='identified' or None, got {aero!r}. Use plugins=[RotorAerodynamics()] for the other "
                 f"forces of the air on rotors."
             )
-        found.append(Residual())
-    return [*found, *plugin_list("plugins", plugins)]
+        initial.append(Residual())
+    return [*initial, *plugin_list("plugins", plugins)]
 
 
 def _describe_settings(n_worlds: int, n_drones: int, freq: int, control: Control, fitted: bool) -> str:

@@ -51,7 +51,7 @@ class VectorLayout:
         """Return the vector of one drone of a simulation. (len(self),)"""
         axes, leaves = Axes(data), jax.tree.leaves(data)
         places = [axes.names.index(name) for name in self.sizes]
-        parts = [_of_one(axes.scopes[i], leaves[i], world, drone) for i in places]
+        parts = [_drone_numbers(axes.scopes[i], leaves[i], world, drone) for i in places]
         return np.concatenate([np.zeros(0), *parts])
 
 
@@ -111,8 +111,8 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     leaves, names = jax.tree.leaves(data), [leaf.name for leaf in program.leaves]
     command = _command_field(data)
     state = [names.index(name) for name in STATES]
-    given = [names.index(command), *_parameter_leaves(program, parameters, command)]
-    sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *given, *program.written}}
+    inputs = [names.index(command), *_parameter_leaves(program, parameters, command)]
+    sizes = {leaf: program.leaves[leaf].size for leaf in {*state, *inputs, *program.written}}
     symbols = {leaf: casadi.SX.sym(names[leaf], size) for leaf, size in sizes.items()}
     constants: dict[int, Any] = {}
 
@@ -121,11 +121,13 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         if leaf in symbols:
             return symbols[leaf][k]
         if leaf not in constants:
-            constants[leaf] = casadi.SX(casadi.DM(_of_one(program.leaves[leaf].scope, leaves[leaf], world, drone)))
+            constants[leaf] = casadi.SX(
+                casadi.DM(_drone_numbers(program.leaves[leaf].scope, leaves[leaf], world, drone))
+            )
         return constants[leaf][k]
 
     after = _step(program, before)
-    then = {
+    next_values = {
         leaf: casadi.vertcat(*(after.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
         for leaf, symbol in symbols.items()
     }
@@ -133,16 +135,16 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
     while memory := [
         leaf
         for leaf, symbol in symbols.items()
-        if leaf not in (*state, *given) and any(casadi.depends_on(then[known], symbol) for known in state)
+        if leaf not in (*state, *inputs) and any(casadi.depends_on(next_values[known], symbol) for known in state)
     ]:
         state += memory
     state = state[: len(STATES)] + sorted(state[len(STATES) :])
-    parts = {"x": state, "u": given[:1], "p": given[1:]}
-    given_parts = [part for part, some in parts.items() if some]
-    arguments = [casadi.vertcat(*(symbols[leaf] for leaf in parts[part])) for part in given_parts]
-    x_next = casadi.vertcat(*(then[leaf] for leaf in state))
+    parts = {"x": state, "u": inputs[:1], "p": inputs[1:]}
+    used_parts = [part for part, members in parts.items() if members]
+    arguments = [casadi.vertcat(*(symbols[leaf] for leaf in parts[part])) for part in used_parts]
+    x_next = casadi.vertcat(*(next_values[leaf] for leaf in state))
     return CasadiStep(
-        casadi.Function("step", arguments, [x_next], given_parts, ["x_next"]),
+        casadi.Function("step", arguments, [x_next], used_parts, ["x_next"]),
         *(VectorLayout({names[leaf]: sizes[leaf] for leaf in part}) for part in parts.values()),
         dt=1 / data.core.freq,
     )
@@ -204,7 +206,7 @@ def _parameter_leaves(program: Program, parameters: Sequence[str], command: str)
     return [names.index(name) for name in parameters]
 
 
-def _of_one(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
+def _drone_numbers(scope: str, x: Any, world: int, drone: int) -> np.ndarray:
     """Return the elements of a leaf that belong to one drone, as float64. (size,)"""
     x = np.asarray(jax.random.key_data(x) if is_key(x) else x)
     place = {"drone": (world, drone), "world": (world, 0)}.get(scope, ())

@@ -71,7 +71,7 @@ class Member:
                 raise UnknownNameError(
                     f"expected a field of {self.name!r}, got {field!r}. Use one of {self._fields()}."
                 )
-            new[field] = self._with_checked_row(f"{field} of {self.name}", getattr(record, field), value)
+            new[field] = self._replace_checked_row(f"{field} of {self.name}", getattr(record, field), value)
         data, record = self._sim.data, record.replace(**new)
         plugin = self._plugin
         self._sim.data = data.replace(states=record) if plugin is None else plugin.write(data, record)
@@ -87,26 +87,28 @@ class Member:
             if plugin.command_field is None:
                 raise ConfigError(f"expected a population that takes commands, got {self.population!r}, which does not")
             record = plugin.read(data)
-            staged = self._with_checked_row(f"command of {self.name}", getattr(record, plugin.command_field), command)
+            staged = self._replace_checked_row(
+                f"command of {self.name}", getattr(record, plugin.command_field), command
+            )
             self._sim.data = plugin.write(data, record.replace(**{plugin.command_field: staged}))
             return
         level = data.controls.mode
         staged, *before = F.staged_leaves(data)
         if level == Control.rotor_vel:
-            command = self._for_rotors(command, command_shape(data, level)[-1])
-        staged = self._with_checked_row(f"{level.value} command of {self.name}", staged, command)
+            command = self._pad_rotors(command, command_shape(data, level)[-1])
+        staged = self._replace_checked_row(f"{level.value} command of {self.name}", staged, command)
         # the feedforward of the other drones stays
         feedforward = [_replace_row(x, self.index, _read_row(F.feedforward_of(staged), self.index)) for x in before]
         self._stage(staged, *feedforward)
 
-    def _for_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
+    def _pad_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
         """Return rotor speeds with zeros for rotors that other drones of the simulation have."""
-        own = self._sim.airframes[self.index].n_rotors
-        if np.shape(command)[-1:] != (own,) or own == n_rotors:
+        n_own_rotors = self._sim.airframes[self.index].n_rotors
+        if np.shape(command)[-1:] != (n_own_rotors,) or n_own_rotors == n_rotors:
             return command
-        return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - own)])
+        return np.pad(np.asarray(command), [(0, 0)] * (np.ndim(command) - 1) + [(0, n_rotors - n_own_rotors)])
 
-    def _with_checked_row(self, what: str, x: Array, value: ArrayLike) -> Array | NDArray:
+    def _replace_checked_row(self, what: str, x: Array, value: ArrayLike) -> Array | NDArray:
         shape = x.shape[:1] + x.shape[2:]
         if np.shape(value) not in (shape[1:], shape):
             raise ValueError(

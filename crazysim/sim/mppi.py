@@ -227,10 +227,12 @@ class MPPI:
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         excess = costs - jnp.min(costs, axis=1, keepdims=True)
         finite = jnp.isfinite(excess)  # a drone whose rollouts all failed keeps its plan
-        spread = jnp.sum(jnp.where(finite, excess, 0.0), axis=1, keepdims=True) / jnp.maximum(
+        mean_excess = jnp.sum(jnp.where(finite, excess, 0.0), axis=1, keepdims=True) / jnp.maximum(
             jnp.sum(finite, axis=1, keepdims=True), 1
         )
-        weights = jnp.where(finite, jnp.exp(-jnp.where(finite, excess, 0.0) / (self.temperature * spread + 1e-9)), 0.0)
+        weights = jnp.where(
+            finite, jnp.exp(-jnp.where(finite, excess, 0.0) / (self.temperature * mean_excess + 1e-9)), 0.0
+        )
         weights = weights / jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), 1e-9)
         moved = plan + jnp.einsum("wsd,wsdkc->wdkc", weights, knots - plan[:, None])
         return moved[:, :, 0], MPPIMemory(self._shift_plan(moved), memory.count + 1)
@@ -249,8 +251,8 @@ class MPPI:
                 f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
             )
 
-        def of_rollouts(scope: str, own: Array, x: Array) -> Array:
-            return self._repeat(x) if n_batch_axes(scope) == 2 else own if scope != "shared" else x
+        def of_rollouts(scope: str, default: Array, x: Array) -> Array:
+            return self._repeat(x) if n_batch_axes(scope) == 2 else default if scope != "shared" else x
 
         leaves = [
             of_rollouts(*pair)
@@ -304,7 +306,7 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))
     high = airframe.n_rotors * float(airframe.value("rotors.thrust_max", ()))
     weight = -GRAVITY[2] * mass
-    thrust, spread = (weight, low, high), 0.2 * (high - low)
+    thrust, thrust_deviation = (weight, low, high), 0.2 * (high - low)
     if level == Control.rotor_vel:
         least, most = rotor_vel_limits(sim.dynamics, airframe)
         hover = least + (most - least) * np.sqrt(max(weight - low, 0.0) / (high - low))
@@ -313,10 +315,10 @@ def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     elif level == Control.force_torque:
         arm = 0.5 * airframe.arm * (high - low)
         torque = np.array([arm, arm, 0.1 * arm])
-        rows = [[thrust[0], 0, 0, 0], [low, *-torque], [high, *torque], [spread, *(0.05 * torque)]]
+        rows = [[thrust[0], 0, 0, 0], [low, *-torque], [high, *torque], [thrust_deviation, *(0.05 * torque)]]
     else:
         limit, deviation = (
             ((0.7, 0.7, np.pi), (0.1, 0.1, 0.05)) if level == Control.attitude else ((8, 8, 3), (2, 2, 1))
         )
-        rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, spread]]
+        rows = [[0, 0, 0, weight], [*(-x for x in limit), low], [*limit, high], [*deviation, thrust_deviation]]
     return tuple(np.asarray(row, float_dtype()) for row in rows)  # type: ignore[return-value]

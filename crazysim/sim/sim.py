@@ -276,10 +276,10 @@ class Sim:
             return
         with self.lock, jax.ensure_compile_time_eval():  # data that are first read inside a user's trace stay arrays
             self._adopted = self._scene.revision
-            self.data = self._with_scene(self._stepper.data)
-            self._default_data = self._stepper.put_on_device(self._with_scene(self._default_data))
+            self.data = self._update_objects(self._stepper.data)
+            self._default_data = self._stepper.put_on_device(self._update_objects(self._default_data))
 
-    def _with_scene(self, data: SimData) -> SimData:
+    def _update_objects(self, data: SimData) -> SimData:
         ids = device_array(self._scene.drone_mocap_ids, np.int32)
         return data.replace(core=data.core.replace(drone_mocap_ids=ids), objects=self._scene.objects(data.objects))
 
@@ -329,8 +329,8 @@ class Sim:
     def add(self, plugin: P, name: str | None = None) -> P:
         """Add an effect, a sensor, a log or any other plugin, and return it.
 
-        Its record goes into ``data.plugins`` of the data and the default data, of which nothing else changes, its
-        stages into the step pipeline, its influences and states into the integration. The step is compiled again.
+        Its record is added to ``data.plugins`` of the data and the default data, its stages to the step pipeline, its
+        influences and states to the integration. Nothing else in the data changes. The step is compiled again.
 
         Args:
             plugin: The plugin, such as ``crazysim.Wind(velocity=(2, 0, 0))``.
@@ -383,9 +383,9 @@ class Sim:
         feedforward: ArrayLike | None = None,
     ) -> None:
         """Stage a full-state setpoint: (n_worlds, n_drones, 16), or ``pos`` and other parts, which broadcast."""
-        like = self._stepper.data_or_shapes
+        data = self._stepper.data_or_shapes
         self._stepper.stage(
-            *F.check_setpoint(like, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
+            *F.check_setpoint(data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward)
         )
 
     @locked
@@ -498,12 +498,12 @@ class Sim:
         """
         n_substeps = self.freq // self.control_freq
         self._stepper.count(n_substeps, positive_integer("n_control_steps", n_control_steps))
-        data, kept = run_rollout(
+        data, records = run_rollout(
             self.step_fn, self.data, policy, params, n_control_steps, check_flag("progress", progress), every,
             n_substeps=n_substeps, keep=keep,
         )  # fmt: skip
         self._stepper.accept(data)
-        return kept
+        return records
 
     def explain(self, measure: bool = False) -> str:
         """Return in a few lines which engine runs the step, which stages it fuses, and which it does not and why.

@@ -61,8 +61,8 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
         for k in range(0, len(pair), CELLS_PER_BATCH):
             part = slice(k, k + CELLS_PER_BATCH)
             i, j = first[pair[part]], second[pair[part]]
-            one, other = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
-            lower = _lower_bounds(pieces, one, other, (i, j), pair[part], cell[part], dt, best, when)
+            motion_i, motion_j = (motion.in_cells(drone, cell[part], dt, table) for drone in (i, j))
+            lower = _lower_bounds(pieces, motion_i, motion_j, (i, j), pair[part], cell[part], dt, best, when)
             keep[part] = lower < best[pair[part]] - tolerance
         pair, cell = np.repeat(pair[keep], N_SPLITS), (cell[keep][:, None] * N_SPLITS + np.arange(N_SPLITS)).ravel()
         dt, n_cells = dt / N_SPLITS, n_cells * N_SPLITS
@@ -110,8 +110,8 @@ class _Motion:
 
 def _lower_bounds(
     pieces: PieceTable,
-    one: tuple[Floats, ...],
-    other: tuple[Floats, ...],
+    motion_i: tuple[Floats, ...],
+    motion_j: tuple[Floats, ...],
     drones: tuple[Ints, Ints],
     pair: Ints,
     cell: Ints,
@@ -120,8 +120,8 @@ def _lower_bounds(
     when: Floats,
 ) -> Floats:
     """Return a lower bound of the distance in each cell; update the smallest distance of each pair in place."""
-    start, end, acc, jerk = (a - b for a, b in zip(one[:4], other[:4], strict=True))
-    deviation = dt**2 / 8 * (_norm(acc) + dt / 2 * _norm(jerk)) + one[4] + other[4]
+    start, end, acc, jerk = (a - b for a, b in zip(motion_i[:4], motion_j[:4], strict=True))
+    deviation = dt**2 / 8 * (_norm(acc) + dt / 2 * _norm(jerk)) + motion_i[4] + motion_j[4]
     step = end - start
     square = _dot(step, step)
     u = np.clip(-_dot(start, step) / np.where(square > 0, square, 1.0), 0.0, 1.0)

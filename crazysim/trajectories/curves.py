@@ -121,8 +121,8 @@ def helix(
         along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
     """
     require_positive("turns", turns)
-    given = {"radius": radius, "climb": climb, "height": height}
-    radius, climb, height = (float(require_vector(name, x, ())) for name, x in given.items())
+    lengths = {"radius": radius, "climb": climb, "height": height}
+    radius, climb, height = (float(require_vector(name, x, ())) for name, x in lengths.items())
     w = 2 * np.pi / _period(period, speed, math.hypot(2 * np.pi * radius, climb))
 
     def curve(t: np.ndarray, order: int) -> np.ndarray:

@@ -196,9 +196,9 @@ def check(
     if not 0 < tolerance < np.inf:
         raise ConfigError(f"expected a positive, finite tolerance, m, got {tolerance!r}. Use 1e-3.")
     allowed = (limits if airframe is None else limits.of_airframe(airframe)).as_dict()
-    found, closest = peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
+    extremes, closest = peaks(table, tuple(QUANTITIES)), tuple(closest_approaches(table, tolerance))
     violations = []
-    for name, peak in found.items():
+    for name, peak in extremes.items():
         if name not in allowed:
             continue
         limit, sign = allowed[name], QUANTITIES[name].sign
@@ -211,4 +211,4 @@ def check(
         if pair.distance < separation * (1 - LIMIT_TOLERANCE):
             who = tuple(labels[k] for k in pair.drones)
             violations.append(Violation("separation", pair.drones, pair.time, pair.distance, separation, who))
-    return Report(tuple(violations), closest, found, labels, table.duration)
+    return Report(tuple(violations), closest, extremes, labels, table.duration)

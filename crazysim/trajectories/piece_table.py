@@ -45,11 +45,11 @@ class PieceTable:
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
-        given = np.asarray(starts, float)
+        start_times = np.asarray(starts, float)
         n_drones = len(trajectories)
-        if given.shape not in ((), (n_drones,)) or not np.all(np.isfinite(given)):
+        if start_times.shape not in ((), (n_drones,)) or not np.all(np.isfinite(start_times)):
             raise ConfigError(f"expected one finite start, s, or one for each of {n_drones} drones, got {starts!r}")
-        starts = np.broadcast_to(given, (n_drones,))
+        starts = np.broadcast_to(start_times, (n_drones,))
         host = [jax.tree.map(np.asarray, trajectory) for trajectory in trajectories]
         ends = [start + float(t.ends[-1]) for start, t in zip(starts, host, strict=True)]
         end = max(ends) if duration is None else float(duration)
@@ -79,12 +79,12 @@ class PieceTable:
     @functools.cached_property
     def _derivatives(self) -> list[Floats]:
         """Coefficients of the derivatives with respect to time, up to snap."""
-        found, c = [self.coefficients], self.coefficients
+        derivatives, c = [self.coefficients], self.coefficients
         for _ in range(N_DERIVATIVES):
             c = c[..., 1:] * np.arange(1, c.shape[-1]) if c.shape[-1] > 1 else np.zeros_like(c)
             c = c / self.length[:, None, None]
-            found.append(c)
-        return found
+            derivatives.append(c)
+        return derivatives
 
     def coefficients_of(self, order: int) -> Floats:
         """Return the coefficients of a derivative, up to snap. (n_pieces, 4, degree + 1 - order)"""
@@ -93,8 +93,8 @@ class PieceTable:
     def piece(self, drone: Ints, t: NDArray) -> Ints:
         """Return the piece that each drone is in at a time; where two meet, the later one. (...)"""
         t = np.clip(t, 0.0, self.duration)
-        found = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
-        return np.maximum(found, self.first[drone])
+        index = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
+        return np.maximum(index, self.first[drone])
 
     def within(self, piece: Ints, u: Floats, order: int = 0) -> Floats:
         """Return a derivative of x, y, z and yaw at times within pieces.

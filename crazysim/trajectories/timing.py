@@ -63,8 +63,8 @@ def best_ratios(nodes: Floats, durations: Floats) -> Floats:
 
     if len(durations) == 1:
         return durations
-    found = minimize(logarithm_of_cost, np.log(durations / total), jac=True, method="L-BFGS-B")
-    return of(found.x)
+    result = minimize(logarithm_of_cost, np.log(durations / total), jac=True, method="L-BFGS-B")
+    return of(result.x)
 
 
 def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> list[str]:
@@ -76,13 +76,13 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
             (n_pieces, 4, degree + 1)
         limits: Limits; the separation concerns several trajectories and is not checked.
     """
-    given = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
+    checked = {name: limit for name, limit in limits.as_dict().items() if name in QUANTITIES}
     ends = np.cumsum(durations)
     table = PieceTable(float(ends[-1]), np.zeros(len(ends), int), ends - durations, durations, coefficients)
-    found = peaks(table, tuple(given))
-    excess = {name: QUANTITIES[name].sign * (found[name].value[0] - limit) for name, limit in given.items()}
-    margins = {name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in given}
-    return [name for name, limit in given.items() if excess[name] > margins[name] * limit_size(name, limit)]
+    extremes = peaks(table, tuple(checked))
+    excess = {name: QUANTITIES[name].sign * (extremes[name].value[0] - limit) for name, limit in checked.items()}
+    margins = {name: -LIMIT_MARGIN if QUANTITIES[name].orders != (0,) else 0.5 * LIMIT_MARGIN for name in checked}
+    return [name for name, limit in checked.items() if excess[name] > margins[name] * limit_size(name, limit)]
 
 
 def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:

@@ -298,7 +298,7 @@ class Trajectory(PyTree):
 
 
 def _array_module(tree: object) -> Any:
-    """Return ``jax.numpy`` if there is an array of JAX, else NumPy, which compiles nothing."""
+    """Return ``jax.numpy`` if there is a JAX array, else NumPy, which compiles nothing."""
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(tree)) else np
 
 

@@ -204,13 +204,13 @@ def _nodes(waypoints: ArrayLike, fixed: Sequence[ArrayLike | None]) -> Floats:
         if values is None:
             nodes[[0, -1], k] = 0.0
             continue
-        given = np.asarray(values, float)
-        if given.shape != at.shape or np.any(np.isinf(given)):
+        array = np.asarray(values, float)
+        if array.shape != at.shape or np.any(np.isinf(array)):
             raise ConfigError(
-                f"expected finite {name} {at.shape}, NaN where free, got shape {given.shape}. Pass one row per "
+                f"expected finite {name} {at.shape}, NaN where free, got shape {array.shape}. Pass one row per "
                 "waypoint."
             )
-        nodes[:, k] = given
+        nodes[:, k] = array
     return nodes
 
 

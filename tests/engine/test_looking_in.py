@@ -12,13 +12,11 @@ from crazysim.engine.backends import source
 from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import dump, listing, ops
 from crazysim.engine.ir.blocks import Builder
-from crazysim.engine.lowering.jaxprs import lower_function
 from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.optimise import optimise
 from crazysim.engine.tools import compare
 
 F = np.float32
-ONE = jax.ShapeDtypeStruct((), F)
 
 
 @stage("drone")
@@ -73,8 +71,13 @@ def test_segments_of_worlds_name_the_drone_and_unfused_stages_their_reason(data)
     assert "  writes states.torque\n" in text
 
 
-def test_blocks_of_operations_are_indented():
-    text = listing.list_block(lower_function(lambda x: jax.lax.fori_loop(0, 70, lambda _, y: y * 0.5, x), ONE))
+@stage("drone")
+def halve(data):
+    return data.replace(states=jax.lax.fori_loop(0, 70, lambda _, s: s.replace(force=0.5 * s.force), data.states))
+
+
+def test_blocks_of_operations_are_indented(data):
+    text = listing.list_program(lower_stages([halve], data))
     assert "loop(" in text
     assert "length=70) {\n" in text
     assert "\n    return " in text

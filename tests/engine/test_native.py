@@ -122,7 +122,7 @@ def test_a_damaged_file_is_compiled_again(source, place, compilations, damage):
     library.write_bytes(damage(raw))
     again(source)
     assert compilations() == 2
-    assert [native._loaded(path) is not None for path in place.iterdir()] == [True]
+    assert [native._load_library(path) is not None for path in place.iterdir()] == [True]
 
 
 def test_a_library_that_does_not_load_here_is_compiled_again(source, place, compilations):
@@ -139,8 +139,8 @@ def test_a_library_that_does_not_load_here_is_compiled_again(source, place, comp
 
 
 def test_a_folder_that_forbids_execution_does_no_harm(source, place, compilations, monkeypatch):
-    real = native._loaded
-    monkeypatch.setattr(native, "_loaded", lambda path: None if path.is_relative_to(place) else real(path))
+    real = native._load_library
+    monkeypatch.setattr(native, "_load_library", lambda path: None if path.is_relative_to(place) else real(path))
     native.target(source)
     assert compilations() == 1
 
@@ -161,7 +161,7 @@ def test_a_file_of_the_key_without_a_kernel_is_not_used(place, monkeypatch):
     )
     assert done.returncode == 0
     assert ctypes.CDLL(str(path))
-    assert native._loaded(path) is None
+    assert native._load_library(path) is None
 
 
 def test_nothing_partial_is_ever_seen(source, place, monkeypatch, tmp_path_factory):

@@ -75,18 +75,18 @@ def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
     log = {key: np.asarray(x, np.float64) for key, x in data.items()}
     time = log["time"]
 
-    def filtered(key: str, cutoff: str, n: int, held: bool = False) -> NDArray:
-        return state_variable_filter(log[key].T, time, CUTOFFS[cutoff], n, held=held)
+    def filter_signal(key: str, cutoff: str, held: bool = False) -> NDArray:
+        return state_variable_filter(log[key].T, time, CUTOFFS[cutoff], 3, held=held)
 
     def columns(x: NDArray, k: int) -> NDArray:
         return x[:, k].T
 
-    pos, rpy = filtered("pos", "translation", 3), filtered("rpy", "rotation", 3)
+    pos, rpy = filter_signal("pos", "translation"), filter_signal("rpy", "rotation")
     log |= {f"SVF_{key}": columns(pos, k) for k, key in enumerate(("pos", "vel", "acc", "jerk"))}
     log |= {f"SVF_{key}": columns(rpy, k) for k, key in enumerate(("rpy", "drpy", "ddrpy", "dddrpy"))}
     log["SVF_quat"] = np.asarray(rotation.from_rpy(jnp.asarray(log["SVF_rpy"])), np.float64)
-    log["SVF_cmd_f"] = filtered("cmd_f", "translation", 3, held=True)[0]
-    log["SVF_cmd_rpy"] = columns(filtered("cmd_rpy", "rotation", 3, held=True), 0)
+    log["SVF_cmd_f"] = filter_signal("cmd_f", "translation", held=True)[0]
+    log["SVF_cmd_rpy"] = columns(filter_signal("cmd_rpy", "rotation", held=True), 0)
     return log
 
 
@@ -95,7 +95,7 @@ def state_variable_filter(
 ) -> NDArray:
     """Return a signal through Butterworth low-passes backward and forward in time, and its derivatives.
 
-    The low-pass of order ``N_deriv + 2`` is simulated exactly between samples, of which the signal is linear, or
+    The low-pass of order ``N_deriv + 2`` is simulated exactly between samples, where the signal is linear, or
     constant where it is held. Uneven times are resampled.
 
     Args:
@@ -127,7 +127,7 @@ def state_variable_filter(
     a[order, order + 1] = 1.0
     move = expm(a)[:order]
 
-    def passed(u: NDArray, change: NDArray) -> NDArray:
+    def low_pass(u: NDArray, change: NDArray) -> NDArray:
         x = np.zeros((len(u), order))
         x[:, 0] = u[:, 0]
         inputs = u[..., None] * move[:, order] + change[..., None] * move[:, order + 1]
@@ -139,9 +139,9 @@ def state_variable_filter(
 
     zero = np.zeros((len(u), 1))
     if held:  # backward in time, the value before a sample holds after it
-        back = passed(np.concatenate([u[:, -2::-1], u[:, :1]], axis=1), np.zeros_like(u))[:, ::-1, 0]
+        back = low_pass(np.concatenate([u[:, -2::-1], u[:, :1]], axis=1), np.zeros_like(u))[:, ::-1, 0]
     else:
-        back = passed(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]
-    states = passed(back, np.concatenate([np.diff(back, axis=1), zero], axis=1))
-    found = [[np.interp(t, even, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
-    return np.squeeze(np.array(found))
+        back = low_pass(u[:, ::-1], np.concatenate([np.diff(u[:, ::-1], axis=1), zero], axis=1))[:, ::-1, 0]
+    states = low_pass(back, np.concatenate([np.diff(back, axis=1), zero], axis=1))
+    interpolated = [[np.interp(t, even, omega**k * x[:, k]) for k in range(N_deriv + 1)] for x in states]
+    return np.squeeze(np.array(interpolated))

@@ -120,9 +120,11 @@ def fit_translation(
     if kind != Dynamics.so_rpy:
         grid = np.geomspace(*RATE_RANGE, 31)
         k = int(np.argmin([solved(x)[0] for x in grid]))
-        near = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
-        found = minimize_scalar(lambda x: solved(np.exp(x))[0], bounds=near, method="bounded", options={"xatol": 1e-7})
-        rate = float(np.exp(found.x))
+        bounds = np.log(grid[[max(0, k - 1), min(len(grid) - 1, k + 1)]])
+        result = minimize_scalar(
+            lambda x: solved(np.exp(x))[0], bounds=bounds, method="bounded", options={"xatol": 1e-7}
+        )
+        rate = float(np.exp(result.x))
     _, coefs, terms, rest = solved(rate)
     names, values, jacobian = ["cmd_f_coef"], [coefs[0]], terms
     if kind != Dynamics.so_rpy:
@@ -131,8 +133,8 @@ def fit_translation(
         jacobian = np.insert(jacobian, 1, slope, axis=-1)
     if kind == Dynamics.so_rpy_rotor_drag:
         names, values = [*names, "drag_xy_coef", "drag_z_coef"], [*values, *coefs[1:]]
-    spread = _deviations(jacobian, rest, np.arange(len(rest)) * len(logs) * 10 // len(rest))
-    return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, spread), strict=True))
+    deviations = _deviations(jacobian, rest, np.arange(len(rest)) * len(logs) * 10 // len(rest))
+    return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, deviations), strict=True))
 
 
 def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
@@ -163,8 +165,8 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
     (tilt, tilt_spread), (turn, turn_spread) = groups
     names = ("rpy_coef", "rpy_rates_coef", "cmd_rpy_coef")
     values = {name: np.array([tilt[k], tilt[k], turn[k]]) for k, name in enumerate(names)}
-    spread = {name: np.array([tilt_spread[k], tilt_spread[k], turn_spread[k]]) for k, name in enumerate(names)}
-    return values, spread
+    deviations = {name: np.array([tilt_spread[k], tilt_spread[k], turn_spread[k]]) for k, name in enumerate(names)}
+    return values, deviations
 
 
 def _terms(
@@ -256,8 +258,8 @@ def _deviations(jacobian: NDArray, rest: NDArray, blocks: NDArray) -> NDArray:
     """Return standard deviations from the scatter between blocks of time. (k,)"""
     inverse = np.linalg.pinv(np.einsum("nri,nrj->ij", jacobian, jacobian), hermitian=True)
     scores = np.einsum("nri,nr->ni", jacobian, rest)
-    each = np.stack([scores[blocks == b].sum(axis=0) for b in np.unique(blocks)])
-    return np.sqrt(np.diag(inverse @ (each.T @ each) @ inverse))
+    block_scores = np.stack([scores[blocks == b].sum(axis=0) for b in np.unique(blocks)])
+    return np.sqrt(np.diag(inverse @ (block_scores.T @ block_scores) @ inverse))
 
 
 def _refuse_plot(plot: bool) -> None:

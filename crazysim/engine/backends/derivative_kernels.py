@@ -57,8 +57,8 @@ class DerivativeKernels:
         It takes all leaves, tangents by leaf, the number of steps, the number of batches, and shapes and types of the
         tangents after the steps, which it returns.
         """
-        found = self._compiled("jvp", add_tangents, kernel.write, changing, platform)
-        return None if found is None else partial(_forward, self, *found)
+        compiled = self._compile("jvp", add_tangents, kernel.write, changing, platform)
+        return None if compiled is None else partial(_forward, self, *compiled)
 
     def reverse(self, changing: tuple[int, ...], platform: str) -> Callable[..., Leaves] | None:
         """Return the kernel that computes the cotangents of some leaves; None where there is none.
@@ -66,10 +66,10 @@ class DerivativeKernels:
         It takes all leaves, cotangents of the floats that are written, the number of steps and the number of batches,
         and returns cotangents by leaf, of a leaf that drones share one for each batch.
         """
-        found = self._compiled("gradient", reverse.reverse_program, reverse.write, changing, platform)
-        return None if found is None else partial(_reverse, self, *found)
+        compiled = self._compile("gradient", reverse.reverse_program, reverse.write, changing, platform)
+        return None if compiled is None else partial(_reverse, self, *compiled)
 
-    def _compiled(
+    def _compile(
         self,
         kind: str,
         transformed: Callable[[Program, Sequence[int]], Any],
@@ -83,10 +83,10 @@ class DerivativeKernels:
             if key not in self._programs:
                 self._programs[key] = None
                 self._programs[key] = transformed(self.program, changing)
-            made = self._programs[key]
-            if made is not None and launch_key not in self._launches:
+            transformed_program = self._programs[key]
+            if transformed_program is not None and launch_key not in self._launches:
                 self._launches[launch_key] = None
-                source = write(made, TARGETS[platform])
+                source = write(transformed_program, TARGETS[platform])
                 location = self.location if platform == self.location.platform else Location(platform)
                 with announce_if_slow("compiling a derivative of the steps", "2 to 10 s"):
                     self._launches[launch_key] = compile_kernel(source, location)
@@ -102,12 +102,12 @@ class DerivativeKernels:
 
 def _inputs(values: Sequence[Any], leaves: Sequence[int]) -> list[Array]:
     """Return the leaves that a kernel reads; random keys as their 32-bit integers."""
-    some = [values[i] for i in leaves]
-    return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in some]
+    arrays = [values[i] for i in leaves]
+    return [jax.random.key_data(x) if jaxcompat.is_key(x) else x for x in arrays]
 
 
 def _forward(
-    own: DerivativeKernels,
+    kernels: DerivativeKernels,
     program: Program,
     launch: Launch,
     values: Sequence[Any],
@@ -116,28 +116,28 @@ def _forward(
     size: int,
     results: Sequence[jax.ShapeDtypeStruct],
 ) -> list[Array]:
-    n = len(own.program.leaves)
-    n_worlds, n_drones = lanes.batch_counts(own.program, list(values))
+    n = len(kernels.program.leaves)
+    n_worlds, n_drones = lanes.batch_counts(kernels.program, list(values))
 
-    def of_worlds(i: int, x: Array) -> Array:
+    def broadcast_tangent(i: int, x: Array) -> Array:
         """Return the tangent of a leaf, of one that all drones share for each world."""
-        if own.is_own(i):
+        if kernels.is_own(i):
             return x
         return jnp.broadcast_to(x[:, None, None], (size, n_worlds // size, 1, *x.shape[1:])).reshape(
             n_worlds, 1, *x.shape[1:]
         )
 
-    every = [*values, *(of_worlds(i, tangents[i]) if i in tangents else None for i in range(n))]
-    inputs = _inputs(every, kernel.needed_leaves(program))
+    leaves = [*values, *(broadcast_tangent(i, tangents[i]) if i in tangents else None for i in range(n))]
+    inputs = _inputs(leaves, kernel.needed_leaves(program))
     outputs = [lanes.shape_of(program, i, n_worlds) for i in program.written]
-    found = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
-    by_leaf = dict(zip(program.written, found, strict=True))
+    results_of_kernel = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
+    by_leaf = dict(zip(program.written, results_of_kernel, strict=True))
     return [by_leaf[n + i] if n + i in by_leaf else jnp.zeros(x.shape, x.dtype)
-            for i, x in zip(own.floats, results, strict=True)]  # fmt: skip
+            for i, x in zip(kernels.floats, results, strict=True)]  # fmt: skip
 
 
 def _reverse(
-    own: DerivativeKernels,
+    kernels: DerivativeKernels,
     going_back: ReverseProgram,
     launch: Launch,
     values: Sequence[Any],
@@ -145,22 +145,22 @@ def _reverse(
     n_steps: int,
     size: int,
 ) -> Leaves:
-    program = own.program
+    program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, list(values))
 
     def seed(i: int) -> Array:
         x = cotangents[i].reshape(n_worlds, -1, program.leaves[i].size)
         return x if x.shape[1] == n_drones else jnp.pad(x, ((0, 0), (0, n_drones - 1), (0, 0)))
 
-    inputs = [*_inputs(values, reverse.needed_leaves(going_back)), *map(seed, own.floats)]
+    inputs = [*_inputs(values, reverse.needed_leaves(going_back)), *map(seed, kernels.floats)]
     leaves = [program.leaves[i] for i in going_back.perturbed]
     outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number) for x in leaves]
-    found = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
+    sums_of_lanes = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
 
-    def of_leaf(i: int, x: Array) -> Array:
+    def sum_cotangent(i: int, x: Array) -> Array:
         """Return the cotangent of a leaf: of one that drones share the sum over them."""
         if program.leaves[i].scope == "world":
             return jnp.sum(x, axis=1)
-        return x if own.is_own(i) else jnp.sum(x.reshape(size, n_worlds * n_drones // size, -1), axis=1)
+        return x if kernels.is_own(i) else jnp.sum(x.reshape(size, n_worlds * n_drones // size, -1), axis=1)
 
-    return {i: of_leaf(i, x) for i, x in zip(going_back.perturbed, found, strict=True)}
+    return {i: sum_cotangent(i, x) for i, x in zip(going_back.perturbed, sums_of_lanes, strict=True)}

@@ -47,19 +47,22 @@ def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels 
                 case = Case(kernels, n_steps, present, tuple(changing), len(values))
                 fixed = [values[i] for i in present]
                 *written, flagged = advance_p.bind(*fixed, run=run, case=case)
-                given = [slopes[i] if kernels.is_own(i) else slopes[i][None] for i in changing]
-                some = tangent_p.bind(*fixed, *given, case=case, n_fixed=len(fixed))
-                found = dict(zip(kernels.floats, some, strict=True))
+                in_tangents = [slopes[i] if kernels.is_own(i) else slopes[i][None] for i in changing]
+                out_tangents = tangent_p.bind(*fixed, *in_tangents, case=case, n_fixed=len(fixed))
+                tangent_of = dict(zip(kernels.floats, out_tangents, strict=True))
                 numbers = kernels.program.written
-                rest = [found[i] if i in found else _float0_zeros(x) for i, x in zip(numbers, written, strict=True)]
+                rest = [
+                    tangent_of[i] if i in tangent_of else _float0_zeros(x)
+                    for i, x in zip(numbers, written, strict=True)
+                ]
                 return (written, flagged), (rest, _float0_zeros(flagged))
 
             if kernels is not None:
                 announce("compiling a derivative of the steps on lanes", "10 to 40 s")
             known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
 
-            def of(some: list[Any]) -> Any:
-                return other(replace_leaves(values, changing, some), known)
+            def of(floats: list[Any]) -> Any:
+                return other(replace_leaves(values, changing, floats), known)
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
@@ -110,22 +113,22 @@ class Case(NamedTuple):
     def over_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear: Sequence[int],
                      results: Sequence[int]) -> list[Array]:  # fmt: skip
         """Return the results for all batches of a function of the leaves and the linear operands of one batch."""
-        fixed, own = self.is_own(self.present), self.is_own(linear)
+        leaves_batched, linear_batched = self.is_own(self.present), self.is_own(linear)
 
         def split(x: Any) -> Any:
             return x.reshape(self.size, -1, *x.shape[1:])
 
-        def whole(values: Sequence[Any], some: Sequence[Any]) -> list[Array]:
-            return fn(self.values(values), list(some))
+        def run_batch(values: Sequence[Any], operands: Sequence[Any]) -> list[Array]:
+            return fn(self.values(values), list(operands))
 
         if self.size == 1:
-            some = [x if o else x[0] for x, o in zip(self.linear(args), own, strict=True)]
-            found = whole(args, some)
-            return [x if o else x[None] for x, o in zip(found, self.is_own(results), strict=True)]
-        values = [split(x) if o else x for x, o in zip(args, fixed, strict=False)]
-        some = [split(x) if o else x for x, o in zip(self.linear(args), own, strict=True)]
-        found = jax.vmap(whole, ([0 if o else None for o in fixed], 0))(values, some)
-        return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(found, self.is_own(results), strict=True)]
+            slopes = [x if o else x[0] for x, o in zip(self.linear(args), linear_batched, strict=True)]
+            outs = run_batch(args, slopes)
+            return [x if o else x[None] for x, o in zip(outs, self.is_own(results), strict=True)]
+        values = [split(x) if o else x for x, o in zip(args, leaves_batched, strict=False)]
+        slopes = [split(x) if o else x for x, o in zip(self.linear(args), linear_batched, strict=True)]
+        outs = jax.vmap(run_batch, ([0 if o else None for o in leaves_batched], 0))(values, slopes)
+        return [x.reshape(-1, *x.shape[2:]) if o else x for x, o in zip(outs, self.is_own(results), strict=True)]
 
 
 # Tangents ----------------------------------------------------------------------------------------------------------
@@ -153,18 +156,18 @@ def _tangents(platform: str, *args: Any, case: Case, **params: Any) -> list[Arra
     kernel = case.kernels.forward(case.changing, platform)
     if kernel is None:
         return _tangents_on_lanes(*args, case=case)
-    given = dict(zip(case.changing, case.linear(args), strict=True))
-    return kernel(case.values(args), given, case.n_steps, case.size, _written(*args, case=case))
+    in_tangents = dict(zip(case.changing, case.linear(args), strict=True))
+    return kernel(case.values(args), in_tangents, case.n_steps, case.size, _written(*args, case=case))
 
 
 # Cotangents --------------------------------------------------------------------------------------------------------
 
 
 def _before(*args: Any, case: Case) -> list[jax.ShapeDtypeStruct]:
-    like = [case.values(args)[i] for i in case.changing]
-    shapes = [x.shape if own else (case.size, *x.shape)
-              for x, own in zip(like, case.is_own(case.changing), strict=True)]  # fmt: skip
-    return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, like, strict=True)]
+    leaves = [case.values(args)[i] for i in case.changing]
+    shapes = [x.shape if is_own else (case.size, *x.shape)
+              for x, is_own in zip(leaves, case.is_own(case.changing), strict=True)]  # fmt: skip
+    return [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves, strict=True)]
 
 
 def _cotangents_on_lanes(*args: Any, case: Case) -> list[Array]:
@@ -178,13 +181,13 @@ def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
     kernel = case.kernels.reverse(case.changing, platform)
     if kernel is None:
         return _cotangents_on_lanes(*args, case=case)
-    given = dict(zip(case.kernels.floats, case.linear(args), strict=True))
-    found = kernel(case.values(args), given, case.n_steps, case.size)
-    return [found[i].reshape(x.shape) if i in found else jnp.zeros(x.shape, x.dtype)
+    seeds = dict(zip(case.kernels.floats, case.linear(args), strict=True))
+    cotangents = kernel(case.values(args), seeds, case.n_steps, case.size)
+    return [cotangents[i].reshape(x.shape) if i in cotangents else jnp.zeros(x.shape, x.dtype)
             for i, x in zip(case.changing, _before(*args, case=case), strict=True)]  # fmt: skip
 
 
-def _transposed(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
+def _transpose(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
     del params
     kernels = case.kernels
     if not kernels.program.fused:  # its stages may have effects, such as printing, that a primitive has not
@@ -193,27 +196,27 @@ def _transposed(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params
     return cotangent_p.bind(*fixed, *seeds, case=case)
 
 
-def _floats_after(case: Case, values: Sequence[Any], some: Sequence[Any]) -> list[Array]:
+def _floats_after(case: Case, values: Sequence[Any], changed: Sequence[Any]) -> list[Array]:
     kernels = case.kernels
-    written, _ = kernels.on_lanes(replace_leaves(values, case.changing, some), case.n_steps)
+    written, _ = kernels.on_lanes(replace_leaves(values, case.changing, changed), case.n_steps)
     return [x for i, x in zip(kernels.program.written, written, strict=True) if i in kernels.floats]
 
 
 def _batched(primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], case: Case, **params: Any) -> Any:
     """Return the results of a primitive for ``n`` batches, which are one call for more worlds."""
     n_fixed = len(case.present)
-    own = [*case.is_own(case.present), *(True for _ in args[n_fixed:])]
-    if any(b and not o for b, o in zip(batched, own, strict=True)):  # parameters that differ: one after the other
+    is_own = [*case.is_own(case.present), *(True for _ in args[n_fixed:])]
+    if any(b and not o for b, o in zip(batched, is_own, strict=True)):  # parameters that differ: one after the other
         full = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
         return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), full)
 
-    def joined(x: Any, b: bool) -> Any:
+    def join(x: Any, b: bool) -> Any:
         x = x if b else jnp.broadcast_to(x, (n, *x.shape))
         return x.reshape(-1, *x.shape[2:])
 
-    some = [joined(x, b) if o else x for x, b, o in zip(args, batched, own, strict=True)]
-    found = primitive.bind(*some, case=case._replace(size=n * case.size), **params)
-    return [x.reshape(n, -1, *x.shape[1:]) for x in found]
+    operands = [join(x, b) if o else x for x, b, o in zip(args, batched, is_own, strict=True)]
+    outs = primitive.bind(*operands, case=case._replace(size=n * case.size), **params)
+    return [x.reshape(n, -1, *x.shape[1:]) for x in outs]
 
 
 cotangent_p = jaxcompat.primitive_by_platform(
@@ -230,7 +233,7 @@ tangent_p = jaxcompat.primitive_by_platform(
     _written,
     {"cpu": partial(_tangents, "cpu"), "cuda": partial(_tangents, "gpu")},
     derivative=_tangents_on_lanes,
-    transposed=_transposed,
+    transposed=_transpose,
     batched=_batched,
 )
 """Tangents of the floats after some steps, from the tangents before them."""
@@ -239,12 +242,12 @@ tangent_p = jaxcompat.primitive_by_platform(
 # The steps in a derivative -----------------------------------------------------------------------------------------
 
 
-def _advanced(*args: Any, run: CountedRun, case: Case) -> list[Any]:
+def _advance(*args: Any, run: CountedRun, case: Case) -> list[Any]:
     written, flagged = run(case.values(args), jnp.asarray(case.n_steps, jnp.int32))
     return [*written, flagged]
 
 
-def _advanced_on_lanes(*args: Any, run: CountedRun, case: Case) -> list[Any]:
+def _advance_on_lanes(*args: Any, run: CountedRun, case: Case) -> list[Any]:
     del run
     written, flagged = case.kernels.on_lanes(case.values(args), case.n_steps)
     return [*written, flagged]
@@ -252,14 +255,14 @@ def _advanced_on_lanes(*args: Any, run: CountedRun, case: Case) -> list[Any]:
 
 def _shapes(*args: Any, **params: Any) -> list[Any]:
     avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
-    return jax.eval_shape(lambda *some: _advanced(*some, **params), *avals)
+    return jax.eval_shape(lambda *arrays: _advance(*arrays, **params), *avals)
 
 
 advance_p = jaxcompat.primitive_by_platform(
     "crazysim_advance",
     _shapes,
-    {"": _advanced},
-    derivative=_advanced_on_lanes,
-    batched=jaxcompat.vmap_rule_of(_advanced),
+    {"": _advance},
+    derivative=_advance_on_lanes,
+    batched=jaxcompat.vmap_rule_of(_advance),
 )
 """Steps of a kernel inside a derivative; they are differentiated as the program on lanes."""

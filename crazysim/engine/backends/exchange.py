@@ -24,6 +24,9 @@ TYPE_BYTES = {"f64": 8, "f32": 4, "i32": 4, "u32": 4, "b1": 1}
 WARP_THREADS = 32
 """Threads of a GPU that run together."""
 
+BLOCK_SIZE = 64
+"""Threads of a block on a GPU, where worlds fit into a warp."""
+
 MAX_THREADS = 1024
 """Most threads of a block on a GPU."""
 
@@ -213,7 +216,7 @@ def exchange_for(target: str, group: int) -> Exchange:
     return Registers() if group <= MAX_IN_VECTOR else Sweeps()
 
 
-def lanes_of_block(group: int, usual: int = 64) -> tuple[int, int]:
+def lanes_of_block(group: int) -> tuple[int, int]:
     """Return the number of threads of a block on a GPU, and how many of them are lanes.
 
     Worlds of up to a warp stay in one. Larger ones fill a block: of up to 256 threads, the size that leaves the fewest
@@ -221,10 +224,9 @@ def lanes_of_block(group: int, usual: int = 64) -> tuple[int, int]:
 
     Args:
         group: Drones of a world that read each other's numbers.
-        usual: Threads of a block where it makes no difference.
     """
     if group <= WARP_THREADS:
-        return usual, usual // WARP_THREADS * (WARP_THREADS // group * group)
+        return BLOCK_SIZE, BLOCK_SIZE // WARP_THREADS * (WARP_THREADS // group * group)
     least = math.ceil(group / WARP_THREADS) * WARP_THREADS
     sizes = range(least, max(least, 256) + 1, WARP_THREADS)
     return max(((n, n // group * group) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from importlib import resources
 
-from crazysim.engine.backends.exchange import lanes_of_block
+from crazysim.engine.backends.exchange import BLOCK_SIZE, lanes_of_block
 from crazysim.engine.ir.blocks import Block
 
 ANY_NUMBER_OF_BLOCKS = "1 /* blocks at least */"
@@ -15,9 +15,6 @@ ANY_NUMBER_OF_BLOCKS = "1 /* blocks at least */"
 
 BLOCK_THREADS = "#define BLOCK_THREADS {}\n"
 """Text in a kernel for a GPU that ``Kernel.with_threads`` replaces."""
-
-BLOCK_SIZE = 64
-"""Threads of a block on a GPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,11 +113,11 @@ def make_kernel(
         kept: Numbers that a lane keeps for each step of an interval; None for a kernel that only goes forward.
     """
     threads, lanes = lanes_of_block(group)
-    lines, own = "\n".join(shared), "\n".join(code)
+    lines, body = "\n".join(shared), "\n".join(code)
     if target == "cuda":
-        frame = _cuda(pointers, lines, own, kept is not None)
+        frame = _cuda(pointers, lines, body, kept is not None)
     else:
-        frame = _host(pointers, lines, own, in_memory, kept is not None)
+        frame = _host(pointers, lines, body, in_memory, kept is not None)
     widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {group}\n" + BLOCK_THREADS.format(threads)
     defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
@@ -144,9 +141,9 @@ def _cuda(pointers: Sequence[str], shared: str, body: str, keeps: bool) -> str:
     """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])
-    interval, each = "", "const int first = blockIdx.x * BLOCK_LANES;"
+    interval, loop = "", "const int first = blockIdx.x * BLOCK_LANES;"
     if keeps:
-        each = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
+        loop = "for (int first = blockIdx.x * BLOCK_LANES; first < n_lanes; first += gridDim.x * BLOCK_LANES)"
         interval = ", interval = count[1]"
     return f"""
 extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {ANY_NUMBER_OF_BLOCKS}) advance({arguments}) {{
@@ -154,7 +151,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_THREADS, {ANY_NUMBER_OF_BLOCK
   const int nothing = n_steps >> 31;
   const int thread = threadIdx.x % THREADS, place = threadIdx.x / THREADS * LANES + thread;
 {shared}
-  {each} {{
+  {loop} {{
   const int wanted = first + place;
   const bool active = thread < LANES && wanted < n_lanes;
   const int lane = wanted < n_lanes ? wanted : n_lanes - 1;

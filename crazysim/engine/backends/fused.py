@@ -1,6 +1,6 @@
 """Fused: one kernel for all steps, in which a drone's numbers stay in registers.
 
-A call of a kernel is a primitive of its own, which becomes the kernel of the platform that JAX lowers it for.
+A call of a kernel is a JAX primitive, which JAX lowers to the kernel of its platform.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class Kernels:
         """
         self.program = program
         self.inputs, self.outputs = kernel.needed_leaves(program), tuple(program.written)
-        self._launches = {location.platform: self._compiled(location)}
+        self._launches = {location.platform: self._compile(location)}
 
     def on(self, platform: str) -> Launch:
         """Return the function that calls the kernel of a platform."""
         if platform not in self._launches:
             try:
-                self._launches[platform] = self._compiled(Location(platform))
+                self._launches[platform] = self._compile(Location(platform))
             except UnsupportedError as error:
                 raise ConfigError(
                     f"expected a kernel for the {platform.upper()}, which JAX compiles this step for, got none: "
@@ -58,7 +58,7 @@ class Kernels:
                 ) from error
         return self._launches[platform]
 
-    def _compiled(self, location: Location) -> Launch:
+    def _compile(self, location: Location) -> Launch:
         return compile_kernel(kernel.write(self.program, TARGETS[location.platform]), location)
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
@@ -131,7 +131,7 @@ def build(program: Program, location: Location, in_leaves: Program | None = None
     run = _split(program, location) if kernels is None else _one_kernel(kernels)
     if in_leaves is not None:
         return FusedRun(
-            make_differentiable(_over_batches(program, run), _on_leaves(program, in_leaves, location)), kernels
+            make_differentiable(_over_batches(program, run), _run_without_rows(program, in_leaves, location)), kernels
         )
     on_lanes = lanes.build(program, location)
     derivatives = DERIVATIVE_KERNELS[program] = DerivativeKernels(program, location, on_lanes)
@@ -159,9 +159,9 @@ def _over_batches(program: Program, run: CountedRun) -> CountedRun:
 
     def batched(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         of_leaves, of_count = in_batched
-        own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
+        is_own = [leaf.scope in ("drone", "world") for leaf in program.leaves]
         out_batched = ([True] * len(program.written), True)
-        if of_count or not program.fused or any(b and not o for b, o in zip(of_leaves, own, strict=True)):
+        if of_count or not program.fused or any(b and not o for b, o in zip(of_leaves, is_own, strict=True)):
             # Shared parameters that differ between batches: one batch after the other.
             full = [x if b or x is None else jnp.broadcast_to(x, (size, *x.shape))
                     for x, b in zip(leaves, of_leaves, strict=True)]  # fmt: skip
@@ -178,11 +178,11 @@ def _over_batches(program: Program, run: CountedRun) -> CountedRun:
             return x.reshape(size, -1, *x.shape[1:])
 
         rows = [i in program.rows for i in range(len(leaves))]
-        joined = [
+        merged = [
             join(x, b, in_rows) if o and x is not None else x
-            for x, b, o, in_rows in zip(leaves, of_leaves, own, rows, strict=True)
+            for x, b, o, in_rows in zip(leaves, of_leaves, is_own, rows, strict=True)
         ]
-        written, flagged = run(joined, count)
+        written, flagged = run(merged, count)
         return (
             [part(x, rows[i]) for i, x in zip(program.written, written, strict=True)],
             part(flagged, False),
@@ -191,19 +191,19 @@ def _over_batches(program: Program, run: CountedRun) -> CountedRun:
     return jaxcompat.batched_rule(run, batched)
 
 
-def _on_leaves(program: Program, in_leaves: Program, location: Location) -> Run:
+def _run_without_rows(program: Program, in_leaves: Program, location: Location) -> Run:
     """Return the run of a program with rows by the same program without, which is compiled when it is called."""
     built: list[Run] = []
 
     def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         built[:] = built or [build(in_leaves, location)]
-        every, given = packed_rows(program), list(leaves)
-        for rows in every:
+        row_leaves, unpacked = packed_rows(program), list(leaves)
+        for rows in row_leaves:
             for i in rows.members:
-                given[i] = rows.unpack(leaves[rows.leaf], i)
-        out, flagged = built[0](given[: len(in_leaves.leaves)], n_steps)
-        after = replace_leaves(given, in_leaves.written, out)
-        after = replace_leaves(after, [rows.leaf for rows in every], [rows.pack(after) for rows in every])
+                unpacked[i] = rows.unpack(leaves[rows.leaf], i)
+        out, flagged = built[0](unpacked[: len(in_leaves.leaves)], n_steps)
+        after = replace_leaves(unpacked, in_leaves.written, out)
+        after = replace_leaves(after, [rows.leaf for rows in row_leaves], [rows.pack(after) for rows in row_leaves])
         return [after[i] for i in program.written], flagged
 
     return run
@@ -259,7 +259,7 @@ def _call(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any],
     """Return the outputs of a kernel: leaves, and the worlds that are flagged."""
     program = kernels.program
     n_worlds, n_drones = lanes.batch_counts(program, leaves)
-    inputs = [_as_numbers(leaves[i]) for i in kernels.inputs]
+    inputs = [_key_numbers(leaves[i]) for i in kernels.inputs]
     out = launch_p.bind(count.reshape(1), *inputs, kernels=kernels, n_worlds=n_worlds)
     written = [
         jax.random.wrap_key_data(x) if jaxcompat.is_key(program.leaves[i]) else x
@@ -270,6 +270,6 @@ def _call(kernels: Kernels, leaves: list[Any], count: Array) -> tuple[list[Any],
     return written, out[-1] if n_drones == 1 else jnp.any(out[-1], axis=1, keepdims=True)
 
 
-def _as_numbers(x: Any) -> Array:
+def _key_numbers(x: Any) -> Array:
     """Return an array of numbers; random keys as their 32-bit integers."""
     return jax.random.key_data(x) if jaxcompat.is_key(x) else x

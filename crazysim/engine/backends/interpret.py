@@ -57,9 +57,9 @@ def run(
         constants: list[Any] = []
         _PREPARED_BLOCKS[block] = _prepare(block, indices, constants), constants
     prepared, constants = _PREPARED_BLOCKS[block]
-    given = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
+    arrays = [np.asarray(x, v.dtype) for x, v in zip(inputs, block.inputs, strict=True)]
     with np.errstate(all="ignore"):
-        out = prepared.run(constants.copy(), given, shape, observe)
+        out = prepared.run(constants.copy(), arrays, shape, observe)
     return [_broadcast(x, shape) for x in out]
 
 
@@ -94,25 +94,25 @@ class _Prepared(NamedTuple):
     outputs: list[int]
     """Indices of the outputs."""
 
-    def run(self, values: list[Any], given: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
+    def run(self, values: list[Any], inputs: Sequence[Any], shape: tuple[int, ...], observe: Observer | None) -> list:
         """Return the outputs for some inputs.
 
         Args:
             values: Constants and values of the blocks around it, by their indices. Values of this block are added: of
                 the lanes' shape, or scalars, or tables.
-            given: Its inputs.
+            inputs: Its inputs.
             shape: Shape of the lanes.
             observe: Gets every operation with its results.
         """
-        for i, x in zip(self.inputs, given, strict=True):
+        for i, x in zip(self.inputs, inputs, strict=True):
             values[i] = x
         for op, fn, args, results, dtype, blocks in self.calls:
             if fn is not None:
                 x = fn(*[values[k] for k in args])
                 values[results[0]] = x if x.dtype == dtype else np.asarray(x).astype(dtype)
             else:
-                runs = [lambda given, block=block: block.run(values, given, shape, observe) for block in blocks]
-                for i, x in zip(results, _structured(op, [values[k] for k in args], shape, runs), strict=True):
+                runs = [lambda inputs, block=block: block.run(values, inputs, shape, observe) for block in blocks]
+                for i, x in zip(results, _run_structured(op, [values[k] for k in args], shape, runs), strict=True):
                     values[i] = x
             if observe is not None:
                 observe(op, [values[k] for k in results])
@@ -162,7 +162,7 @@ def _numpy(op: Operation) -> Callable[..., Any] | None:
     return functools.partial(row.numpy, **params) if params else row.numpy
 
 
-def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
+def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Sequence[_Run]) -> list[Any]:
     """Return the results of an operation that runs blocks, looks something up, or has several results.
 
     Args:
@@ -200,24 +200,24 @@ def _structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs: Se
         case "threefry2x32":
             return list(threefry2x32(*args))
     raise RuntimeError(
-        f"expected a structured operation that is interpreted, got {op.name!r}; add a case to _structured"
+        f"expected a structured operation that is interpreted, got {op.name!r}; add a case to _run_structured"
     )
 
 
 def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _Run) -> list[np.ndarray]:
     """Combine the results of a block for each drone of the world, one after the other."""
     n = op.param("n_members")
-    own = np.arange(shape[0]) % n
+    member = np.arange(shape[0]) % n
     combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
-    found = [
+    reduced = [
         np.full(shape, ops.neutral_number(name, x.dtype))
         for name, x in zip(op.param("reduce"), op.results, strict=True)
     ]
     for j in range(n):
         other = [np.repeat(np.broadcast_to(x, shape).reshape(-1, n)[:, j], n) for x in args]
-        new = run([*other, own == j])
-        found = [fn(x, y) for fn, x, y in zip(combine, found, new, strict=True)]
-    return found
+        new = run([*other, member == j])
+        reduced = [fn(x, y) for fn, x, y in zip(combine, reduced, new, strict=True)]
+    return reduced
 
 
 THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -241,10 +241,10 @@ def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Ar
     """Return what ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
     results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
 
-    def of_arrays(*inputs: Any) -> list[np.ndarray]:
+    def run_arrays(*inputs: Any) -> list[np.ndarray]:
         return [np.array(x) for x in run(block, [np.asarray(x) for x in inputs], shape)]
 
-    return list(jax.pure_callback(of_arrays, results, *inputs, vmap_method="sequential"))
+    return list(jax.pure_callback(run_arrays, results, *inputs, vmap_method="sequential"))
 
 
 def build(program: Program, location: Location) -> Run:
@@ -266,20 +266,20 @@ def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: boo
     if not program.fused:
         return lanes.steps(program, leaves, n_steps, call)
     n_worlds, _ = lanes.batch_counts(program, leaves)
-    given = [i for i, x in enumerate(leaves) if x is not None]
+    present = [i for i, x in enumerate(leaves) if x is not None]
     written = [lanes.shape_of(program, i, n_worlds) for i in program.written]
     flagged = jax.ShapeDtypeStruct((n_worlds, 1), np.bool_)
 
-    def of_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
-        arrays = replace_leaves([None] * len(leaves), given, [np.asarray(x) for x in values])
+    def run_arrays(n_steps: Any, *values: Any) -> tuple[list[np.ndarray], Any]:
+        arrays = replace_leaves([None] * len(leaves), present, [np.asarray(x) for x in values])
         with flush_subnormals() if on_cpu else contextlib.nullcontext():
             return _steps(program, arrays, int(n_steps))
 
-    values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in given]
+    values = [jax.random.key_data(leaves[i]) if is_key(leaves[i]) else leaves[i] for i in present]
     if any(isinstance(x, jax.core.Tracer) for x in (n_steps, *values)):
-        out, flags = jax.pure_callback(of_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
+        out, flags = jax.pure_callback(run_arrays, (written, flagged), n_steps, *values, vmap_method="sequential")
     else:
-        out, flags = of_arrays(n_steps, *values)
+        out, flags = run_arrays(n_steps, *values)
     keys = [is_key(program.leaves[i]) for i in program.written]
     return [jax.random.wrap_key_data(jnp.asarray(x)) if key else x for x, key in zip(out, keys, strict=True)], flags
 

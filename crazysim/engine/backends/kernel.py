@@ -51,7 +51,7 @@ class Body:
         self.exchange = exchange_for(target, program.group)
         self.writer = Writer(self.exchange)
         self.each = [s for s in program.fused_segments if s.phase == "each"]
-        self.stored = _stored(program)
+        self.stored = _written_slots(program)
         self._depth = 1 + self.exchange.depth
         self.names: dict[Slot, str] = {}
         """Expression of each number."""
@@ -69,8 +69,8 @@ class Body:
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()
         at_use = registers is not None and len(slots) > registers
-        loaded, rank = _loaded(program), program.ranks
-        deferred = set() if exchange.depth else _deferred(program)
+        loaded, rank = _loaded_slots(program), program.ranks
+        deferred = set() if exchange.depth else _deferred_slots(program)
         names.update({(leaf, k): f"x{rank[leaf]}_{k}" for leaf, k in slots})
         shared = [slot for slot in slots if program.leaves[slot[0]].scope not in ("drone", "world")]
         for slot in shared:
@@ -82,8 +82,8 @@ class Body:
                 names[slot] = f"SHARED(p{rank[slot[0]]}, {slot[1]})" if at_use else _load(program, slot)
         self._n_shared = len(writer.lines)
         exchange.open_loop(writer, 1)
-        own = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
-        for i in dict.fromkeys(i for i, _ in own if i not in program.rows):
+        per_lane = [slot for slot in slots if slot not in shared and (slot not in written or slot in loaded)]
+        for i in dict.fromkeys(i for i, _ in per_lane if i not in program.rows):
             size, drones = program.leaves[i].size, _drones(program, i)
             writer.line(rows(f"p{rank[i]}", _type(program, i), size, drones), self._depth)
         for slot in slots:
@@ -99,7 +99,7 @@ class Body:
             else:
                 names[slot] = exchange.keep(writer, names[slot], kind, access, self._depth)
         self._write_phase("before")
-        hoisted = [self._hoisted(segment) for segment in self.each]
+        hoisted = [self._write_hoisted(segment) for segment in self.each]
         exchange.close_loop(writer, 1)
         return hoisted
 
@@ -164,7 +164,7 @@ class Body:
         checked = program.check.reads if program.check else ()
         return written, dict.fromkeys([*read, *written, *checked, *self.stored])
 
-    def _hoisted(self, segment: Segment) -> list[str]:
+    def _write_hoisted(self, segment: Segment) -> list[str]:
         """Write the hoisted block of a segment, and return the names of the results."""
         writer, keep = self.writer, self.exchange.keep
         outs = writer.block(segment.hoisted, [self.names[slot] for slot in segment.hoisted_reads], self._depth)
@@ -190,15 +190,15 @@ def require_source(program: Program) -> None:
 
 def needed_leaves(program: Program) -> tuple[int, ...]:
     """Return the leaves that a kernel reads."""
-    return tuple(sorted({leaf for leaf, _ in _loaded(program)}))
+    return tuple(sorted({leaf for leaf, _ in _loaded_slots(program)}))
 
 
-def _stored(program: Program) -> list[Slot]:
-    """Return the numbers that a kernel writes: all of a leaf of which some are written."""
+def _written_slots(program: Program) -> list[Slot]:
+    """Return the numbers that a kernel writes: all numbers of each leaf that it writes to."""
     return [(leaf, k) for leaf in program.written for k in range(program.leaves[leaf].size)]
 
 
-def _loaded(program: Program) -> set[Slot]:
+def _loaded_slots(program: Program) -> set[Slot]:
     """Return the slots whose numbers at the beginning matter: they are used before they are written for certain."""
     loaded: set[Slot] = set()
     known: set[Slot] = set()
@@ -222,7 +222,7 @@ def _loaded(program: Program) -> set[Slot]:
         use(program.check.reads)
     for segment in program.phase_segments("after"):
         run(segment)
-    use(_stored(program))
+    use(_written_slots(program))
     return loaded
 
 
@@ -255,13 +255,13 @@ def write_segment(
     ):
         kind, name = _type(program, leaf), names[slot]
         if segment.scope == "world" and program.leaves[leaf].scope == "drone":  # every lane computes all of them
-            mine = f"eq_(own, i32({number // program.leaves[leaf].size}))"
-            writer.line(f"{name} = select_n_({mine}, {name}, {kind}_lanes({new}));", depth)
+            is_own_drone = f"eq_(own, i32({number // program.leaves[leaf].size}))"
+            writer.line(f"{name} = select_n_({is_own_drone}, {name}, {kind}_lanes({new}));", depth)
         else:
             writer.line(f"{name} = {kind}_lanes({new});", depth)
 
 
-def _deferred(program: Program) -> set[Slot]:
+def _deferred_slots(program: Program) -> set[Slot]:
     """Return the numbers that only stages below the step rate use, or only the check behind the loop.
 
     If none changes them, they are loaded there, and take no register in between.
@@ -270,11 +270,11 @@ def _deferred(program: Program) -> set[Slot]:
     at_each_step: set[Slot] = set()
     for segment in program.fused_segments:
         block = segment.block
-        now = {x for op in block.operations for x in op.args} | set(block.outputs)
-        now = now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
+        used_now = {x for op in block.operations for x in op.args} | set(block.outputs)
+        used_now = used_now.union(*(x.uses() for op in block.operations if op.name == "over_others" for x in op.blocks))
         at_each_step.update(segment.hoisted_reads)
         for x, slot in zip(block.inputs, program.per_drone(segment, segment.reads), strict=False):
-            (at_each_step if segment.scope == "world" or x in now else below_rate).add(slot)
+            (at_each_step if segment.scope == "world" or x in used_now else below_rate).add(slot)
     in_check = set(program.check.reads) if program.check is not None else set()
     return (below_rate ^ in_check) - at_each_step
 

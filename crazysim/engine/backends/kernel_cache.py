@@ -49,9 +49,9 @@ def digest(*parts: str | bytes) -> str:
 
 def folder() -> Path:
     """Return the folder of compiled kernels: in the folder of compiled programs, or one of this process alone."""
-    kept = cache.folder()
-    if kept is not None:
-        shared = kept / "crazysim"
+    programs = cache.folder()
+    if programs is not None:
+        shared = programs / "crazysim"
         with contextlib.suppress(OSError):
             make_private(shared)
         if shared.is_dir():

@@ -78,10 +78,10 @@ class LeafValues:
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.vectors[leaf, k] for k in range(example.size)]
-            self.arrays[leaf] = self.library.stack(items) if example.rows_of else self._stacked(leaf, items)
+            self.arrays[leaf] = self.library.stack(items) if example.rows_of else self._stack(leaf, items)
         return self.arrays[leaf]
 
-    def _stacked(self, leaf: int, items: list[Any]) -> Any:
+    def _stack(self, leaf: int, items: list[Any]) -> Any:
         example, key = self.program.leaves[leaf], is_key(self.program.leaves[leaf])
         shape = (*example.shape[2:], 2) if key else example.shape[2:]
         array = self.library.stack(items, axis=-1).reshape(self.n_worlds, self.n_drones, *shape)
@@ -216,9 +216,9 @@ def steps(
     """
     start = LeafValues(program, leaves, execute)
     constants = prepare(program, start)
-    each = program.phase_segments("each")
-    by_array = sorted({i for s in each if isinstance(s, UnfusedStage) for i in s.written})
-    fused = [s for s in each if isinstance(s, Segment)]
+    segments = program.phase_segments("each")
+    by_array = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written})
+    fused = [s for s in segments if isinstance(s, Segment)]
     by_slot = sorted({slot for s in fused for slot in program.per_drone(s, s.writes) if slot[0] not in by_array})
 
     def turn(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:

@@ -158,13 +158,13 @@ def _words(variable: str) -> list[str]:
 
 def time_limit() -> float:
     """Return the time that the compiler may take, s."""
-    given = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", COMPILE_TIMEOUT)
+    text = os.environ.get("CRAZYSIM_COMPILE_TIMEOUT", COMPILE_TIMEOUT)
     try:
-        seconds = float(given)
+        seconds = float(text)
     except ValueError:
         seconds = math.nan
     if not 0 < seconds < math.inf:
-        raise ConfigError(f"expected seconds in CRAZYSIM_COMPILE_TIMEOUT, got {given!r}; set a number above 0")
+        raise ConfigError(f"expected seconds in CRAZYSIM_COMPILE_TIMEOUT, got {text!r}; set a number above 0")
     return seconds
 
 
@@ -214,13 +214,13 @@ def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
     """Return a kernel's library: from the cache, or compiled."""
     cache_folder = kernel_cache.folder()
     for path in kernel_cache.find(cache_folder, key):
-        library = _loaded(path)
+        library = _load_library(path)
         if library is not None:
             return library
     made, lost = _compile(words, source), None
     for where in dict.fromkeys((cache_folder, kernel_cache.temporary())):  # code in the first may not be executable
         try:
-            library = _loaded(kernel_cache.store(where, key, made, ".so"))
+            library = _load_library(kernel_cache.store(where, key, made, ".so"))
         except OSError as error:
             lost = f"the kernel that {words[0]} compiled cannot be written: {error}; make room, or set TMPDIR"
             continue
@@ -231,7 +231,7 @@ def _library(words: Sequence[str], key: str, source: str) -> ctypes.CDLL:
     )
 
 
-def _loaded(path: Path) -> ctypes.CDLL | None:
+def _load_library(path: Path) -> ctypes.CDLL | None:
     """Return a library, or None if it cannot be loaded or holds no kernel."""
     try:
         library = ctypes.CDLL(str(path))
@@ -251,14 +251,14 @@ def _compile(words: Sequence[str], source: str) -> bytes:
             f"what is unrolled, or set CRAZYSIM_COMPILE_TIMEOUT to a larger number of seconds"
         )
     with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as name:
-        work, made = Path(name), Path(name) / "kernel.so"
+        work, library = Path(name), Path(name) / "kernel.so"
         try:
             (work / "kernel.cpp").write_text(source)
-            done = _run([*words, str(work / "kernel.cpp"), "-o", str(made)], work, seconds)
+            done = _run([*words, str(work / "kernel.cpp"), "-o", str(library)], work, seconds)
             if done.returncode:
                 _check_settings(work)
                 raise KernelError(f"{words[0]} refused the kernel: {done.stderr.strip()[:2000]}")
-            return made.read_bytes()
+            return library.read_bytes()
         except OSError as error:
             raise KernelError(f"{words[0]} left no library: {error}") from error
 

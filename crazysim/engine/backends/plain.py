@@ -46,7 +46,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
 
     jaxprs = {phase: jax.make_jaxpr(single, static_argnums=1)(jax.tree.leaves(data), phase) for phase in PHASES}
     run = {phase: jaxcompat.jaxpr_as_fun(jaxpr) for phase, jaxpr in jaxprs.items()}  # the stages are traced once
-    written = {phase: _changed(jaxpr) for phase, jaxpr in jaxprs.items()}
+    written = {phase: _changed_leaves(jaxpr) for phase, jaxpr in jaxprs.items()}
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
         leaves = run["before"](*leaves)
@@ -64,14 +64,14 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
         leaves = replace_leaves(leaves, in_loop, out)
         flagged = nonfinite_worlds(axes.treedef.unflatten(leaves))
         leaves = run["after"](*leaves)
-        return [leaves[i] for i in every], flagged
+        return [leaves[i] for i in written_leaves], flagged
 
     scratch = {i for i, x in enumerate(jax.tree.leaves(leaf_flags(data, "scratch"))) if x}
-    every = sorted({i for some in written.values() for i in some} - scratch)
-    return steps, every
+    written_leaves = sorted({i for leaves_of_phase in written.values() for i in leaves_of_phase} - scratch)
+    return steps, written_leaves
 
 
-def _changed(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
+def _changed_leaves(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
     """Return the numbers of the leaves that a function of leaves does not return as they are."""
     pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
     return [i for i, (before, after) in enumerate(pairs) if before is not after]

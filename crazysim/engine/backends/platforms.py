@@ -32,7 +32,7 @@ def describe_kernel(kernel: Kernel, platform: str, devices: Sequence[jax.Device]
     device = cuda.weakest_device(devices)
     if device is None:
         return f"compiled for {cuda.DEFAULT_ARCHITECTURE}; this machine has no GPU"
-    few = cuda.fit_registers(kernel, device)
-    many, used = cuda.widen_blocks(few, device), cuda.resources(few, device)
-    wide = f", {many.threads} from {cuda.RESIDENT_LANES:,} drones on" if many is not few else ""
-    return f"{few.threads} threads a block{wide}, {used.registers} registers, {used.spilled} bytes spilled"
+    small = cuda.fit_registers(kernel, device)
+    large, used = cuda.widen_blocks(small, device), cuda.resources(small, device)
+    wide = f", {large.threads} from {cuda.RESIDENT_LANES:,} drones on" if large is not small else ""
+    return f"{small.threads} threads a block{wide}, {used.registers} registers, {used.spilled} bytes spilled"

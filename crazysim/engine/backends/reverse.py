@@ -51,8 +51,8 @@ class ReverseProgram:
 
     def slots(self) -> list[Slot]:
         """Return the slots of all cotangents."""
-        own = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
-        ct_slots = {(self.n_leaves + i, k) for i, k in own}
+        numbers = [(i, k) for i in {*self.seeds, *self.perturbed} for k in range(self.program.leaves[i].size)]
+        ct_slots = {(self.n_leaves + i, k) for i, k in numbers}
         for s in (*self.back.values(), *self.back_hoisted.values()):
             slots = self.program.per_drone(s, [*s.reads, *s.writes])
             ct_slots.update(slot for slot in slots if slot[0] >= self.n_leaves)
@@ -72,24 +72,26 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     program, perturbed = without_check(program, perturbed)
     n = len(program.leaves)
     cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number) for x in program.leaves]
-    each = [s for s in program.fused_segments if s.phase == "each"]
+    step_segments = [s for s in program.fused_segments if s.phase == "each"]
     hoisted = [
         Leaf("cotangents of hoisted numbers", "drone", (1, 1, len(s.hoisted.outputs)), _float_of(s.hoisted))
-        for s in each
+        for s in step_segments
     ]
     extended = dataclasses.replace(program, leaves=(*program.leaves, *cotangents, *hoisted))
-    found, constants = changed_slots(program, perturbed)
+    changed, constants = changed_slots(program, perturbed)
     back = {}
     for s in program.fused_segments:
-        where = 2 * n + each.index(s) if s in each else -1
-        back[s] = _back(extended, n, s, found, constants.get(s, ()), where)
-    back_hoisted = {s: _back_hoisted(n, s, found, constants[s], 2 * n + k) for k, s in enumerate(each) if constants[s]}
-    read = {slot for s in each for slot in program.per_drone(s, [*s.reads, *s.writes])}
+        where = 2 * n + step_segments.index(s) if s in step_segments else -1
+        back[s] = _back(extended, n, s, changed, constants.get(s, ()), where)
+    back_hoisted = {
+        s: _back_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
+    }
+    read = {slot for s in step_segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
     changing = program.changing()
-    if len(each) == 1 and each[0].scope == "drone":
-        read = set(each[0].reads)
+    if len(step_segments) == 1 and step_segments[0].scope == "drone":
+        read = set(step_segments[0].reads)
     carried = tuple(sorted(read & changing))
-    used = {slot for s in (*(back[s] for s in each), *each[:-1]) for slot in _used_slots(extended, s)}
+    used = {slot for s in (*(back[s] for s in step_segments), *step_segments[:-1]) for slot in _used_slots(extended, s)}
     return ReverseProgram(extended, n, perturbed, back, back_hoisted, carried, frozenset(used.intersection(carried)))
 
 
@@ -104,7 +106,7 @@ def _float_of(block: Block) -> np.dtype:
     return next((x.dtype for x in block.outputs if x.dtype.kind == "f"), np.dtype(np.float32))
 
 
-def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:
+def _back(program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], where: int) -> Segment:
     """Return the segment that replaces the cotangents after a segment by the cotangents before it.
 
     In a segment of worlds, each drone has a copy of what belongs to the world, and a cotangent for it; the sum of all
@@ -113,7 +115,7 @@ def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Seq
     n_drones, of_world = program.n_drones, s.scope == "world"
     reads = program.per_drone(s, s.reads)
     wanted = [k for k, (x, slot) in enumerate(zip(s.block.inputs, reads, strict=False))
-              if slot in found and x.dtype.kind == "f" and not x.size]  # fmt: skip
+              if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
     wanted_constants = [len(reads) + k for k in constants]
     outs = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
     pull = transpose_block(s.block, [s.block.inputs[k] for k in (*wanted, *wanted_constants)])
@@ -155,16 +157,16 @@ def _back(program: Program, n: int, s: Segment, found: set[Slot], constants: Seq
     for k, part in zip(constants, parts[len(wanted) :], strict=True):
         ct_slot, dtype = (where, k), s.block.inputs[len(reads) + k].dtype
         now[ct_slot] = builder.add("add", (read(ct_slot, dtype), part), dtype)
-    own, fixed = primal[: len(reads)], primal[len(reads) : n_inputs]
-    block = Block((*own, *before.values(), *fixed), tuple(builder.operations), tuple(now.values()))
+    first_inputs, fixed = primal[: len(reads)], primal[len(reads) : n_inputs]
+    block = Block((*first_inputs, *before.values(), *fixed), tuple(builder.operations), tuple(now.values()))
     return Segment(s.scope, s.stages, s.phase, block, (*s.reads, *before), tuple(now))
 
 
-def _back_hoisted(n: int, s: Segment, found: set[Slot], constants: Sequence[int], where: int) -> Segment:
+def _back_hoisted(n: int, s: Segment, changed: set[Slot], constants: Sequence[int], where: int) -> Segment:
     """Return the segment that passes the cotangents of hoisted numbers to the inputs of the hoisted block."""
     reads = s.hoisted_reads
     wanted = [k for k, (x, slot) in enumerate(zip(s.hoisted.inputs, reads, strict=True))
-              if slot in found and x.dtype.kind == "f"]  # fmt: skip
+              if slot in changed and x.dtype.kind == "f"]  # fmt: skip
     pull = transpose_block(s.hoisted, [s.hoisted.inputs[k] for k in wanted])
     builder = Builder(stage=f"gradient of {', '.join(s.stages)}")
     primal = [builder.input(x.dtype, x.size) for x in s.hoisted.inputs]
@@ -236,7 +238,7 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
             if slot in slots:
                 writer.line(f"KEEP({t}, {state}, {k}, {names[slot]})", depth)
 
-    last, each, first = (program.phase_segments(phase) for phase in ("after", "each", "before"))
+    last, step_segments, first = (program.phase_segments(phase) for phase in ("after", "each", "before"))
     writer.line("const int n_intervals = n_steps > 0 ? (n_steps + interval - 1) / interval : 1;", 1)
     writer.line("for (int turn = 0; turn < 2 * n_intervals - 1; ++turn) {", 1)
     writer.line("const bool back = turn >= n_intervals - 1;", 2)
@@ -249,7 +251,7 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
     keep("step", reverse.read_back, 3)
     if not last:  # nothing needs what comes after the last step
         writer.line("if (back && step == n_here - 1) break;", 3)
-    for segment, fixed in zip(each, constants, strict=True):
+    for segment, fixed in zip(step_segments, constants, strict=True):
         kernel.write_segment(writer, program, segment, names, fixed, 3)
     writer.line("}", 2)
     writer.line("if (!back) continue;", 2)
@@ -258,19 +260,19 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         _write_back(body, reverse, last, [()] * len(last), dict(names), 3)
         writer.line("}", 2)
     writer.line("for (int step = n_here - 1; step >= 0; --step) {", 2)
-    here = dict(names)
+    names_before = dict(names)
     for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
         if slot not in reverse.read_back:
             continue
-        here[slot] = writer.new("b")
-        writer.line(f"const auto {here[slot]} = KEPT({t}, step, {k});", 3)
-    _write_back(body, reverse, each, constants, here, 3)
+        names_before[slot] = writer.new("b")
+        writer.line(f"const auto {names_before[slot]} = KEPT({t}, step, {k});", 3)
+    _write_back(body, reverse, step_segments, constants, names_before, 3)
     writer.line("}", 2)
     writer.line("const int before = interval + (part > 0 ? part - 1 : 0);", 2)
     for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
         writer.line(f"{names[slot]} = KEPT({t}, before, {k});", 2)
     writer.line("}", 1)
-    for s in each:
+    for s in step_segments:
         if s in reverse.back_hoisted:
             kernel.write_segment(writer, program, reverse.back_hoisted[s], names, (), 1)
     if first:
@@ -284,7 +286,7 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         pointers.append(f"{number}* __restrict__ {pointer}")
         values = [names[n + i, k] for k in range(program.leaves[i].size)]
         kernel.write_results(writer, pointer, number, 1, values, 1)
-    blocks = [*(s.block for s in each for _ in range(2)), *(reverse.back[s].block for s in each)]
+    blocks = [*(s.block for s in step_segments for _ in range(2)), *(reverse.back[s].block for s in step_segments)]
     return body.kernel(pointers, needed_leaves(reverse), (), (), blocks, len(carried))
 
 
@@ -316,5 +318,5 @@ def _write_back(
                 writer.line(f"auto {fresh} = {kind}_lanes({names[slot]});", depth)
                 names[slot] = fresh
             kernel.write_segment(writer, program, s, names, fixed, depth)
-    for s, fixed, here in reversed(list(zip(segments, constants, before, strict=True))):
-        kernel.write_segment(writer, program, reverse.back[s], here, fixed, depth)
+    for s, fixed, names_before in reversed(list(zip(segments, constants, before, strict=True))):
+        kernel.write_segment(writer, program, reverse.back[s], names_before, fixed, depth)

@@ -262,7 +262,7 @@ def _four_of(op: Operation) -> tuple[Element, Element, int]:
 
 
 def _fours(block: Block) -> list[tuple[Element, Element, int]]:
-    """Return the aligned groups of four entries in float32 of which a block reads at least three."""
+    """Return the aligned groups of four float32 entries from which a block reads at least three."""
     lookups = [op for op in block.operations if op.name == "lookup" and op.param("aligned") and op.dtype == np.float32]
     counts = collections.Counter(_four_of(op) for op in lookups if isinstance(op.args[1], Value))
     sizes = {_four_of(op): op.args[0].size for op in lookups}

@@ -31,21 +31,21 @@ def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
 def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
     """Return for each number that a loop carries whether all lanes share it, from its first turn to its last."""
     *tests, body = op.blocks
-    found = [is_shared(x, shared) for x in op.args]
+    is_same = [is_shared(x, shared) for x in op.args]
     while True:
-        inside = _inside(body, found, shared)
-        after = [same and is_shared(x, inside) for same, x in zip(found, body.outputs, strict=True)]
+        inside = _inside(body, is_same, shared)
+        after = [same and is_shared(x, inside) for same, x in zip(is_same, body.outputs, strict=True)]
         for test in tests:  # where lanes stop at different turns, they share nothing that changes
-            if not all(is_shared(x, _inside(test, found, shared)) for x in test.outputs):
-                after = [False] * len(found)
-        if after == found:
-            return found
-        found = after
+            if not all(is_shared(x, _inside(test, is_same, shared)) for x in test.outputs):
+                after = [False] * len(is_same)
+        if after == is_same:
+            return is_same
+        is_same = after
 
 
 def _inside(block: Block, inputs: list[bool], shared: Set[Value]) -> set[Value]:
     """Return the values that lanes share at the end of a block, given which of its inputs they share."""
-    found = {*shared, *(x for x, same in zip(block.inputs, inputs, strict=True) if same)}
+    inside = {*shared, *(x for x, same in zip(block.inputs, inputs, strict=True) if same)}
     for op in block.operations:
-        found.update(shared_results(op, found))
-    return found
+        inside.update(shared_results(op, inside))
+    return inside

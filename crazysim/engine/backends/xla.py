@@ -145,37 +145,37 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
     (block,), n = op.blocks, op.param("n_members")
     n_worlds = shape[0] // n
     used = [v for v in block.uses() if v in env]
-    own = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
-    fixed = {v: env[v] for v in used if v not in own}
+    per_lane = {v: env[v] for v in used if not v.size and np.ndim(env[v])}
+    fixed = {v: env[v] for v in used if v not in per_lane}
     rows = [jnp.reshape(x, (n_worlds, n)) if np.ndim(x) else x for x in args]
     if n <= MAX_UNROLLED:
         number = lax.broadcasted_iota(np.int32, (n_worlds, n), 1)
-        mine = {v: jnp.reshape(x, (n_worlds, n)) for v, x in own.items()}
+        mine = {v: jnp.reshape(x, (n_worlds, n)) for v, x in per_lane.items()}
         turns = []
         for j in range(n):
             other = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
             turns.append(run(block, [*other, number == j], (n_worlds, n), fixed | mine))
         combine = [COMBINE[name] for name in op.param("reduce")]
-        found = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in some])
-                 for fn, some in zip(combine, zip(*turns, strict=True), strict=True)]  # fmt: skip
-        return [jnp.reshape(x, shape) for x in found]
-    columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in own.values()]  # (n, n_worlds, 1)
+        reduced = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in turn_results])
+                 for fn, turn_results in zip(combine, zip(*turns, strict=True), strict=True)]  # fmt: skip
+        return [jnp.reshape(x, shape) for x in reduced]
+    columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in per_lane.values()]  # (n, n_worlds, 1)
 
-    def of_one(xs: tuple[Array, list[Array]]) -> list[Array]:
-        i, some = xs
-        mine = dict(zip(own, some, strict=True))
-        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), fixed | mine)
+    def reduce_for_one(xs: tuple[Array, list[Array]]) -> list[Array]:
+        i, column = xs
+        own_values = dict(zip(per_lane, column, strict=True))
+        outs = run(block, [*rows, jnp.arange(n)[None] == i], (n_worlds, n), fixed | own_values)
         return [
             REDUCE[name](_lanes(x, (n_worlds, n)), axis=1) for name, x in zip(op.param("reduce"), outs, strict=True)
         ]
 
     numbers = jnp.arange(n)
     if n_worlds * n * n <= MAX_PAIRS:
-        found = jax.vmap(of_one)((numbers, columns))
+        reduced = jax.vmap(reduce_for_one)((numbers, columns))
     else:
         at_once = max(1, MAX_PAIRS // (n_worlds * n))
-        found = lax.map(jax.checkpoint(of_one), (numbers, columns), batch_size=at_once)
-    return [x.T.reshape(shape) for x in found]
+        reduced = lax.map(jax.checkpoint(reduce_for_one), (numbers, columns), batch_size=at_once)
+    return [x.T.reshape(shape) for x in reduced]
 
 
 COMBINE: dict[str, Callable[..., Array]] = {

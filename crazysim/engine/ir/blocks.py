@@ -1,6 +1,6 @@
 """The intermediate representation: a block of scalar operations in single-assignment form.
 
-The engine does not compile arrays. Every element of every small array is a value of its own, constants are folded,
+The engine does not compile arrays. Every element of every small array is a separate value, constants are folded,
 and a common subexpression is computed once. Blocks are immutable; a ``Builder`` makes one. What operations there are
 is in ``ops``.
 """
@@ -206,29 +206,29 @@ def prune(block: Block, keep_inputs: bool = True) -> Block:
 
 def _prune(block: Block, needed: set[Value]) -> Block:
     needed.update(x for x in block.outputs if isinstance(x, Value))
-    kept = []
+    operations = []
     for op in reversed(block.operations):
         if op.name == "barrier":
-            kept.append(op)
+            operations.append(op)
         elif not needed.isdisjoint(op.results):
             op = _drop_results(op, needed) if op.name == "when" else op
             needed.update(x for x in op.args if isinstance(x, Value))
             if op.blocks:
                 blocks = tuple([_prune(inner, needed) for inner in op.blocks])
-                kept.append(op._replace(blocks=blocks))
+                operations.append(op._replace(blocks=blocks))
             else:
-                kept.append(op)
-    return dataclasses.replace(block, operations=tuple(kept[::-1]))
+                operations.append(op)
+    return dataclasses.replace(block, operations=tuple(operations[::-1]))
 
 
 def _drop_results(op: Operation, needed: Collection[Value]) -> Operation:
     """Return a ``when`` without the results that are not needed."""
     (mask, *old), (block,) = op.args, op.blocks
-    kept = [k for k, x in enumerate(op.results) if x in needed]
-    if len(kept) == len(op.results):
+    used = [k for k, x in enumerate(op.results) if x in needed]
+    if len(used) == len(op.results):
         return op
-    inner = dataclasses.replace(block, outputs=tuple([block.outputs[k] for k in kept]))
-    args, results = (mask, *(old[k] for k in kept)), tuple([op.results[k] for k in kept])
+    inner = dataclasses.replace(block, outputs=tuple([block.outputs[k] for k in used]))
+    args, results = (mask, *(old[k] for k in used)), tuple([op.results[k] for k in used])
     return op._replace(args=args, results=results, blocks=(inner,))
 
 
@@ -257,11 +257,11 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
         values: Elements that stand for the block's inputs and for values around it. The block's own values are added.
     """
 
-    def mapped(x: Element) -> Element:
+    def replaced(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
     for op in block.operations:
-        args = [mapped(x) for x in op.args]
+        args = [replaced(x) for x in op.args]
         if op.name == "barrier":
             builder.barrier()
         elif len(op.results) == 1 and not op.blocks:
@@ -275,7 +275,7 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
             blocks = tuple([_inline_block(builder, inner, values) for inner in op.blocks])
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, blocks)
             values.update(zip(op.results, results, strict=True))
-    return [mapped(x) for x in block.outputs]
+    return [replaced(x) for x in block.outputs]
 
 
 def _inline_block(outer: Builder, block: Block, values: dict[Value, Element]) -> Block:

@@ -1,4 +1,4 @@
-"""Programs and blocks as text, for people."""
+"""Programs as text, for people."""
 
 from __future__ import annotations
 
@@ -24,26 +24,17 @@ def list_program(program: Program) -> str:
             lines += [f"{INDENT}reads {program.leaves[i].name}" for i in stage.used]
             lines += [f"{INDENT}writes {program.leaves[i].name}" for i in stage.written]
         else:
-            lines += _of_segment(program, cast(Segment, segment), _Names())
+            lines += _list_segment(program, cast(Segment, segment), _Names())
     if program.check is not None:
-        lines += ["", *_of_segment(program, program.check, _Names())]
+        lines += ["", *_list_segment(program, program.check, _Names())]
     return "\n".join(lines[1:]) + "\n"
-
-
-def list_block(block: Block) -> str:
-    """Return a block as text."""
-    names = _Names()
-    inputs = ", ".join(f"{names.new(x)}: {_type(x)}" for x in block.inputs)
-    lines = list(_of_operations(block, names, 1))
-    outputs = ", ".join(names.of(x) for x in block.outputs)
-    return "\n".join([f"block({inputs})", *lines, f"return {outputs}"]) + "\n"
 
 
 def list_operation(program: Program, operation: Operation) -> str:
     """Return the line that an operation has in the listing of a program."""
     for segment in program.fused_segments:
         names = _Names()
-        list(_of_segment(program, segment, names))
+        list(_list_segment(program, segment, names))
         if any(op is operation for op in segment.block.walk()):
             return f"{_line(operation, names)} of stage {operation.stage!r}"
     raise ValueError("expected an operation of the program, got one of another program")
@@ -67,19 +58,19 @@ def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
     return f"{program.leaves[i].name}[{k}]{drone}"
 
 
-def _of_segment(program: Program, segment: Segment, names: _Names) -> Iterator[str]:
+def _list_segment(program: Program, segment: Segment, names: _Names) -> Iterator[str]:
     when = {"before": "before the first step", "each": "at each step", "after": "after the last step"}[segment.phase]
     yield f"segment of one {segment.scope}, {when}: {', '.join(segment.stages)}"
     if segment.hoisted.outputs:
         yield f"{INDENT}hoisted, once before the first step:"
         for x, slot in zip(segment.hoisted.inputs, segment.hoisted_reads, strict=True):
             yield f"{INDENT * 2}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
-        yield from _of_operations(segment.hoisted, names, 2)
+        yield from _list_operations(segment.hoisted, names, 2)
         for x, y in zip(segment.block.inputs[len(segment.reads) :], segment.hoisted.outputs, strict=True):
             yield f"{INDENT * 2}{names.new(x)} = {names.of(y)}"
     for x, slot in zip(segment.block.inputs, segment.reads, strict=False):
         yield f"{INDENT}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
-    yield from _of_operations(segment.block, names, 1)
+    yield from _list_operations(segment.block, names, 1)
     if segment is program.check:
         yield f"{INDENT}flagged = {names.of(segment.block.outputs[0])}"
         return
@@ -108,7 +99,7 @@ def _constant(x: np.generic) -> str:
     return f"{x.item()!r}" if x.dtype.kind != "b" else str(bool(x)).lower()
 
 
-def _of_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
+def _list_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
     stage = ""
     for op in block.operations:
         if op.name == "barrier":
@@ -117,7 +108,7 @@ def _of_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
         if depth == 1 and op.stage != stage:
             stage = op.stage
             yield f"{INDENT * depth}# {stage}"
-        inner = [line for b in op.blocks for line in _of_inner(b, names, depth + 1)]
+        inner = [line for b in op.blocks for line in _list_inner(b, names, depth + 1)]
         yield f"{INDENT * depth}{_line(op, names)}" + (" {" if inner else "")
         yield from inner
         if inner:
@@ -130,8 +121,8 @@ def _line(op: Operation, names: _Names) -> str:
     return f"{results} = {op.name}({', '.join([*map(names.of, op.args), *params])})"
 
 
-def _of_inner(block: Block, names: _Names, depth: int) -> Iterator[str]:
+def _list_inner(block: Block, names: _Names, depth: int) -> Iterator[str]:
     if block.inputs:
         yield f"{INDENT * depth}block({', '.join(names.new(x) for x in block.inputs)})"
-    yield from _of_operations(block, names, depth)
+    yield from _list_operations(block, names, depth)
     yield f"{INDENT * depth}return {', '.join(names.of(x) for x in block.outputs)}"

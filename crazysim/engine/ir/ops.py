@@ -52,7 +52,7 @@ class OperationForm:
     cost: float = 1
     """Cost in multiply-adds."""
     structured: bool = False
-    """True where each target has code of its own for the operation, because it runs blocks or has several results."""
+    """True where each target implements the operation separately, because it runs blocks or has several results."""
 
     def accepts(self, dtypes: Sequence[np.dtype]) -> bool:
         """Return True where operands of these types fit."""

@@ -131,7 +131,7 @@ def _verify_types(op: Operation) -> None:
         case "loop" | "while":
             *test, body = op.blocks
             _require(len(test) == (op.name == "while"), text)
-            carried = [[x.dtype for x in some] for some in (body.inputs, body.outputs, *(t.inputs for t in test))]
+            carried = [[x.dtype for x in values] for values in (body.inputs, body.outputs, *(t.inputs for t in test))]
             _require(all(x == dtypes == results for x in carried), text)
             _require(all([x.dtype for x in t.outputs] == [np.dtype(bool)] for t in test), text)
         case "over_others":

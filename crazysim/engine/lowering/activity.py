@@ -22,20 +22,20 @@ def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program
     if program.rows:
         raise LimitError("rows of packed leaves have no gradient in a kernel")
     program = dataclasses.replace(program, check=None)
-    some = tuple(sorted(i for i in perturbed if program.leaves[i].number.kind == "f" and i in program.ranks))
-    if tables := program.tables.intersection(some):
+    floats = tuple(sorted(i for i in perturbed if program.leaves[i].number.kind == "f" and i in program.ranks))
+    if tables := program.tables.intersection(floats):
         names = ", ".join(program.leaves[i].name for i in sorted(tables))
         raise UnsupportedError(f"{names} is read as a table, which has no derivative in a kernel")
-    return program, some
+    return program, floats
 
 
 def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
     """Return the numbers that depend differentiably on the perturbed leaves, and such hoisted outputs by segment."""
-    found = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
+    changed = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     constants: dict[Segment, tuple[int, ...]] = {}
 
     def of(block: Block, slots: Sequence[Slot], more: Sequence[int] = ()) -> list[int]:
-        wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in found and x.dtype.kind == "f"]
+        wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in changed and x.dtype.kind == "f"]
         wanted += [block.inputs[len(slots) + k] for k in more]
         on_path = active_values(block, wanted)
         return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
@@ -43,48 +43,48 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     def run(s: Segment) -> None:
         written_slots = program.per_drone(s, s.writes)
         reads = program.per_drone(s, s.reads)
-        found.update(written_slots[k] for k in of(s.block, reads, constants.get(s, ())))
+        changed.update(written_slots[k] for k in of(s.block, reads, constants.get(s, ())))
 
     for s in program.phase_segments("before"):
         run(s)
     for s in program.phase_segments("each"):
         constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
     while True:  # a number that one step changes may change more in the next
-        before = len(found)
+        before = len(changed)
         for s in program.phase_segments("each"):
             run(s)
-        if len(found) == before:
+        if len(changed) == before:
             break
     for s in program.phase_segments("after"):
         run(s)
-    return found, constants
+    return changed, constants
 
 
 def active_values(block: Block, wanted: Collection[Value]) -> set[Value]:
     """Return the values of a block and of its inner blocks that depend differentiably on some of its inputs."""
-    found = set(wanted)
-    _propagate(block, found)
-    return found
+    active = set(wanted)
+    _propagate(block, active)
+    return active
 
 
-def _propagate(block: Block, found: set[Value]) -> None:
+def _propagate(block: Block, active: set[Value]) -> None:
     for op in block.operations:
         if op.name == "over_others":
             (body,) = op.blocks
-            found.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in found)
+            active.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in active)
         if op.name in ("loop", "while"):  # what changes in one turn may change all that the next one computes
-            changed = any(x in found for x in (*op.args, *op.blocks[-1].uses()))
-            if changed:
-                found.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
+            has_active = any(x in active for x in (*op.args, *op.blocks[-1].uses()))
+            if has_active:
+                active.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
         if op.name == "custom_jvp":
-            if any(isinstance(x, Value) and x in found for x in op.args):
-                found.update(x for x in op.results if x.dtype.kind == "f")
+            if any(isinstance(x, Value) and x in active for x in op.args):
+                active.update(x for x in op.results if x.dtype.kind == "f")
             continue
         for inner in op.blocks:
-            _propagate(inner, found)
+            _propagate(inner, active)
         sources = (*op.args, *(x for inner in op.blocks for x in inner.outputs))
-        if any(isinstance(x, Value) and x in found for x in sources):
-            found.update(x for x in op.results if x.dtype.kind == "f")
+        if any(isinstance(x, Value) and x in active for x in sources):
+            active.update(x for x in op.results if x.dtype.kind == "f")
 
 
 def apply_operation(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:

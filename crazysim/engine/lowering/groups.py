@@ -1,4 +1,4 @@
-"""Populations that do not depend on each other: stages in groups, each of which becomes a program of its own."""
+"""Groups of stages whose populations do not depend on each other. Each group becomes a program."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     clocks = _clocks(access, axes)
     members = {scope: x.shape[1] for scope, x in zip(axes.scopes, leaves, strict=True) if has_members(scope)}
     parts = _components([k for k in range(len(stages)) if k not in clocks], access)
-    parts = [(some, frozenset().union(*(access[k].populations for k in some))) for some in parts]
+    parts = [(indices, frozenset().union(*(access[k].populations for k in indices))) for indices in parts]
     parts.sort(key=lambda part: "drone" not in part[1])
     if not parts or "drone" not in parts[0][1]:
         parts.insert(0, (set(), frozenset({"drone"})))
-    parts = [(_with_clocks(some, clocks, access), populations) for some, populations in parts]
+    parts = [(_with_clocks(indices, clocks, access), populations) for indices, populations in parts]
     parts[0] = (parts[0][0] | clocks, parts[0][1])  # the drones' program is what it is without other populations
     groups, taken = [], frozenset()
-    for some, populations in parts:
-        written = frozenset().union(*(access[k].written for k in some))
+    for indices, populations in parts:
+        written = frozenset().union(*(access[k].written for k in indices))
         main = "drone" if "drone" in populations else max(sorted(populations), key=members.__getitem__)
-        groups.append(Group(main, tuple([stages[k] for k in sorted(some)]), written - taken))
+        groups.append(Group(main, tuple([stages[k] for k in sorted(indices)]), written - taken))
         taken |= written
     return groups
 
@@ -77,26 +77,26 @@ def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
 
 def _clocks(access: Sequence[_Access], axes: Axes) -> set[int]:
     """Return the stages that read and write leaves of worlds alone, which no other stage writes."""
-    found = {k for k, a in enumerate(access) if not any(has_members(axes.scopes[i]) for i in a.touched)}
+    clocks = {k for k, a in enumerate(access) if not any(has_members(axes.scopes[i]) for i in a.touched)}
     while True:
-        others = frozenset().union(*(a.written for k, a in enumerate(access) if k not in found))
-        depending = {k for k in found if access[k].touched & others}
+        others = frozenset().union(*(a.written for k, a in enumerate(access) if k not in clocks))
+        depending = {k for k in clocks if access[k].touched & others}
         if not depending:
-            return found
-        found -= depending
+            return clocks
+        clocks -= depending
 
 
-def _components(some: Iterable[int], access: Sequence[_Access]) -> list[set[int]]:
+def _components(stages: Iterable[int], access: Sequence[_Access]) -> list[set[int]]:
     """Return sets of stages that depend on each other, or write the same populations."""
     parts: list[set[int]] = []
-    for k in some:
-        joined, rest = {k}, []
+    for k in stages:
+        component, rest = {k}, []
         for part in parts:
             if any(_depend(access[k], access[j]) for j in part):
-                joined |= part
+                component |= part
             else:
                 rest.append(part)
-        parts = [*rest, joined]
+        parts = [*rest, component]
     return parts
 
 
@@ -106,9 +106,9 @@ def _depend(a: _Access, b: _Access) -> bool:
     return bool(populations or a.written & b.touched or b.written & a.touched)
 
 
-def _with_clocks(some: Collection[int], clocks: Collection[int], access: Sequence[_Access]) -> set[int]:
+def _with_clocks(stages: Collection[int], clocks: Collection[int], access: Sequence[_Access]) -> set[int]:
     """Return stages with the clocks whose results they read."""
-    out = set(some)
+    out = set(stages)
     while True:
         read = frozenset().union(*(access[k].read for k in out))
         more = {k for k in clocks if access[k].written & read} - out

@@ -137,9 +137,9 @@ class Lowering:
 
     def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
         """Return a number of a table, whose base is a multiple of four if it is aligned."""
-        found = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
-        self.entries[found] = TableEntry(table, base, offset, aligned)
-        return found
+        number = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
+        self.entries[number] = TableEntry(table, base, offset, aligned)
+        return number
 
     def finish(self, outputs: Sequence[Elements]) -> Block:
         """Return the block, with these outputs."""
@@ -164,8 +164,8 @@ class TableRows:
         if tuple(sizes) != (1, self._size):
             raise UnsupportedError(f"a part of shape {tuple(sizes)} of a table; only whole rows are read")
         base = ctx.scalar("mul", index, constant(self._size, np.int32))
-        found = [ctx.lookup(self._table, base, k, self._size % 4 == 0) for k in range(self._size)]
-        return as_elements(found, (1, self._size))
+        numbers = [ctx.lookup(self._table, base, k, self._size % 4 == 0) for k in range(self._size)]
+        return as_elements(numbers, (1, self._size))
 
 
 def as_elements(items: Sequence[Element], shape: tuple[int, ...]) -> Elements:

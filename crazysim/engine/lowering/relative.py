@@ -58,12 +58,12 @@ class RelativeStage(Stage):
     def __call__(self, data: Any) -> Any:
         treedef, views = self.axes.treedef, self.axes.views
         before = jax.tree.leaves(data)
-        given = restore_leaves(views, before)
-        after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(given)))
+        restored = restore_leaves(views, before)
+        after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(restored)))
         if after_treedef != treedef:
             return after_treedef.unflatten(after)  # the caller refuses it
         new = view_leaves(views, after)
-        unchanged = [x is y for x, y in zip(after, given, strict=True)]
+        unchanged = [x is y for x, y in zip(after, restored, strict=True)]
         return treedef.unflatten([old if same else x for old, x, same in zip(before, new, unchanged, strict=True)])
 
 
@@ -92,8 +92,8 @@ def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., A
     def steps(leaves: Sequence[Any], n_steps: Any) -> Any:
         out, flagged = run(view_leaves(views, leaves), n_steps)
         numbered = dict(zip(written, out, strict=True))
-        given = [numbered.get(i) for i in range(len(leaves))]
-        back = restore_leaves(views, given)
+        partial_leaves = [numbered.get(i) for i in range(len(leaves))]
+        back = restore_leaves(views, partial_leaves)
         return [back[i] for i in written], flagged
 
     return steps

@@ -22,8 +22,8 @@ def add_selections(block: Block) -> Block:
     for op in block.operations:
         builder.stage = op.stage
         inline(builder, Block((), (op,), ()), values)
-        if some := _selecting_results(op):
-            values.update(zip([op.results[k] for k in some], _select_own(builder, op, some, values), strict=True))
+        if indices := _selecting_results(op):
+            values.update(zip([op.results[k] for k in indices], _select_own(builder, op, indices, values), strict=True))
     outputs = [values.get(x, x) if isinstance(x, Value) else x for x in block.outputs]
     return Block(tuple([values[x] for x in block.inputs]), tuple(builder.operations), tuple(outputs))
 
@@ -36,30 +36,30 @@ def _selecting_results(op: Operation) -> list[int]:
     return [k for k, (name, x) in enumerate(pairs) if name in INDEX_REDUCTION_OF and x.dtype.kind == "f"]
 
 
-def _select_own(builder: Builder, op: Operation, some: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
+def _select_own(builder: Builder, op: Operation, indices: list[int], values: dict[Value, Element]) -> tuple[Value, ...]:
     (body,) = op.blocks
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
-    dtypes, n_members = [op.results[k].dtype for k in some], ("n_members", op.param("n_members"))
+    dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))
 
     def of_pair(n_more: int) -> tuple[Builder, list[Value], list[Element]]:
         """Return the body once more with further published integers, which follow the others."""
         inner = Builder(builder)
         fresh = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_more)]
         is_self = inner.input(bool)
-        own = [*fresh[: len(args)], is_self]
-        outs = inline(inner, body, values | dict(zip(body.inputs, own, strict=True)))
-        return inner, [*fresh[len(args) :], is_self], [outs[k] for k in some]
+        pair_inputs = [*fresh[: len(args)], is_self]
+        outs = inline(inner, body, values | dict(zip(body.inputs, pair_inputs, strict=True)))
+        return inner, [*fresh[len(args) :], is_self], [outs[k] for k in indices]
 
-    inner, (is_self,), found = of_pair(0)
+    inner, (is_self,), candidates = of_pair(0)
     one, zero = (constant(x, dtypes[0]) for x in (1, 0))
-    own = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the drone itself has the largest
-    names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in some), "argmax")
-    block = prune(inner.finish([*found, own]))
+    is_largest = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the drone itself has the largest
+    names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
+    block = prune(inner.finish([*candidates, is_largest]))
     *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
                                        (block,))  # fmt: skip
 
-    inner, (other, _), found = of_pair(1)
+    inner, (other, _), candidates = of_pair(1)
     terms = [inner.add("select_n", (inner.add("eq", (other, which), bool), constant(0, x.dtype), x), x.dtype)
-             for which, x in zip(chosen, found, strict=True)]  # fmt: skip
-    params = (("reduce", ("add",) * len(some)), n_members)
+             for which, x in zip(chosen, candidates, strict=True)]  # fmt: skip
+    params = (("reduce", ("add",) * len(indices)), n_members)
     return builder.add_many("over_others", [*args, number], dtypes, params, (prune(inner.finish(terms)),))

@@ -33,7 +33,7 @@ def lower_stages(
     population: str = "drone",
     tracer: Tracer | None = None,
 ) -> Program:
-    """Return the program of a step, each stage a segment of its own.
+    """Return the program of a step, with one segment per stage.
 
     A stage that cannot be lowered becomes an ``UnfusedStage``, which says why.
 
@@ -54,9 +54,9 @@ def lower_stages(
     n_drones = next(x.shape[1] for x, scope in zip(leaves, axes.scopes, strict=True) if scope == "drone")
     segments = []
     for phase in PHASES:
-        some = [stage for stage in stages if stage.phase == phase]
-        own = [_lower_stage(axes.stage(stage), phase, axes, leaves, known, n_drones, tracer) for stage in some]
-        segments += _before_the_steps(own, some, axes.numbers.core.steps) if phase == "each" else own
+        in_phase = [stage for stage in stages if stage.phase == phase]
+        lowered = [_lower_stage(axes.stage(x), phase, axes, leaves, known, n_drones, tracer) for x in in_phase]
+        segments += _before_the_steps(lowered, in_phase, axes.numbers.core.steps) if phase == "each" else lowered
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
@@ -65,13 +65,13 @@ def lower_stages(
     program = Program(described, n_drones, tuple(segments), None, scratch, (), population, axes.views)
     changed = known.keys() & set(program.written)
     if changed:  # an element is only known to be zero while no stage writes it
-        zeros = tuple([(i, some) for i, some in zeros if i not in changed])
+        zeros = tuple([(i, indices) for i, indices in zeros if i not in changed])
         return lower_stages(stages, data, zeros, watched, population, tracer)
     core = axes.numbers.core
     if watched is None or core.nonfinite in program.written:
         return program
-    own = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
-    checked = sorted((own | axes.views & set(program.written)) & set(watched(axes.numbers)))
+    members = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
+    checked = sorted((members | axes.views & set(program.written)) & set(watched(axes.numbers)))
     return dataclasses.replace(program, check=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
 
 
@@ -147,7 +147,7 @@ def _segment(
         for i in traced.written:
             if i not in before:
                 before[i] = inputs(lowering.builder, traced.avals[i])
-        after = _guarded(lowering, mask, traced, args, [before[i] for i in traced.written])
+        after = _lower_guarded(lowering, mask, traced, args, [before[i] for i in traced.written])
     writes: dict[Slot, Element] = {}
     for i, new in zip(traced.written, after, strict=True):
         old = scalars(before[i]) if i in before else [None] * len(scalars(new))
@@ -166,7 +166,7 @@ def _table(lowering: Lowering, elements: Elements) -> Value:
     return table
 
 
-def _guarded(
+def _lower_guarded(
     lowering: Lowering, mask: Element, traced: TracedStage, args: list[Elements], old: list[Elements]
 ) -> list[Elements]:
     """Return the written leaves after a stage that acts where a mask is true.
@@ -180,20 +180,20 @@ def _guarded(
     pairs = [(a, b) for x, y in zip(old, new, strict=True) for a, b in zip(scalars(x), scalars(y), strict=True)]
     if together:
         results = iter([a if a is b else lowering.scalar("select_n", mask, a, b) for a, b in pairs])
-        return [_with_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
+        return [_replace_scalars(x, [next(results) for _ in scalars(x)]) for x in old]
     changed = [(a, b) for a, b in pairs if a is not b]
     block = inner.builder.finish([b for _, b in changed])
     before = [a for a, _ in changed]
     results = iter(lowering.builder.add_many("when", (mask, *before), [a.dtype for a in before], (), (block,)))
     flat = iter([a if a is b else next(results) for a, b in pairs])
-    return [_with_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
+    return [_replace_scalars(x, [next(flat) for _ in scalars(x)]) for x in old]
 
 
-def _with_scalars(like: Elements, items: Sequence[Element]) -> Elements:
+def _replace_scalars(template: Elements, items: Sequence[Element]) -> Elements:
     """Return elements of the same shape; of a key, two integers."""
     row = iter(items)
-    pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in like.reshape(-1)]
-    return as_elements(pairs, like.shape)
+    pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in template.reshape(-1)]
+    return as_elements(pairs, template.shape)
 
 
 def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:

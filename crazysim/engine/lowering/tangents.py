@@ -43,8 +43,8 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     """
     program, perturbed = without_check(program, perturbed)
     n = len(program.leaves)
-    found, constants = changed_slots(program, perturbed)
-    segments = [_segment(program, n, s, found, constants.get(s, ())) for s in program.fused_segments]
+    changed, constants = changed_slots(program, perturbed)
+    segments = [_segment(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
     zero = dict.fromkeys((i, k) for s in segments for i in s.written if i >= n and i - n not in perturbed
                          for k in range(program.leaves[i - n].size))  # fmt: skip
     zeros = [constant(0, program.leaves[i - n].number) for i, _ in zero]
@@ -58,31 +58,31 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
 
 
 def _tangent_of(leaf: Leaf) -> Leaf:
-    own = leaf.scope in ("drone", "world")
-    return Leaf(f"tangent of {leaf.name}", leaf.scope if own else "world", leaf.shape if own else (1, 1, *leaf.shape),
-                leaf.dtype)  # fmt: skip
+    is_own = leaf.scope in ("drone", "world")
+    scope, shape = (leaf.scope, leaf.shape) if is_own else ("world", (1, 1, *leaf.shape))
+    return Leaf(f"tangent of {leaf.name}", scope, shape, leaf.dtype)
 
 
-def _segment(program: Program, n: int, s: Segment, found: set[Slot], constants: Sequence[int]) -> Segment:
+def _segment(program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int]) -> Segment:
     """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
-    wanted = [k for k, slot in enumerate(reads) if slot in found and s.block.inputs[k].dtype.kind == "f"]
+    wanted = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
     wanted = [k for k in wanted if not s.block.inputs[k].size]
     block = add_block_tangents(s.block, [s.block.inputs[k] for k in (*wanted, *(n_reads + k for k in constants))])
     primal, slopes = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
     inputs = (*primal[:n_reads], *slopes[: len(wanted)], *primal[n_reads:], *slopes[len(wanted) :])
     floats = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
     moving = [(k, x) for k, x in zip(floats, block.outputs[len(s.writes) :], strict=True)
-              if program.per_drone(s, [s.writes[k]])[0] in found]  # fmt: skip
+              if program.per_drone(s, [s.writes[k]])[0] in changed]  # fmt: skip
     before = [slot for slot, x in zip(s.hoisted_reads, s.hoisted.inputs, strict=True)
-              if slot in found and x.dtype.kind == "f" and not x.size]  # fmt: skip
+              if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
     hoisted, n_hoisted = s.hoisted, len(s.hoisted.outputs)
     if constants:
-        some = [x for x, slot in zip(s.hoisted.inputs, s.hoisted_reads, strict=True) if slot in before]
-        hoisted = add_block_tangents(s.hoisted, some)
+        moving_inputs = [x for x, slot in zip(s.hoisted.inputs, s.hoisted_reads, strict=True) if slot in before]
+        hoisted = add_block_tangents(s.hoisted, moving_inputs)
         indices = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
-        kept = [hoisted.outputs[n_hoisted + indices.index(k)] for k in constants]
-        hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *kept))
+        tangents_of_constants = [hoisted.outputs[n_hoisted + indices.index(k)] for k in constants]
+        hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *tangents_of_constants))
     return dataclasses.replace(
         s,
         block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in moving))),
@@ -145,8 +145,8 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
         slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
-        given = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
-        _record(op.results, inline(builder, slope, dict(zip(slope.inputs, given, strict=True))), tangents)
+        operands = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
+        _record(op.results, inline(builder, slope, dict(zip(slope.inputs, operands, strict=True))), tangents)
     return [_map_element(x, values) for x in block.outputs]
 
 
@@ -154,9 +154,9 @@ def _map_element(x: Element, values: Values) -> Element:
     return values.get(x, x) if isinstance(x, Value) else x
 
 
-def _record(results: Sequence[Value], found: Sequence[Element], tangents: Values) -> None:
+def _record(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
     """Note the tangents of some results, unless they are zero."""
-    tangents.update((x, t) for x, t in zip(results, found, strict=True) if isinstance(t, Value) or t != 0)
+    tangents.update((x, t) for x, t in zip(results, elements, strict=True) if isinstance(t, Value) or t != 0)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -167,8 +167,8 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
     def push(*args: Any) -> Any:
         operands, tangents = args[: len(dtypes)], args[len(dtypes) :]
 
-        def of(*some: Any) -> Any:
-            return apply_operation(name, replace_leaves(operands, floats, some), dtype, params)
+        def of(*changed: Any) -> Any:
+            return apply_operation(name, replace_leaves(operands, floats, changed), dtype, params)
 
         return jax.jvp(of, tuple([operands[k] for k in floats]), tangents)[1]
 
@@ -182,26 +182,26 @@ def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
     outputs = _push(inner, block, dict(values), moving)
     after = [_tangent(x, moving) for x in block.outputs]
     before = [_tangent(x, tangents) for x in old]
-    some = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
-    args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(before[k] for k in some)]
-    inside = inner.finish([*outputs, *(after[k] for k in some)])
+    indices = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
+    args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(before[k] for k in indices)]
+    inside = inner.finish([*outputs, *(after[k] for k in indices)])
     results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inside,))
     values.update(zip(op.results, results, strict=False))
-    _record([op.results[k] for k in some], results[len(old) :], tangents)
+    _record([op.results[k] for k in indices], results[len(old) :], tangents)
 
 
 def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Compute the derivative that the function has of its own."""
+    """Use the function's custom derivative."""
     (block,) = op.blocks
     args = [_map_element(x, values) for x in op.args]
-    found = inline(builder, block, values | dict(zip(block.inputs, args, strict=True)))
-    values.update(zip(op.results, found, strict=True))
+    results = inline(builder, block, values | dict(zip(block.inputs, args, strict=True)))
+    values.update(zip(op.results, results, strict=True))
     if not any(isinstance(x, Value) and x in tangents for x in op.args):
         return
     slope = op.param("slope")()
     moving = [_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
     parts = inline(builder, slope, dict(zip(slope.inputs, [*args, *moving], strict=True)))
-    parts = [x for x, like in zip(parts, slope.outputs, strict=True) if like.dtype.kind == "f"]
+    parts = [x for x, out in zip(parts, slope.outputs, strict=True) if out.dtype.kind == "f"]
     _record([x for x in op.results if x.dtype.kind == "f"], parts, tangents)
 
 
@@ -239,14 +239,14 @@ def _over_others(builder: Builder, op: Operation, values: Values, tangents: Valu
     inside[is_self] = inner.input(is_self.dtype)
     outputs = _push(inner, body, inside, moving)
     names = op.param("reduce")
-    some = [k for k, x in enumerate(body.outputs) if names[k] == "add" and isinstance(_tangent(x, moving), Value)]
-    block = inner.finish([*outputs, *(moving[body.outputs[k]] for k in some)])
+    summed = [k for k, x in enumerate(body.outputs) if names[k] == "add" and isinstance(_tangent(x, moving), Value)]
+    block = inner.finish([*outputs, *(moving[body.outputs[k]] for k in summed)])
     args = [*(_map_element(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
-    dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in some]
-    params = (("reduce", (*names, *("add" for _ in some))), ("n_members", op.param("n_members")))
+    dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in summed]
+    params = (("reduce", (*names, *("add" for _ in summed))), ("n_members", op.param("n_members")))
     results = builder.add_many("over_others", args, dtypes, params, (block,))
     values.update(zip(op.results, results, strict=False))
-    _record([op.results[k] for k in some], results[len(op.results) :], tangents)
+    _record([op.results[k] for k in summed], results[len(op.results) :], tangents)
 
 
 STRUCTURE: dict[str, Callable[[Builder, Operation, Values, Values], None]] = {

@@ -68,7 +68,7 @@ class Tracer:
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._found:
             if stage.fixed:
-                traced = _traced_once(stage, axes, leaves, shapes)
+                traced = _trace_once(stage, axes, leaves, shapes)
             else:
                 traced = TracedStage(stage, axes, leaves)
             traced.dump(stage.__name__)
@@ -82,7 +82,7 @@ MAX_TRACED_STAGES = 256
 """Largest number of them."""
 
 
-def _traced_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
+def _trace_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
     """Return a fixed stage, traced now or before in this process. It must not read the numbers of worlds and drones."""
     data = axes.treedef.unflatten(leaves)
     kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))

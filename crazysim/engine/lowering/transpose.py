@@ -56,8 +56,8 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
             if isinstance(x, Value) and x in on_path:
                 _accumulate(builder, cotangents, x, ct)
     for k, part in reversed(list(enumerate(parts))):
-        here = values if k == len(parts) - 1 else _recompute(builder, part, k, values, on_path)
-        _pull(builder, part, here, on_path, cotangents)
+        elements = values if k == len(parts) - 1 else _recompute(builder, part, k, values, on_path)
+        _pull(builder, part, elements, on_path, cotangents)
     return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
 
 
@@ -83,12 +83,12 @@ def _recompute(
     other drones and loops are not computed again.
     """
     repeated = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
-    own, used = {x for op in repeated for x in op.results}, part.uses()
-    before = [x for x in values if x in used and x in on_path and x not in own and isinstance(values[x], Value)]
+    recomputed, used = {x for op in repeated for x in op.results}, part.uses()
+    before = [x for x in values if x in used and x in on_path and x not in recomputed and isinstance(values[x], Value)]
     fresh = {x: builder.add("again", (values[x],), x.dtype, (("part", number),)) for x in before}
-    here = values | fresh
-    inline(builder, Block((), tuple(repeated)), here)
-    return here
+    elements = values | fresh
+    inline(builder, Block((), tuple(repeated)), elements)
+    return elements
 
 
 def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents) -> None:
@@ -102,23 +102,23 @@ def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path:
         cts: Cotangents found so far, which are replaced.
     """
 
-    def mapped(x: Element) -> Element:
+    def replaced(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
     for op in reversed(block.operations):
-        found = [cts.pop(x, None) for x in op.results]
-        if all(ct is None for ct in found) or not any(x in on_path for x in op.results):
+        result_cts = [cts.pop(x, None) for x in op.results]
+        if all(ct is None for ct in result_cts) or not any(x in on_path for x in op.results):
             continue
         builder.stage = op.stage
         rule = STRUCTURE.get(op.name)
         if rule is not None:
-            rule(builder, op, values, on_path, found, cts)
+            rule(builder, op, values, on_path, result_cts, cts)
             continue
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
         slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
-        given = [*map(mapped, op.args), found[0]]
-        parts = inline(builder, slope, dict(zip(slope.inputs, given, strict=True)))
+        operands = [*map(replaced, op.args), result_cts[0]]
+        parts = inline(builder, slope, dict(zip(slope.inputs, operands, strict=True)))
         floats = [x for x in op.args if x.dtype.kind == "f"]
         for x, part in zip(floats, parts, strict=True):
             if isinstance(x, Value) and x in on_path:
@@ -137,51 +137,53 @@ def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tup
     def pull(*args: Any) -> list[Any]:
         *operands, ct = args
 
-        def of(some: list[Any]) -> Any:
-            return apply_operation(name, replace_leaves(operands, floats, some), dtype, params)
+        def of(floats_now: list[Any]) -> Any:
+            return apply_operation(name, replace_leaves(operands, floats, floats_now), dtype, params)
 
         return jax.vjp(of, [operands[k] for k in floats])[1](ct)[0]
 
     return lower_function(pull, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, dtype)])
 
 
-Found = Sequence[Element | None]
+ResultCotangents = Sequence[Element | None]
 """Cotangents of the results of an operation; None for unused results."""
 
 
-def _when(builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents) -> None:
+def _when(
+    builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
+) -> None:
     """Pass cotangents through the block where the mask is true, and to the old numbers elsewhere."""
     mask, *old = op.args
     mask = values.get(mask, mask)
     (block,) = op.blocks
-    inner, inside, own = Builder(builder), dict(values), Cotangents()
+    inner, inside, inner_cts = Builder(builder), dict(values), Cotangents()
     inline(inner, block, inside)
-    for x, before, ct in zip(block.outputs, old, found, strict=True):
+    for x, before, ct in zip(block.outputs, old, result_cts, strict=True):
         if ct is None:
             continue
         if isinstance(before, Value) and before in on_path:
             rest = builder.add("select_n", (mask, ct, constant(0, ct.dtype)), ct.dtype)
             _accumulate(builder, cts, before, rest)
         if isinstance(x, Value) and x in on_path:
-            _accumulate(inner, own, x, ct)
-    _pull(inner, block, inside, on_path, own)
-    before = [cts.get(x, constant(0, x.dtype)) for x in own]
-    sums = [inner.add("add", (a, own[x]), x.dtype) for a, x in zip(before, own, strict=True)]
-    if own:
-        results = builder.add_many("when", (mask, *before), [x.dtype for x in own], (), (inner.finish(sums),))
-        cts.update(zip(own, results, strict=True))
+            _accumulate(inner, inner_cts, x, ct)
+    _pull(inner, block, inside, on_path, inner_cts)
+    before = [cts.get(x, constant(0, x.dtype)) for x in inner_cts]
+    sums = [inner.add("add", (a, inner_cts[x]), x.dtype) for a, x in zip(before, inner_cts, strict=True)]
+    if inner_cts:
+        results = builder.add_many("when", (mask, *before), [x.dtype for x in inner_cts], (), (inner.finish(sums),))
+        cts.update(zip(inner_cts, results, strict=True))
 
 
 def _custom_jvp(
-    builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents
+    builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
-    """Transpose the derivative that the function has of its own."""
+    """Transpose the function's custom derivative."""
     slope = _transpose_slope(op.param("slope")())
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
-    seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, found, strict=True)
+    seeds = [constant(0, x.dtype) if ct is None else ct for x, ct in zip(op.results, result_cts, strict=True)
              if x.dtype.kind == "f"]  # fmt: skip
-    given = [*args, *(constant(0, x.dtype) for x in args), *seeds]
-    parts = inline(builder, slope, dict(zip(slope.inputs, given, strict=True)))
+    operands = [*args, *(constant(0, x.dtype) for x in args), *seeds]
+    parts = inline(builder, slope, dict(zip(slope.inputs, operands, strict=True)))
     for x, part in zip([x for x in op.args if x.dtype.kind == "f"], parts, strict=True):
         if isinstance(x, Value) and x in on_path:
             _accumulate(builder, cts, x, part)
@@ -194,26 +196,29 @@ def _transpose_slope(slope: Block) -> Block:
 
 
 def _over_others(
-    builder: Builder, op: Operation, values: dict, on_path: set[Value], found: Found, cts: Cotangents
+    builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
     """Cotangents go to the drone that reads, and, from all drones that read them, to the numbers it published."""
-    used = [ct for ct in found if ct is not None]
-    names = [name for name, ct in zip(op.param("reduce"), found, strict=True) if ct is not None]
+    used = [ct for ct in result_cts if ct is not None]
+    names = [name for name, ct in zip(op.param("reduce"), result_cts, strict=True) if ct is not None]
     if any(name != "add" for name in names):  # see ``selections``
         raise UnsupportedError(f"{', '.join(names)} over other drones has no derivative in a kernel", op.name)
     (body,) = op.blocks
     uses = body.uses()
-    own = [x for x in values if x in uses and not x.size and isinstance(values[x], Value)]  # in the same order always
+    # A list, so that the order is always the same.
+    captured = [x for x in values if x in uses and not x.size and isinstance(values[x], Value)]
     published = [values.get(x, x) for x in op.args]
 
-    def backwards(inputs: Sequence[Value], mine: dict, wanted: Sequence[Value], shared: Sequence[Element]) -> None:
+    def backwards(
+        inputs: Sequence[Value], own_values: dict, wanted: Sequence[Value], shared: Sequence[Element]
+    ) -> None:
         """Add a loop over the other drones for the cotangents of some values."""
         inner, inside, local = Builder(builder), dict(values), Cotangents()
         fresh = [inner.input(x.dtype) for x in (*inputs, body.inputs[-1])]
-        inside.update(mine)
+        inside.update(own_values)
         inside.update(zip((*inputs, body.inputs[-1]), fresh, strict=True))
         inline(inner, body, inside)
-        for x, ct in zip(body.outputs, found, strict=True):
+        for x, ct in zip(body.outputs, result_cts, strict=True):
             if ct is not None and isinstance(x, Value) and x in on_path:
                 _accumulate(inner, local, x, inside.get(ct, ct) if isinstance(ct, Value) else ct)
         _pull(inner, body, inside, on_path, local)
@@ -222,27 +227,27 @@ def _over_others(
             return
         block = prune(inner.finish([local[x] for x in wanted]))
         read = block.uses()
-        kept = [(y, s) for y, s in zip(fresh, shared, strict=False) if y in read]
-        block = Block((*(y for y, _ in kept), fresh[-1]), block.operations, block.outputs)
+        pairs = [(y, s) for y, s in zip(fresh, shared, strict=False) if y in read]
+        block = Block((*(y for y, _ in pairs), fresh[-1]), block.operations, block.outputs)
         params = (("reduce", ("add",) * len(wanted)), ("n_members", op.param("n_members")))
-        sums = builder.add_many("over_others", [s for _, s in kept], [x.dtype for x in wanted], params, (block,))
+        sums = builder.add_many("over_others", [s for _, s in pairs], [x.dtype for x in wanted], params, (block,))
         for x, part in zip(wanted, sums, strict=True):
             target = dict(zip(body.inputs, op.args, strict=False)).get(x, x)
             if isinstance(target, Value) and target in on_path:
                 _accumulate(builder, cts, target, part)
 
     others = body.inputs[:-1]
-    backwards(others, {}, [x for x in own if x in on_path], published)
+    backwards(others, {}, [x for x in captured if x in on_path], published)
     seeds = [ct for ct in used if isinstance(ct, Value)]
     backwards(
-        (*own, *seeds),
+        (*captured, *seeds),
         dict(zip(others, published, strict=True)),
         [x for x in others if x in on_path],
-        [*(values[x] for x in own), *seeds],
+        [*(values[x] for x in captured), *seeds],
     )
 
 
-Rule = Callable[[Builder, Operation, dict, set[Value], Found, Cotangents], None]
+Rule = Callable[[Builder, Operation, dict, set[Value], ResultCotangents, Cotangents], None]
 STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
 
 
@@ -264,14 +269,14 @@ def _is_reversed(op: Operation) -> bool:
 
 
 def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
-    def mapped(x: Element) -> Element:
+    def replaced(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
     for op in block.operations:
         builder.stage = op.stage
         if _is_reversed(op):
             (body,) = op.blocks
-            length, carry = op.param("length"), [mapped(x) for x in op.args]
+            length, carry = op.param("length"), [replaced(x) for x in op.args]
             if length * sum(1 for _ in body.walk()) > MAX_UNROLLED:
                 raise UnsupportedError(f"a loop of {length} iterations is too long to be reversed", op.name, op.stage)
             for _ in range(length):
@@ -284,9 +289,9 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
                 fresh = Builder(builder)
                 inside = values | {x: fresh.input(x.dtype) for x in inner.inputs}
                 blocks.append(fresh.finish(_unroll(fresh, inner, inside)))
-            args = [mapped(x) for x in op.args]
+            args = [replaced(x) for x in op.args]
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, tuple(blocks))
             values.update(zip(op.results, results, strict=True))
         else:
             inline(builder, Block((), (op,), ()), values)
-    return [mapped(x) for x in block.outputs]
+    return [replaced(x) for x in block.outputs]

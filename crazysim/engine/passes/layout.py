@@ -95,9 +95,9 @@ class PackedRows(NamedTuple):
     def unpack(self, rows: Array, leaf: int) -> Array:
         """Return one of the members."""
         sizes = {i: self.program.leaves[i].size for i in self.members}
-        first, like = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
-        x = rows[first : first + like.size].T.reshape(-1, self.program.n_drones, *like.shape[2:])
-        return x[:, :1] if like.scope == "world" else x
+        first, member = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
+        x = rows[first : first + member.size].T.reshape(-1, self.program.n_drones, *member.shape[2:])
+        return x[:, :1] if member.scope == "world" else x
 
 
 def packed_rows(program: Program) -> list[PackedRows]:

@@ -31,10 +31,10 @@ def fuse(program: Program) -> Program:
     """
     segments: list[Segment | UnfusedStage] = []
     kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
-    for _, some in kinds:
-        run = list(some)
-        joined = [s for s in run if isinstance(s, Segment)]
-        segments += [_join_segments(joined)] if joined else run
+    for _, group in kinds:
+        run = list(group)
+        fusible = [s for s in run if isinstance(s, Segment)]
+        segments += [_join_segments(fusible)] if fusible else run
     return dataclasses.replace(program, segments=tuple(segments))
 
 
@@ -144,7 +144,7 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     fixed = {x for x, slot in slots.items() if slot not in changing}
     worth: set[Value] = set()
     operations: list[Operation] = []
-    for op in _with_inverses(block, fixed):
+    for op in _replace_divisions(block, fixed):
         operations.append(op)
         if op.results and not op.blocks and all([is_constant(x) or x in fixed for x in op.args]):
             fixed.update(op.results)
@@ -156,8 +156,8 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     if not moved:
         return segment
     # What is cheap stays in both blocks: it depends on nothing that has moved.
-    kept = [op for op in operations if op.results and fixed.issuperset(op.results)]
-    once = prune(Block(block.inputs, tuple(kept), tuple(moved)), keep_inputs=False)
+    fixed_operations = [op for op in operations if op.results and fixed.issuperset(op.results)]
+    once = prune(Block(block.inputs, tuple(fixed_operations), tuple(moved)), keep_inputs=False)
     further = {x: Value(x.dtype) for x in moved}
     rest = prune(substitute(rest, further), keep_inputs=False)
     return dataclasses.replace(
@@ -169,7 +169,7 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     )
 
 
-def _with_inverses(block: Block, fixed: set[Value]) -> Iterable[Operation]:
+def _replace_divisions(block: Block, fixed: set[Value]) -> Iterable[Operation]:
     """Yield the operations of a block, divisions by fixed numbers as products. ``fixed`` grows as they are taken."""
     inverses: dict[Any, Element] = {}
     for op in block.operations:

@@ -96,10 +96,10 @@ def _differs(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
         finite = np.where(np.isfinite(x), np.abs(x), 0)
         size = finite.max(axis=-1, keepdims=True) if x.ndim > 2 else finite
         with np.errstate(all="ignore"):
-            apart = np.abs(x.astype(np.float64) - y) / np.maximum(size, np.finfo(x.dtype).tiny)
+            relative_error = np.abs(x.astype(np.float64) - y) / np.maximum(size, np.finfo(x.dtype).tiny)
         same = (x == y) | (np.isnan(x) & np.isnan(y))
-        wrong = np.where(same, 0.0, np.where(np.isnan(apart), np.inf, apart)) > tolerance
-        wrong = np.where(wrong, np.where(np.isfinite(apart), apart, np.inf), 0.0)
+        wrong = np.where(same, 0.0, np.where(np.isnan(relative_error), np.inf, relative_error)) > tolerance
+        wrong = np.where(wrong, np.where(np.isfinite(relative_error), relative_error, np.inf), 0.0)
     if not wrong.any():
         return None
     return tuple(int(k) for k in np.unravel_index(int(wrong.argmax()), wrong.shape))
@@ -111,9 +111,9 @@ def _operation(stage: Any, name: str, data: Any, engines: Sequence[str], toleran
     builds: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
     for engine in engines:
         if engine in builds and program.fused and program.segments:
-            found = first_operation(program, jax.tree.leaves(data), builds[engine], tolerance)
-            if found is not None:
-                return f"{engine}: {found}"
+            listed = first_operation(program, jax.tree.leaves(data), builds[engine], tolerance)
+            if listed is not None:
+                return f"{engine}: {listed}"
     return ""
 
 
@@ -126,18 +126,18 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
         build: Builds what runs the program.
         tolerance: As in ``first_difference``.
     """
-    seen, operations = expose_values(program)
+    exposed, operations = expose_values(program)
     n_worlds = lanes.batch_counts(program, leaves)[0]
-    more = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in seen.leaves[len(leaves) :]]
+    more = [jnp.zeros((n_worlds, *leaf.shape[1:]), leaf.dtype) for leaf in exposed.leaves[len(leaves) :]]
     location = Location("cpu" if jax.default_backend() == "cpu" else "gpu")
-    written = [builder(seen, location)([*leaves, *more], 1)[0] for builder in (interpret.build, build)]
-    results = [dict(zip(seen.written, some, strict=True)) for some in written]
-    (segment,) = seen.fused_segments
+    written = [builder(exposed, location)([*leaves, *more], 1)[0] for builder in (interpret.build, build)]
+    results = [dict(zip(exposed.written, arrays, strict=True)) for arrays in written]
+    (segment,) = exposed.fused_segments
     for op, (leaf, _) in zip(operations, segment.writes, strict=True):
-        expected, found = (np.asarray(result[leaf]) for result in results)
-        index = _differs(expected, found, tolerance)
+        expected, actual = (np.asarray(result[leaf]) for result in results)
+        index = _differs(expected, actual, tolerance)
         if index is not None:
-            numbers = f"{expected[index]} by 'interpret' and {found[index]} by the engine"
+            numbers = f"{expected[index]} by 'interpret' and {actual[index]} by the engine"
             return f"{listing.list_operation(program, op)} ({numbers}, index {list(index)})"
     return None
 
@@ -152,11 +152,11 @@ def expose_values(program: Program) -> tuple[Program, list[Operation]]:
     values: list[Value] = [x for op in segment.block.operations for x in op.results]
     n_worlds = next(leaf.shape[0] for leaf in program.leaves if leaf.scope == "drone")
     shape = (n_worlds, program.n_drones if segment.scope == "drone" else 1)
-    further = [Leaf(f"value {k}", segment.scope, shape, x.dtype) for k, x in enumerate(values)]
+    value_leaves = [Leaf(f"value {k}", segment.scope, shape, x.dtype) for k, x in enumerate(values)]
     first = len(program.leaves)
-    seen = dataclasses.replace(
+    exposed = dataclasses.replace(
         segment,
         block=Block(segment.block.inputs, segment.block.operations, tuple(values)),
         writes=tuple([(first + k, 0) for k in range(len(values))]),
     )
-    return dataclasses.replace(program, leaves=(*program.leaves, *further), segments=(seen,)), operations
+    return dataclasses.replace(program, leaves=(*program.leaves, *value_leaves), segments=(exposed,)), operations

@@ -32,9 +32,13 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
             if isinstance(segment, UnfusedStage):
                 lines.append(f"splits the step: {segment.unfused}")
             else:
-                names, own = ", ".join(segment.stages), segment.scope == "drone"
-                one = f"member of {program.population!r}" if own and program.population != "drone" else segment.scope
-                lines.append(f"fused, for one {one}: {names} ({segment.n_operations} operations)")
+                names, is_per_member = ", ".join(segment.stages), segment.scope == "drone"
+                owner = (
+                    f"member of {program.population!r}"
+                    if is_per_member and program.population != "drone"
+                    else segment.scope
+                )
+                lines.append(f"fused, for one {owner}: {names} ({segment.n_operations} operations)")
     split = [stage.name for program in plan.programs for stage in program.unfused_stages]
     if split and measure:
         lines.append(_cost_of_split(step, data, split))

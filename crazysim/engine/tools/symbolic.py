@@ -147,8 +147,8 @@ class _Interpreter:
     def _guarded_sqrt(self, x: Expression) -> Expression:
         """Return a root whose slope at zero is zero.
 
-        A function with a derivative of its own has it for arguments where its arithmetic has an infinite one, such as a
-        norm at zero.
+        Functions such as a norm have a custom derivative because the derivative of their arithmetic is infinite at
+        zero.
         """
         ca = self.casadi
         return ca.if_else(x > 0, ca.sqrt(ca.if_else(x > 0, x, 1.0)), 0.0)

@@ -35,8 +35,8 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
             f"a show."
         )
     times = np.array([float(str(x)) for x in ends])
-    kept = np.diff(times, prepend=0.0) > 0
-    return times[kept], np.asarray(trajectory.coefficients, float)[kept]
+    has_length = np.diff(times, prepend=0.0) > 0
+    return times[has_length], np.asarray(trajectory.coefficients, float)[has_length]
 
 
 def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:

@@ -103,20 +103,20 @@ def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     for k, v in enumerate(eqn.outvars):
         taken = outs[-1][k]
         for i in range(len(branches) - 2, -1, -1):
-            here = ctx.scalar("le", index, constant(i, index.dtype), dtype=bool)
-            taken = ctx.elementwise("select_n", [as_elements([here], ()), taken, outs[i][k]], v.aval.dtype)
+            is_branch = ctx.scalar("le", index, constant(i, index.dtype), dtype=bool)
+            taken = ctx.elementwise("select_n", [as_elements([is_branch], ()), taken, outs[i][k]], v.aval.dtype)
         results.append(taken)
     return results
 
 
 @rule("platform_index")
 def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Take the default branch: a program is lowered once for all platforms."""
+    """Return the default branch: a program is lowered once for all platforms."""
     platforms = list(eqn.params["platforms"])
-    own = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
-    if own or None not in platforms:
+    named = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
+    if named or None not in platforms:
         raise UnsupportedError(
-            f"primitive 'platform_index' with a branch for {', '.join(own) or 'some platforms only'}"
+            f"primitive 'platform_index' with a branch for {', '.join(named) or 'some platforms only'}"
         )
     return [constants(platforms.index(None), np.int32)]
 
@@ -169,11 +169,11 @@ def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
     return [condition if is_constant(condition[()]) else as_elements([ctx.scalar("any_lane", condition[()])], ())]
 
 
-def _inputs(ctx: Lowering, like: Elements) -> Elements:
+def _inputs(ctx: Lowering, template: Elements) -> Elements:
     def new(x: Any) -> Any:
         return tuple(map(new, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
 
-    return as_elements([new(x) for x in like.reshape(-1)], like.shape)
+    return as_elements([new(x) for x in template.reshape(-1)], template.shape)
 
 
 def _results(

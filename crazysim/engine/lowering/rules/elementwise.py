@@ -58,8 +58,8 @@ def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
         return [ctx.elementwise("select_n", args, dtype)]
     taken = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
-        here = ctx.elementwise("le", [which, constants(k, kind)], bool)
-        taken = ctx.elementwise("select_n", [here, taken, cases[k]], dtype)
+        is_case = ctx.elementwise("le", [which, constants(k, kind)], bool)
+        taken = ctx.elementwise("select_n", [is_case, taken, cases[k]], dtype)
     return [taken]
 
 

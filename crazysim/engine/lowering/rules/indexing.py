@@ -50,8 +50,8 @@ def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> E
     pieces = [np.take(x, range(k, k + size), axis) for k in range(last + 1)]
     taken = pieces[last]
     for k in range(last - 1, -1, -1):
-        here = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
-        taken = _select(ctx, here, pieces[k], taken)
+        is_start = as_elements([ctx.scalar("le", start, constant(k, start.dtype), dtype=bool)], ())
+        taken = _select(ctx, is_start, pieces[k], taken)
     return taken
 
 
@@ -66,15 +66,15 @@ def _dynamic_update_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) ->
     _check_range(int(np.prod([len(options) for options in ranges])))
     out = x
     for corner in itertools.product(*ranges):
-        here = _all(ctx, (_at(ctx, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
+        inside = _all(ctx, (_is_at(ctx, s, k, options[-1]) for s, k, options in zip(starts, corner, ranges, strict=True)
                         if len(options) > 1))  # fmt: skip
         window_index = tuple(slice(k, k + size) for k, size in zip(corner, update.shape, strict=True))
         out = out.copy()
-        out[window_index] = update if here is None else _select(ctx, here, update, out[window_index])
+        out[window_index] = update if inside is None else _select(ctx, inside, update, out[window_index])
     return [out]
 
 
-def _at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
+def _is_at(ctx: Lowering, index: Element, k: int, last: int) -> Elements:
     """Return True where an index, clamped to 0 to ``last``, is ``k``."""
     op = "le" if k == 0 else "ge" if k == last else "eq"
     return as_elements([ctx.scalar(op, index, constant(k, index.dtype), dtype=bool)], ())
@@ -152,14 +152,15 @@ def _select_windows(
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
         static = np.broadcast_to(np.array(corner, np.int32), shape)
-        here = move_many(eqn, [x], [static])[0].reshape(-1)
+        window = move_many(eqn, [x], [static])[0].reshape(-1)
         if not result:
-            result = list(here)
+            result = list(window)
             continue
         hit = [
-            _all(ctx, (_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0)) for row in rows
+            _all(ctx, (_is_at(ctx, i, k, m) for i, k, m in zip(row, corner, limits, strict=True) if m > 0))
+            for row in rows
         ]
-        for o, item in enumerate(here):
+        for o, item in enumerate(window):
             condition = hit[row_of[o]]
             if condition is not None and item is not result[o]:
                 result[o] = _select(ctx, condition, as_elements([item], ()), as_elements([result[o]], ()))[()]
@@ -224,7 +225,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
             here = _all(
                 ctx,
                 (
-                    _at(ctx, i, k, limit)
+                    _is_at(ctx, i, k, limit)
                     if clip
                     else as_elements([ctx.scalar("eq", i, constant(k, i.dtype), dtype=bool)], ())
                     for i, k, limit in zip(start, positions, limits, strict=True)
@@ -233,7 +234,7 @@ def _scatter(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Element
             )
             window_index = tuple(slice(k, k + size) for k, size in zip(corner, window, strict=True))
             old = out[window_index]
-            new = _combined(ctx, eqn, old, block.reshape(old.shape))
+            new = _combine(ctx, eqn, old, block.reshape(old.shape))
             out[window_index] = new if here is None else _select(ctx, here, new, old)
     return [out]
 
@@ -247,7 +248,7 @@ def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
     return [int(index)] if 0 <= index <= limit else []
 
 
-def _combined(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elements:
+def _combine(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elements:
     """Return the numbers that a scatter writes over ``old``: ``new``, their sum and the like, or a function of both."""
     combination = eqn.params["update_jaxpr"]
     if combination is None:

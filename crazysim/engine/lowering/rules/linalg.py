@@ -95,9 +95,12 @@ def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
                 largest = ctx.scalar("select_n", wins, largest, size)
             pivots.append(pivot)
             for i in range(j + 1, n):
-                here = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
+                is_pivot = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
                 for x in (*a.T, rows):  # every column, and the list of rows
-                    x[i], x[j] = ctx.scalar("select_n", here, x[i], x[j]), ctx.scalar("select_n", here, x[j], x[i])
+                    x[i], x[j] = (
+                        ctx.scalar("select_n", is_pivot, x[i], x[j]),
+                        ctx.scalar("select_n", is_pivot, x[j], x[i]),
+                    )
             is_zero = ctx.scalar("eq", a[j, j], zero, dtype=bool)  # then the column is zero, and stays
             divisor = ctx.scalar("select_n", is_zero, a[j, j], constant(1, a[j, j].dtype))
             for i in range(j + 1, n):

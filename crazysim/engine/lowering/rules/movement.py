@@ -74,13 +74,13 @@ def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
         case "rev":
             return [np.flip(x, p["dimensions"])]
         case "pad":
-            return [_padded(x, args[1], p["padding_config"])]
+            return [_pad(x, args[1], p["padding_config"])]
         case "gather":
             return run_now(eqn, args, fill_value=0)  # never used: all places are inside
     return run_now(eqn, args)
 
 
-def _padded(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
+def _pad(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
     """Return an array padded before, behind and between its elements; a negative number removes some."""
     for axis, (low, high, interior) in enumerate(config):
         n = x.shape[axis]

@@ -22,28 +22,28 @@ def _over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
     if n == 1:
         return ctx.lower(eqn.params["jaxpr"], [*args, as_elements([constant(True, bool)], ())])
     published = [x for x in scalars(*args[n_own:]) if not is_constant(x)]
-    shared = _shared(ctx)
+    shared = _shared_numbers(ctx)
     inner = ctx.inner()
     others = {x: inner.builder.input(x.dtype) for x in dict.fromkeys(published) if x not in shared}
     is_self = inner.builder.input(bool)
-    other = [_replaced(x, others) for x in args[n_own:]]
+    other = [_replace_elements(x, others) for x in args[n_own:]]
     results = inner.lower(eqn.params["jaxpr"], [*args[:n_own], *other, as_elements([is_self], ())])
     block = inner.finish(results)
     used = block.uses()  # what is published and not used is not published
-    kept = [(x, y) for x, y in others.items() if y in used]
-    block = dataclasses.replace(block, inputs=(*(y for _, y in kept), is_self))
+    pairs = [(x, y) for x, y in others.items() if y in used]
+    block = dataclasses.replace(block, inputs=(*(y for _, y in pairs), is_self))
     types = [x.dtype for x in block.outputs]
     name = ops.REDUCTIONS[eqn.params["reduce"]]
     names = tuple([ops.BOOLEAN_FORM[name][0] if dtype.kind == "b" else name for dtype in types])
-    found = iter(
+    outs = iter(
         ctx.builder.add_many(
-            "over_others", [x for x, _ in kept], types, (("reduce", names), ("n_members", n)), (block,)
+            "over_others", [x for x, _ in pairs], types, (("reduce", names), ("n_members", n)), (block,)
         )
     )
-    return [as_elements([next(found) for _ in scalars(x)], x.shape) for x in results]
+    return [as_elements([next(outs) for _ in scalars(x)], x.shape) for x in results]
 
 
-def _replaced(x: Elements, new: dict[Value, Value]) -> Elements:
+def _replace_elements(x: Elements, new: dict[Value, Value]) -> Elements:
     def of(item: Any) -> Any:
         return (
             tuple(map(of, item))
@@ -56,10 +56,10 @@ def _replaced(x: Elements, new: dict[Value, Value]) -> Elements:
     return as_elements([of(item) for item in x.reshape(-1)], x.shape)
 
 
-def _shared(ctx: Lowering) -> set[Value]:
+def _shared_numbers(ctx: Lowering) -> set[Value]:
     """Return the numbers known so far that are the same for all drones: computed from shared ones alone."""
-    found = set(ctx.shared)
+    shared = set(ctx.shared)
     for op in ctx.builder.operations:
-        if op.results and not op.blocks and all([is_constant(x) or x in found for x in op.args]):
-            found.update(op.results)
-    return found
+        if op.results and not op.blocks and all([is_constant(x) or x in shared for x in op.args]):
+            shared.update(op.results)
+    return shared

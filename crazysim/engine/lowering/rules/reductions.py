@@ -89,7 +89,7 @@ def _argmax(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 
 @rule("sort")
 def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    return _sorted(ctx, eqn, args, eqn.params["dimension"], eqn.params["num_keys"])
+    return _sort_rows(ctx, eqn, args, eqn.params["dimension"], eqn.params["num_keys"])
 
 
 @rule("top_k")
@@ -104,16 +104,16 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
     key = x
     if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
         ctx.builder.barrier()  # the sign of a NaN that XLA computes again, for another exchange, may be another
-        whole = np.dtype(f"i{dtype.itemsize}")
-        key = ctx.elementwise("bitcast_convert_type", [x], whole)
-        turned = ctx.elementwise("xor", [key, constants(np.iinfo(whole).max, whole)], whole)
-        negative = ctx.elementwise("lt", [key, constants(0, whole)], bool)
-        key = ctx.elementwise("select_n", [negative, key, turned], whole)
-    columns = _sorted(ctx, eqn, [key, x, positions], axis, 1, descending=True)
+        integer = np.dtype(f"i{dtype.itemsize}")
+        key = ctx.elementwise("bitcast_convert_type", [x], integer)
+        turned = ctx.elementwise("xor", [key, constants(np.iinfo(integer).max, integer)], integer)
+        negative = ctx.elementwise("lt", [key, constants(0, integer)], bool)
+        key = ctx.elementwise("select_n", [negative, key, turned], integer)
+    columns = _sort_rows(ctx, eqn, [key, x, positions], axis, 1, descending=True)
     return [np.take(y, range(k), axis) for y in columns[1:]]
 
 
-def _sorted(
+def _sort_rows(
     ctx: Lowering, eqn: JaxprEqn, args: list[Elements], axis: int, n_keys: int, descending: bool = False
 ) -> list[Elements]:
     """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
@@ -166,7 +166,7 @@ def _dot(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     if any(v.aval.dtype.kind == "f" for v in eqn.invars) and dtype.kind != "f":
         raise UnsupportedError(f"primitive 'dot_general' of floating-point numbers with a result of type {dtype}")
 
-    def arranged(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:
+    def as_matrices(x: Elements, batch: Sequence[int], summed: Sequence[int]) -> tuple[Elements, tuple[int, ...]]:
         free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
         sizes = tuple(x.shape[i] for i in free)
         x = x.transpose(*batch, *free, *summed)
@@ -174,8 +174,8 @@ def _dot(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
         return x.reshape(n_batch, n_free, -1), sizes
 
     batch = tuple(a.shape[i] for i in lhs_batch)
-    a, a_sizes = arranged(a, lhs_batch, lhs_axes)
-    b, b_sizes = arranged(b, rhs_batch, rhs_axes)
+    a, a_sizes = as_matrices(a, lhs_batch, lhs_axes)
+    b, b_sizes = as_matrices(b, rhs_batch, rhs_axes)
     times, plus = ("and", "or") if dtype.kind == "b" else ("mul", "add")
     out = []
     for n in range(a.shape[0]):

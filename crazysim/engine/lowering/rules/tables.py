@@ -42,19 +42,19 @@ class TableView:
                 continue
             largest = constant(min(limit, np.iinfo(i.dtype).max), i.dtype)
             clamped = self.ctx.scalar("clamp", constant(0, i.dtype), i, largest)
-            whole = self.ctx.scalar("convert_element_type", clamped, dtype=np.int32)
-            step = self.ctx.scalar("mul", whole, constant(stride, np.int32))
+            integer = self.ctx.scalar("convert_element_type", clamped, dtype=np.int32)
+            step = self.ctx.scalar("mul", integer, constant(stride, np.int32))
             base = self.ctx.scalar("add", base, step)
         return base
 
     def look_up(self, offsets: np.ndarray, bases: Sequence[Element]) -> Elements:
         """Return the entries with these offsets, each from its base."""
         flat = [int(k) for k in offsets.reshape(-1)]
-        found = [
+        numbers = [
             self.same[k] if k in self.same else self.ctx.lookup(self.table, base, k, self.aligned)
             for k, base in zip(flat, bases, strict=True)
         ]
-        return as_elements(found, offsets.shape)
+        return as_elements(numbers, offsets.shape)
 
 
 def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> TableView | None:
@@ -70,7 +70,7 @@ def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) 
     if not len(items) or isinstance(items[0], tuple):
         return None
     if all(map(is_constant, items)):
-        return _of_constants(ctx, x, axes) if n_indices > MAX_SELECTED_CONSTANTS else None
+        return _table_of_constants(ctx, x, axes) if n_indices > MAX_SELECTED_CONSTANTS else None
     locations = [ctx.entries.get(item) if isinstance(item, Value) else None for item in items]
     first = locations[0]
     if first is None or not all(p is not None and p.table is first.table and p.base is first.base for p in locations):
@@ -82,7 +82,7 @@ def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) 
     return None if strides is None else TableView(ctx, first, offsets, strides)
 
 
-def _of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> TableView | None:
+def _table_of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> TableView | None:
     """Return an array of constants as a table. Entries that are equal at all indices stay constants."""
     numbers = np.array([item.item() for item in x.reshape(-1)], x.reshape(-1)[0].dtype)
     if not np.all(np.isfinite(numbers)):
