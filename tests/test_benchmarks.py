@@ -305,7 +305,7 @@ def test_the_page_shows_the_committed_table(benchmarks):
 @pytest.mark.long("trains in a process of its own")
 def test_a_training_that_fails_leaves_the_others_which_are_not_trained_again(run, train, tmp_path, capsys):
     options = ("--seeds", "0", "--parallel", "2", "--out", tmp_path, "--")
-    small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "--config", "n_steps=4", "hidden=[8]")
+    small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "--config", "n_steps=4", "minibatches=2")
     with pytest.raises(SystemExit, match=r"^nothing: training with seed 0 failed$"):
         run("train.py", "--tasks", "nothing", "hover", *options, *small)
     count, *lines = lines_of(capsys.readouterr().out)
