@@ -27,6 +27,7 @@ def run(
     log: Callable[[str], None] = print,
     progress: bool = True,
     checkpoint_every: float | None = None,
+    on_iteration: Callable[[int, dict[str, float]], None] | None = None,
     **settings: Any,
 ) -> TrainResult:
     """Train a policy, evaluate it, plot the training and an episode, and film it, as ``crazysim train`` does.
@@ -45,6 +46,8 @@ def run(
         log: Function that is called with each line of output.
         progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
+        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
+            those of an evaluation after it begin with ``"evaluation "``. Each call waits for the device. None for none.
         settings: ``algorithm``, ``seed``, ``n_worlds``, ``options`` and ``config`` of ``TrainConfig.create``.
 
     Raises:
@@ -62,7 +65,7 @@ def run(
     folder = Path("out") / config.title if folder is None else Path(folder)
     if resume:
         config = TrainConfig.create(task, **settings, resumed=stored_config(folder))
-    result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every)
+    result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
     log(f"wrote {folder / CHECKPOINT}, {folder / POLICY}")
     try:
         plot_curve({config.title: read_curve(folder)}, folder / "curve.png")

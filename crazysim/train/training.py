@@ -71,6 +71,7 @@ def train(
     log: Callable[[str], None] = print,
     progress: bool = True,
     checkpoint_every: float | None = None,
+    on_iteration: Callable[[int, dict[str, float]], None] | None = None,
 ) -> TrainResult:
     """Train a policy and write checkpoint, learning curve and policy into a folder.
 
@@ -88,6 +89,8 @@ def train(
         log: Function that is called with each line of output.
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
+        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
+            those of an evaluation after it begin with ``"evaluation "``. Each call waits for the device. None for none.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
@@ -200,6 +203,7 @@ def train(
             )
 
     finite: Array | bool = True
+    metrics: dict[str, Array] = {}
     if not resume:
         record(learner)
     every = recipe_of(config.task, config.algorithm).evaluate_every
@@ -210,17 +214,23 @@ def train(
                 require_finite(finite, i)  # of the iteration before, while this one runs
                 finite = metrics["finite"]
                 show(metrics if i % 5 == 0 else None)
+                point = None
                 if (i + 1) % every == 0 and i + 1 < hyperparameters.iterations:
-                    show(record(learner), 0)
+                    point = record(learner)
+                    show(point, 0)
                 elif checkpoint_every is not None and time.perf_counter() - saved_at > checkpoint_every:
                     require_finite(finite, i + 1)
                     save(learner)
+                if on_iteration is not None and i + 1 < hyperparameters.iterations:
+                    on_iteration(i + 1, _numbers(metrics, point))
     except (KeyboardInterrupt, SystemExit):
         jax.block_until_ready(learner)
         record(learner, interrupted=True)
         log(f"interrupted after iteration {int(learner.iteration)}; wrote {path}; continue with --resume")
         raise
     last = record(learner)
+    if on_iteration is not None and metrics:
+        on_iteration(hyperparameters.iterations, _numbers(metrics, last))
     best = kept_point(curve)
     if best is not last:
         log(
@@ -237,6 +247,12 @@ def train(
         f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
     )
     return TrainResult(folder, point, kept, eval_env)
+
+
+def _numbers(metrics: dict[str, Array], point: dict[str, Any] | None) -> dict[str, float]:
+    """Return the metrics of an iteration, and of the evaluation after it if there was one, as numbers of the host."""
+    numbers = {name: float(x) for name, x in jax.device_get(metrics).items() if name != "finite"}
+    return numbers | {f"evaluation {name}": float(x) for name, x in (point or {}).items() if name != "iteration"}
 
 
 def least_kept_success(success: float, n_worlds: int) -> float:

@@ -226,6 +226,27 @@ def test_a_finished_run_resumes_with_more_iterations(whole, tmp_path):
     assert "nothing is left to train after 6 iterations; continue with more: --iterations 12" in lines
 
 
+def test_metrics_of_each_iteration_are_passed_on(whole, tmp_path, monkeypatch):
+    """Those of evaluations too, in an interrupted and a resumed run as well; the run is the same."""
+    recipe = dataclasses.replace(configs.RECIPES["hover"], evaluate_every=2)
+    monkeypatch.setitem(configs.RECIPES, "hover", recipe)
+    seen = []
+    with interrupted_after(4, monkeypatch), pytest.raises(KeyboardInterrupt):  # an evaluation shows metrics as well
+        trained(tmp_path, small_config(), on_iteration=lambda *call: seen.append(call))
+    trained(tmp_path, small_config(), resume=True, on_iteration=lambda *call: seen.append(call))
+    assert [i for i, _ in seen] == [1, 2, 4]
+    assert {"reward", "crashed", "error", "std", "value_error", "ratio_off"} == seen[0][1].keys()
+    point = read_curve(tmp_path)[-1]
+    assert {"evaluation success", "evaluation kept"} < seen[1][1].keys()
+    assert seen[-1][1]["evaluation reward"] == point["reward"]
+    assert all(type(x) is float for _, metrics in seen for x in metrics.values())
+    mine, others = arrays(tmp_path), arrays(whole.folder)
+    for name in (name for name in mine if "learner" in name):
+        np.testing.assert_array_equal(mine[name], others[name], err_msg=name)
+    trained(tmp_path, small_config(), resume=True, on_iteration=lambda *call: seen.append(call))
+    assert len(seen) == 3
+
+
 def test_evaluations_hold_the_terms_of_the_reward(whole, tmp_path):
     """They add up to the return, and the plot of an episode returns them over time."""
     point = read_curve(whole.folder)[-1]
