@@ -75,8 +75,7 @@ def _run_live(show: Show, options: argparse.Namespace, settings: dict[str, Any])
 
     from crazysim.lab.live import Browser, Window
     from crazysim.lab.shows.flight import planned_at
-    from crazysim.lab.shows.live_show import live_show
-    from crazysim.lab.shows.view import camera_around
+    from crazysim.lab.shows.view import camera_around, live_show
 
     file_option = next((name for name in ("film", "page", "report") if getattr(options, name) is not None), None)
     if file_option is not None:

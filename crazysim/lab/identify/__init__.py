@@ -6,8 +6,7 @@ from crazysim.lab.identify.fit import Identification, identify
 from crazysim.lab.identify.logs import Log, read_log
 from crazysim.lab.identify.motors import motor_lag, with_speeds
 from crazysim.lab.identify.network import fit_residual
-from crazysim.lab.identify.plots import plot_errors
-from crazysim.lab.identify.prediction import Model, Predictor, errors_table, prediction_errors
+from crazysim.lab.identify.prediction import Model, Predictor, errors_table, plot_errors, prediction_errors
 from crazysim.lab.identify.rotation import aligned, fast_rotation
 
 __all__ = [

@@ -2,9 +2,8 @@
 
 from crazysim.lab.show_files import Cue, Lights, Show, load_show, save_show
 from crazysim.lab.shows.flight import ShowFlight, fly
-from crazysim.lab.shows.live_show import ShowLights, live_show
 from crazysim.lab.shows.show_report import collisions, report, sampled_approaches, summary, tracking_rms
-from crazysim.lab.shows.view import film, page, play
+from crazysim.lab.shows.view import ShowLights, film, live_show, page, play
 
 __all__ = [
     "Cue",

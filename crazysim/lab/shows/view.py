@@ -1,4 +1,4 @@
-"""Films, windows and pages of flown shows, with the drones' lights."""
+"""Films, windows and pages of flown shows, and live simulations of shows, with the drones' lights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from crazysim.core.settings import check_flag
 from crazysim.drones.body import LED_MATERIALS
 from crazysim.errors import ConfigError
-from crazysim.lab.shows.flight import ShowFlight
+from crazysim.lab.live.loop import Live
+from crazysim.lab.live.pace import Speed
+from crazysim.lab.show_files.show import Show
+from crazysim.lab.shows.flight import ShowFlight, start_simulation
 from crazysim.lab.shows.show_report import collisions
 from crazysim.media import Film, Flight, View, flight_of, web
 from crazysim.media.flight_recorder import show_flight_at
@@ -37,6 +40,8 @@ NIGHT_LIGHT = 0.1
 """Brightest light at night, 0 to 1."""
 NIGHT_SKY = (8, 10, 24)
 """Brightest colour of the sky at night, 0 to 255."""
+LIGHT_FREQ = 50
+"""Rate at which the LEDs change in a live simulation, Hz."""
 
 
 def film(
@@ -178,3 +183,37 @@ def _led_materials(sim: Sim) -> tuple[str, ...]:
 
 def _ascii(text: str) -> str:
     return text.encode("ascii", "replace").decode()[:99]
+
+
+class ShowLights:
+    """Process that sets the LEDs of drones to the colours of a show: ``live.add(ShowLights(show))``."""
+
+    def __init__(self, show: Show):
+        """Create the process of a show, whose k-th drone is the simulation's k-th.
+
+        Args:
+            show: Show, which begins when the simulated time is zero.
+        """
+        self._lights, self._n = show.lights, show.n_drones
+
+    def __call__(self, live: Live) -> None:
+        """Set the colours at the present time, equal in all worlds."""
+        live.lights[:, : self._n] = self._lights.colors([live.time])[0]
+
+
+def live_show(show: Show, speed: Speed = 1.0, **settings: Any) -> Live:
+    """Return a live simulation of a show; ``show`` a viewer and ``run`` it.
+
+        with live_show(load_show("my_show.skyc")) as live:
+            live.show(Browser())
+            live.run()
+
+    Args:
+        show: Show, whose drones start hovering at the first points of their trajectories.
+        speed: Simulated seconds per second, or ``"max"``.
+        settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
+    """
+    sim = start_simulation(show, settings)
+    live = Live(sim, speed=speed)
+    live.add(ShowLights(show), freq=LIGHT_FREQ, name="lights")
+    return live

@@ -20,9 +20,8 @@ from crazysim.control import Control
 from crazysim.errors import ConfigError
 from crazysim.lab.live.attitude import yaw_of
 from crazysim.lab.live.host_trajectory import HostTrajectory
-from crazysim.lab.live.swarm.estimate import EstimateFrame
 from crazysim.lab.live.swarm.motion import PlannedMotion, move, nearest_yaw
-from crazysim.lab.live.swarm.state import DroneState
+from crazysim.lab.live.swarm.state import DroneState, EstimateFrame
 
 STABILIZE, SHUTDOWN = 0.5, 2.0
 """Time without a streamed setpoint after which the drone holds its position, and after which its motors stop, s."""

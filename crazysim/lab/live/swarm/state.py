@@ -1,12 +1,14 @@
-"""States of drones, simulated and real."""
+"""States of drones, simulated and real, and the frame of a drone's estimate."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
-from crazysim.lab.live.attitude import to_rpy
+from crazysim.control import Control
+from crazysim.lab.live.attitude import from_yaw, multiply, rotate, to_rpy
 
 
 class DroneState(NamedTuple):
@@ -29,3 +31,44 @@ class DroneState(NamedTuple):
     def rpy(self) -> NDArray:
         """Roll, pitch and yaw, rad. (3,)"""
         return to_rpy(self.quat)
+
+
+class EstimateFrame(NamedTuple):
+    """Turn about the vertical and shift from the world to the frame of a drone's estimate.
+
+    Without absolute positioning, as with a Flow deck, the estimate is the pose at which the estimator was started
+    (``kalmanCoreInit`` in kalman_core.c of crazyflie-firmware) and the motion since then; commands are relative to it.
+    """
+
+    turn: float
+    """Angle about the vertical, rad."""
+    shift: NDArray
+    """Position of the world's origin, m. (3,)"""
+
+    @staticmethod
+    def from_pose(pos: NDArray, yaw: float, pose: NDArray) -> EstimateFrame:
+        """Return the frame in which a drone at a position, m, and yaw, rad, of the world has a pose (4,)."""
+        turn = float(pose[3]) - yaw
+        return EstimateFrame(turn, pose[:3] - rotate(from_yaw(turn), pos))
+
+    def state(self, state: DroneState) -> DroneState:
+        """Return the state of a drone in this frame."""
+        quat = from_yaw(self.turn)
+        return state._replace(
+            pos=rotate(quat, state.pos) + self.shift, quat=multiply(quat, state.quat), vel=rotate(quat, state.vel)
+        )
+
+    def motion(self, pos: NDArray, vel: NDArray, yaw: float) -> tuple[NDArray, NDArray, float]:
+        """Return position, m, velocity, m/s, and yaw, rad, in this frame."""
+        quat = from_yaw(self.turn)
+        return rotate(quat, pos) + self.shift, rotate(quat, vel), yaw + self.turn
+
+    def command(self, level: Control, command: NDArray) -> NDArray:
+        """Return a command in the world's frame."""
+        if level == Control.attitude:
+            return command - [0.0, 0.0, self.turn, 0.0]
+        if level != Control.state:
+            return command
+        back = from_yaw(-self.turn)
+        pos, vel, acc = (rotate(back, x) for x in (command[:3] - self.shift, command[3:6], command[6:9]))
+        return np.concatenate([pos, vel, acc, multiply(back, command[9:13]), command[13:]])
