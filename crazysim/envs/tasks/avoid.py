@@ -38,9 +38,9 @@ HEIGHT = 2.0
 """Height of poles and ceiling, m."""
 JITTER = 0.15
 """Largest component of the distance of starts and goals from their places, m."""
-CRUISE_SPEED = 2.5
+CRUISE_SPEED = 2.0
 """Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so it brakes with up
-to g, and stops from there within v^2 / 2 g = 0.32 m, less than half a cell."""
+to g, and stops from there within v^2 / 2 g = 0.2 m, a quarter of a cell."""
 SPACING = 0.6
 """Distance between the starts, and between the goals, of several drones, m."""
 
@@ -176,30 +176,45 @@ class Avoid(Task):
         record = crossing_of(data)
         return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
 
-    def nearest_ways(self, data: SimData) -> Array:
-        """Return the ways to the nearest points of the nearest obstacles, m. (n_drones, n_seen, 3)"""
+    def nearest_obstacles(self, data: SimData) -> tuple[Array, Array]:
+        """Return the nearest obstacles, as ways from the drone and from there on. (n_drones, n_seen, 3) each
+
+        Returns:
+            Way to the nearest point of each, m; way from that point to the middle of a box, which shows how far the box
+            extends to either side, zero for a pole, m.
+        """
         dtype, handles = data.states.pos.dtype, crossing_of(data).handles
-        places = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
+        rows = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
         n_poles, n_boxes = self.n_poles, self.n_boxes
         # Middle and half size of each solid, in the object's frame; a pole's radius is subtracted from the distance.
         middle = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[0, 0, 0]] * n_boxes)
         size = np.array([[0, 0, HEIGHT / 2]] * n_poles + [[BOX_WIDTH / 2] * 3] * n_boxes)
         thick = np.array([POLE_RADIUS] * n_poles + [0.0] * n_boxes)
-        pos, quat = (x[..., places, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
+        is_box = np.arange(n_poles + n_boxes)[:, None] >= n_poles
+        pos, quat = (x[..., rows, :] for x in (data.objects.pos, data.objects.quat))  # type: ignore[union-attr]
         inside = rotation.rotate_inverse(quat, data.states.pos[..., None, :] - pos) - middle.astype(dtype)
         reach = jnp.asarray(size, dtype)
-        ways = rotation.safe_clip(inside, -reach, reach) - inside
-        far = rotation.safe_norm(ways)
+        nearest = rotation.safe_clip(inside, -reach, reach)
+        far = rotation.safe_norm(nearest - inside)
         gap = far - thick[:, None].astype(dtype)
-        ways = rotation.rotate(quat, ways) * (gap / jnp.where(far > 1e-3, far, 1))
-        return nearest_entries(gap[..., 0], ways, min(self.n_seen, n_poles + n_boxes))
+        ways = rotation.rotate(quat, nearest - inside) * (gap / jnp.where(far > 1e-3, far, 1))
+        to_middle = jnp.where(is_box, rotation.rotate(quat, -nearest), 0)
+        both = jnp.concatenate([ways, to_middle], axis=-1)
+        seen = nearest_entries(gap[..., 0], both, min(self.n_seen, n_poles + n_boxes))
+        return seen[..., :3], seen[..., 3:]
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and the ways to its goal, to the nearest obstacles and to other drones, m."""
+        """Return the drone's state, and the ways to its goal, to the nearest obstacles and to other drones, m.
+
+        ``obstacles_near`` are the ways to their nearest points, ``obstacles_middle`` the ways from there to the middles
+        of boxes, zero for poles.
+        """
         n_drones = data.core.n_drones
+        ways, to_middle = self.nearest_obstacles(data)
         obs = state_of(data) | {
             "difference_to_goal": crossing_of(data).goal - data.states.pos,
-            "obstacles_near": self.nearest_ways(data).reshape(n_drones, -1),
+            "obstacles_near": ways.reshape(n_drones, -1),
+            "obstacles_middle": to_middle.reshape(n_drones, -1),
         }
         if n_drones > 1:
             others, _ = nearest_drones(data, 2, ~crossing_of(data).out)
@@ -208,11 +223,11 @@ class Avoid(Task):
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         record = crossing_of(data)
-        gap = rotation.safe_norm(self.nearest_ways(data)[..., 0, :])[..., 0]
+        gap = rotation.safe_norm(self.nearest_obstacles(data)[0][..., 0, :])[..., 0]
         speed = rotation.safe_norm(data.states.vel)[..., 0]
         paid = {
             "progress": 2.0 * (record.remaining_way_before - self.error(data)),
-            "closeness": -0.05 * jnp.exp(-10 * gap),
+            "closeness": -0.2 * jnp.exp(-6 * gap),
             "haste": -0.1 * jnp.maximum(speed - CRUISE_SPEED, 0),
             "spin": -0.002 * terms.spin(data),
             "action_rate": -0.02 * terms.action_rate(action, last_action),
