@@ -1,7 +1,7 @@
 """Training results: several seeds per task, evaluated on 1,000 held-out initial states, and the table of the page.
 
     python benchmarks/train.py [--tasks hover track] [--seeds 0 1 2 3 4] [--device gpu] [--parallel 12] [--plot FILE]
-    python benchmarks/train.py --all --seeds $(seq 201 220) --device gpu --parallel 12 --write
+    python benchmarks/train.py --all --seeds $(seq 41 50) --device gpu --parallel 9 --write
     python benchmarks/train.py --check --device gpu --parallel 12
     python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
@@ -252,7 +252,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         joined = seeds == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
         cells = (
             f"`{row['task']}`",
-            f"{names[row['algorithm']]}, {row['env_steps'] / 1e6:.2g} M",
+            f"{names[row['algorithm']]}, {digits(row['env_steps'] / 1e6, 2):g} M",
             f"{seeds[0]} to {seeds[-1]}" if joined else ", ".join(map(str, seeds)),
             f"{row['least']:.1%}",
             f"{row['median']:.1%}",
