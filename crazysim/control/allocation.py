@@ -1,4 +1,4 @@
-"""Allocation, the last step of the cascade: wrench to rotor speeds."""
+"""Control allocation, the last step of the cascade: from a wrench to rotor speeds."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from crazysim.rotation import matvec, safe_clip
 
 
 class AllocationParams(PyTree):
-    """Parameters of the allocation, each shared or one per drone."""
+    """Parameters of the allocation, each shared by all drones or with one value per drone."""
 
     thrust_min: Array = leaf("parameter", 1)
     """Minimum thrust of a rotor that is on, N. (1,)"""
     thrust_max: Array = leaf("parameter", 1)
     """Maximum thrust of one rotor, N. (1,)"""
     arms: Array = leaf("parameter", 1)
-    """Torque per thrust about x and y (arm) and z (drag torque over thrust), m. (3,)"""
+    """Torque per thrust about x and y (the arm) and about z (drag torque over thrust), m. (3,)"""
     rpm2thrust: Array = leaf("parameter", 2)
-    """Thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
+    """Coefficients of the thrust curve that the controller assumes, N, N/rpm, N/rpm^2. (1, 3)"""
     allocation_matrix: Array = leaf("parameter", 2)
-    """Allocation matrix, wrench over the arms to rotor thrusts, 1. (n_rotors, 4)"""
+    """Matrix from collective thrust and torque divided by ``arms`` to rotor thrusts, 1. (n_rotors, 4)"""
     rotors: Array | None = leaf("parameter", 1, default=None)
-    """True for the rotors that the drone has; None where all drones have equally many. (n_rotors,)"""
+    """True for the rotors that the drone has; None if all drones have the same number of rotors. (n_rotors,)"""
     weight: Array | None = leaf("parameter", 1, (1,), default=None)
-    """Weight, up to which roll and pitch torque may raise the collective thrust, N; None where clipping is not by
-    priority. (1,)"""
+    """Weight, N: the limit up to which roll and pitch torque may raise the collective thrust. None if clipping does not
+    use priorities. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> AllocationParams:
-        """Return the shared parameters of an airframe.
+        """Return the parameters of an airframe, shared by all drones.
 
-        For the drag torque over thrust see ``torque_arms``.
+        ``torque_arms`` documents where the drag torque over thrust comes from.
         """
         curve = airframe.value("rotors.thrust_curve")
         return AllocationParams(
@@ -50,24 +50,31 @@ class AllocationParams(PyTree):
 
 
 def hover_rotor_vel(airframe: Airframe) -> np.ndarray:
-    """Return the speed at which each rotor lifts its share of the weight, rpm. (1,), or (n_rotors,) if they differ."""
+    """Return the rotor speed at which each rotor lifts an equal share of the weight, rpm.
+
+    Returns:
+        (1,), or (n_rotors,) if each rotor has its own thrust curve
+    """
     thrust = float(airframe.value("rigid_body.mass", ())) * GRAVITY_MAGNITUDE / airframe.n_rotors
     return airframe.rotor_vel([thrust])
 
 
 def level_thrust(airframe: Airframe) -> float:
-    """Return the largest collective thrust without a torque, N: that at which the first rotor is at its limit."""
+    """Return the largest collective thrust without torque, N: the first rotor is then at its maximum thrust."""
     return float(airframe.value("rotors.thrust_max", ()) / np.max(allocation_matrix(airframe)[:, 0]))
 
 
 def torque_arms(airframe: Airframe) -> np.ndarray:
-    """Return torque per thrust about x, y and z, m: the third is the airframe's number, or else ``yaw_arm``. (3,)"""
-    known = airframe.values.get("controller.thrust2torque")
-    return np.array([airframe.arm, airframe.arm, yaw_arm(airframe) if known is None else float(known)])
+    """Return the torque per thrust about x, y and z, m. (3,)
+
+    The third entry is the value ``controller.thrust2torque`` of the airframe, or ``yaw_arm`` if it has none.
+    """
+    thrust2torque = airframe.values.get("controller.thrust2torque")
+    return np.array([airframe.arm, airframe.arm, yaw_arm(airframe) if thrust2torque is None else float(thrust2torque)])
 
 
 def yaw_arm(airframe: Airframe) -> float:
-    """Return the ratio of the changes of a rotor's drag torque and thrust around hover, m."""
+    """Return the change of a rotor's drag torque per change of its thrust around hover, m: the mean of all rotors."""
     hover = hover_rotor_vel(airframe)
     slopes = []
     for key in ("torque_curve", "thrust_curve"):
@@ -77,25 +84,26 @@ def yaw_arm(airframe: Airframe) -> float:
 
 
 def hover_arms(airframe: Airframe) -> np.ndarray:
-    """Return torque per thrust about x, y and z around hover, m. (3,)"""
+    """Return the torque per thrust about x, y and z around hover, m, with ``yaw_arm`` as the third entry. (3,)"""
     return np.array([airframe.arm, airframe.arm, yaw_arm(airframe)])
 
 
 def wrench_matrix(airframe: Airframe) -> np.ndarray:
-    """Return the matrix from the rotors' thrusts to thrust and torque around hover, 1 and m. (4, n_rotors)"""
+    """Return the matrix from rotor thrusts to collective thrust, 1, and torque around hover, m. (4, n_rotors)"""
     return np.vstack([np.ones(airframe.n_rotors), hover_arms(airframe)[:, None] * airframe.mixing_matrix])
 
 
 def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     """Return the rotor speeds that produce a wrench, each within its limits.
 
-    The wrench is allocated with the least-norm inverse of the mixing matrix, and each thrust is clipped on its own, as
-    in Crazyflow. The firmware lowers all motors by the excess of the highest instead, which keeps the torque; see
-    ``crazysim.control.power_distribution``. A collective thrust of zero or less switches the motors off.
+    The wrench is allocated with the least-norm inverse of the mixing matrix. Each rotor thrust is then clipped
+    independently, as in Crazyflow. The firmware instead lowers all motors by the excess of the highest one, which keeps
+    the torque; see ``crazysim.control.power_distribution``. If the collective thrust is zero or less, the motors are
+    off.
 
     Args:
         cmd: Collective thrust, N, and body torque, N m. (..., 4)
-        params: Parameters, shared or with the leading axes of the command.
+        params: Parameters, shared or with the same leading axes as the command.
 
     Returns:
         Rotor speeds, rpm. (..., n_rotors)
@@ -104,4 +112,4 @@ def force_torque2rotor_vel(cmd: Array, *, params: AllocationParams) -> Array:
     force = cmd[..., :1]
     thrusts = matvec(p.allocation_matrix, jnp.concatenate([force, cmd[..., 1:] / p.arms], axis=-1))
     rotor_vel = rotor_vel_of_thrust(safe_clip(thrusts, p.thrust_min, p.thrust_max), p.rpm2thrust)
-    return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN passes through, so that it is flagged
+    return jnp.where(force <= 0, 0.0, rotor_vel)  # NaN passes through, so that the world is flagged

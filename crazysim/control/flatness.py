@@ -1,4 +1,4 @@
-"""Differential flatness: attitude, body rates and angular acceleration of a thrust vector and a yaw that change."""
+"""Differential flatness: attitude, body rates and angular acceleration from a changing thrust vector and yaw."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from crazysim.pytree import PyTree, leaf
 from crazysim.rotation import cross, dot, matvec
 
 MIN_HEADING_SINE = 0.05
-"""Sine of the angle between thrust and heading below which the yaw rate that holds the heading is limited.
+"""Sine of the angle between thrust and heading below which the body rate about z is limited.
 
-Below 3 degrees the heading does not determine the attitude, and the rate that holds it grows without bound.
+As the angle approaches zero, the heading no longer determines the attitude, and the body rate that holds the heading
+grows without bound. The limit takes effect below 3 degrees.
 """
 
 MIN_THRUST = 1e-3
-"""Thrust over mass below which its direction counts as undefined, m/s^2: a ten-thousandth of hover."""
+"""Thrust over mass below which the direction of thrust counts as undefined, m/s^2: 1/10000 of the thrust in hover."""
 
 
 class Attitude(NamedTuple):
-    """Attitude with its first two derivatives."""
+    """Attitude, angular velocity and angular acceleration."""
 
     matrix: Array
     """Rotation matrix, body to world. (..., 3, 3)"""
@@ -35,7 +36,7 @@ class Attitude(NamedTuple):
 
 
 class FlatState(PyTree):
-    """Attitude, rates and wrench of a drone that flies a setpoint exactly."""
+    """Attitude, its derivatives and wrench of a drone that tracks a setpoint exactly."""
 
     quat: Array = leaf("drone", 1)
     """Attitude, body to world, unit, xyzw. (..., 4)"""
@@ -52,28 +53,28 @@ class FlatState(PyTree):
 def flat_state(
     setpoint: Setpoint, mass: Array | float, inertia: Array, gravity_vec: Array | tuple[float, ...] = GRAVITY
 ) -> FlatState:
-    """Return attitude, rates and wrench with which a drone without drag flies a setpoint.
+    """Return the attitude, its derivatives and the wrench with which a drone without drag tracks a setpoint exactly.
 
     Position and yaw are flat outputs of a multirotor: with their derivatives they determine its state and its inputs
     (Mellinger and Kumar 2011, section III). The thrust is ``m |acc - g|`` along ``acc - g``, and the torque follows
-    from Euler's equation, ``J w' + w x J w``. The docstring of ``attitude_of_thrust`` has the rules for attitudes that
-    are not determined.
+    from Euler's equation, ``J w' + w x J w``. See ``attitude_of_thrust`` for setpoints that do not determine an
+    attitude.
 
     Args:
-        setpoint: Position, yaw and their derivatives.
+        setpoint: Position and yaw, with their derivatives.
         mass: Mass, kg. () or (..., 1)
         inertia: Inertia about the centre of mass, body frame, kg m^2. (3, 3) or (..., 3, 3)
         gravity_vec: Gravitational acceleration, world frame, m/s^2. (3,)
     """
-    thrust = setpoint.acc - jnp.asarray(gravity_vec, setpoint.acc.dtype)
+    specific_thrust = setpoint.acc - jnp.asarray(gravity_vec, setpoint.acc.dtype)
     s = setpoint
-    attitude = attitude_of_thrust(thrust, s.jerk, s.snap, s.yaw, s.yaw_rate, s.yaw_acc)
+    attitude = attitude_of_thrust(specific_thrust, s.jerk, s.snap, s.yaw, s.yaw_rate, s.yaw_acc)
     axes = (attitude.matrix[..., 0], attitude.matrix[..., 1], attitude.matrix[..., 2])
     return FlatState(
         quat=rotation.quat_from_axes(*axes),
         ang_vel=attitude.ang_vel,
         ang_acc=attitude.ang_acc,
-        thrust=mass * rotation.safe_norm(thrust),
+        thrust=mass * rotation.safe_norm(specific_thrust),
         torque=matvec(inertia, attitude.ang_acc) + cross(attitude.ang_vel, matvec(inertia, attitude.ang_vel)),
     )
 
@@ -86,16 +87,18 @@ def attitude_of_thrust(
     yaw_rate: Array,
     yaw_acc: Array,
 ) -> Attitude:
-    """Return the attitude whose z axis is along a thrust vector and whose x axis is closest to a heading.
+    """Return the attitude whose z axis is along a thrust vector and whose x axis is as close as possible to a heading.
 
     With the thrust ``f``, the heading ``c = (cos yaw, sin yaw, 0)`` and ``l = e_z x c``, the axes are ``z = f / |f|``,
-    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011). The rates follow from two
-    conditions, differentiated once and twice: ``z' = w_y x - w_x y``, and ``y . c = 0``:
+    ``y = z x c / |z x c|`` and ``x = y x z`` (Mellinger and Kumar 2011). The body rates ``w`` about x and y follow from
+    ``z' = w_y x - w_x y``. The rate about z follows from the derivative of ``y . c = 0``:
 
         w_z x.c = w_x z.c + yaw' y.l
 
-    A thrust below ``MIN_THRUST`` counts as one along z that does not change. Where thrust and heading are parallel, y
-    is the horizontal ``l``, and the rate about z is limited (``MIN_HEADING_SINE``).
+    The angular acceleration follows from the derivatives of these two equations.
+
+    A thrust below ``MIN_THRUST`` is replaced by one along the vertical that does not change. Where thrust and heading
+    are parallel, y is the horizontal ``l``, and the rate about z is limited (``MIN_HEADING_SINE``).
 
     Args:
         thrust: Thrust vector over the mass, world frame, m/s^2. (..., 3)
@@ -109,33 +112,36 @@ def attitude_of_thrust(
     z, z_rate, z_acc = thrust_direction(thrust, thrust_rate, thrust_acc)
     across = cross(z, ahead)
     y = jnp.where(dot(across, across) < 1e-10, left, rotation.safe_normalize(across, left))
-    x = rotation.safe_normalize(cross(y, z), ahead)  # exactly one unless thrust and heading are parallel
+    x = rotation.safe_normalize(cross(y, z), ahead)  # of length one already, unless thrust and heading are parallel
 
     x_ahead = jnp.maximum(dot(x, ahead), MIN_HEADING_SINE)
     z_ahead, y_left, x_left, z_left = dot(z, ahead), dot(y, left), dot(x, left), dot(z, left)
     wx, wy = -dot(y, z_rate), dot(x, z_rate)
     wz = (wx * z_ahead + yaw_rate * y_left) / x_ahead
-    ax, ay = wy * wz - dot(y, z_acc), dot(x, z_acc) - wx * wz
-    swing = z_ahead * (ax + wy * wz) + 2 * yaw_rate * (wx * z_left - wz * x_left) + yaw_acc * y_left
-    az = wx * wy + swing / x_ahead
-    ang_vel, ang_acc = jnp.concatenate([wx, wy, wz], axis=-1), jnp.concatenate([ax, ay, az], axis=-1)
+    wx_rate, wy_rate = wy * wz - dot(y, z_acc), dot(x, z_acc) - wx * wz
+    heading_terms = z_ahead * (wx_rate + wy * wz) + 2 * yaw_rate * (wx * z_left - wz * x_left) + yaw_acc * y_left
+    wz_rate = wx * wy + heading_terms / x_ahead
+    ang_vel = jnp.concatenate([wx, wy, wz], axis=-1)
+    ang_acc = jnp.concatenate([wx_rate, wy_rate, wz_rate], axis=-1)
     return Attitude(jnp.stack([x, y, z], axis=-1), ang_vel, ang_acc)
 
 
 def thrust_direction(thrust: Array, thrust_rate: Array, thrust_acc: Array) -> tuple[Array, Array, Array]:
-    """Return the unit vector along a vector, and its first two derivatives; e_z at rest below ``MIN_THRUST``.
+    """Return the unit vector along a thrust vector, with its first two derivatives.
+
+    Below ``MIN_THRUST`` it is e_z, with derivatives of zero.
 
     Args:
-        thrust: Vector, m/s^2. (..., 3)
+        thrust: Thrust vector over the mass, m/s^2. (..., 3)
         thrust_rate: Its derivative, m/s^3. (..., 3)
         thrust_acc: Its second derivative, m/s^4. (..., 3)
 
     Returns:
         Direction, its derivative, 1/s, and its second derivative, 1/s^2. (..., 3) each
     """
-    falls = dot(thrust, thrust) < MIN_THRUST**2
-    inverse = jnp.where(falls, 0.0, 1 / rotation.safe_norm(jnp.where(falls, 1.0, thrust)))
-    z = jnp.where(falls, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
+    is_undefined = dot(thrust, thrust) < MIN_THRUST**2
+    inverse = jnp.where(is_undefined, 0.0, 1 / rotation.safe_norm(jnp.where(is_undefined, 1.0, thrust)))
+    z = jnp.where(is_undefined, jnp.asarray([0.0, 0.0, 1.0], thrust.dtype), thrust * inverse)
     growth = dot(z, thrust_rate) * inverse
     z_rate = thrust_rate * inverse - growth * z
     growth_rate = (dot(z_rate, thrust_rate) + dot(z, thrust_acc)) * inverse

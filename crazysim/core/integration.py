@@ -1,4 +1,4 @@
-"""Integrators: from a state and its derivative to the next state, plugins' own states included."""
+"""Integrators, which advance the states of drones and plugins by one step."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ R = TypeVar("R", bound=PyTree)
 DerivFn = Callable[[SimData], SimStateDeriv]
 
 MAX_ROTATION = 1.0
-"""Largest rotation per step about a body axis, rad: angular velocities are limited to ``MAX_ROTATION * freq``.
+"""Largest rotation per step about a body axis, rad. Angular velocities are limited to ``MAX_ROTATION * freq``.
 
-No model damps the rate that a constant torque builds up, so this limit does. It is 500 rad/s at 500 Hz. The range of a
-Crazyflie's gyroscope is 35 rad/s (2000 degrees per second; BMI088, data sheet).
+No model has damping that would bound the angular velocity under a constant torque. This limit bounds it, to 500 rad/s
+at 500 Hz. For comparison, the gyroscope of a Crazyflie measures up to 35 rad/s (2000 degrees per second; BMI088, data
+sheet).
 """
 
 
@@ -35,9 +36,9 @@ class Integrator(StrEnum):
     euler = "euler"
     """Explicit Euler, order 1: the fastest."""
     symplectic_euler = "symplectic_euler"
-    """Semi-implicit Euler, order 1: positions move with the new velocities. As fast, with less drift of energy."""
+    """Semi-implicit Euler, order 1: positions move with the new velocities. As fast, with less energy drift."""
     rk4 = "rk4"
-    """Runge-Kutta, order 4: four derivatives per step."""
+    """Classical Runge-Kutta, order 4: four evaluations of the derivative per step."""
     default = euler
 
     @property
@@ -62,9 +63,9 @@ def symplectic_euler(data: SimData, deriv_fn: DerivFn) -> SimData:
 def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
     """Return the data one Runge-Kutta step of order 4 later.
 
-    Rotations about different axes do not commute, so an attitude that moves along the averaged body rate is
-    only of order 2. The two cross products are the commutators that restore order 4 (Munthe-Kaas 1999; in the
-    form of Celledoni, Marthinsen and Owren 2014, section 3, with the signs of body rates).
+    Rotations about different axes do not commute, so an attitude advanced with the averaged body rate is only accurate
+    to order 2. The two cross products are commutators that restore order 4 (Munthe-Kaas 1999; here in the form of
+    Celledoni, Marthinsen and Owren 2014, section 3, with the signs for body rates).
     """
     dt = 1 / data.core.freq
     k1 = deriv_fn(data)
@@ -78,14 +79,14 @@ def rk4(data: SimData, deriv_fn: DerivFn) -> SimData:
 
 
 def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool = True) -> SimData:
-    """Return the data ``dt`` seconds along a derivative.
+    """Return the data advanced by ``dt`` seconds along a derivative.
 
     Args:
         data: Data at the start of the step.
         deriv: Derivative of the states.
         dt: Duration, s.
-        final: True for the end of a step, where quaternions are normalised and angular velocities limited; False for
-            its intermediate points.
+        final: True at the end of a step, to normalise quaternions and limit angular velocities. False at intermediate
+            points of a step.
     """
     s = data.states
     ang_vel = s.ang_vel + dt * deriv.ang_acc
@@ -98,17 +99,17 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool
     )
     if not deriv.plugins:
         return data.replace(states=states)
-    moved = {name: advance_record(data.plugins[name], rates, dt) for name, rates in deriv.plugins.items()}
-    return data.replace(states=states, plugins=data.plugins | moved)
+    records = {name: advance_record(data.plugins[name], rates, dt) for name, rates in deriv.plugins.items()}
+    return data.replace(states=states, plugins=data.plugins | records)
 
 
 def advance_record(record: R, rates: Mapping[str, Array], dt: float) -> R:
-    """Return a record ``dt`` seconds along a derivative, by field."""
+    """Return a record advanced by ``dt`` seconds, given the time derivatives of some of its fields by name."""
     return record.replace(**{field: getattr(record, field) + dt * rate for field, rate in rates.items()})
 
 
 def limit_ang_vel(ang_vel: Array, freq: float) -> Array:
-    """Return angular velocities limited to ``MAX_ROTATION`` per step about each axis, rad/s. (..., 3)"""
+    """Return angular velocities, rad/s, limited to ``MAX_ROTATION`` per step about each body axis. (..., 3)"""
     limit = MAX_ROTATION * freq
     return rotation.safe_clip(ang_vel, -limit, limit)
 
@@ -122,14 +123,14 @@ INTEGRATORS: dict[Integrator, Callable[..., SimData]] = {
 
 @dataclass(frozen=True)
 class Integration:
-    """The function of the stage ``integration``: one step of the drones' states and of plugins' own, together."""
+    """Function of the stage ``integration``, which advances the states of drones and plugins together by one step."""
 
     method: Callable[[SimData, DerivFn], SimData]
     """The integrator, one of ``INTEGRATORS``."""
     deriv_fn: DerivFn
     """Derivative of the drones' states."""
     plugins: tuple[Plugin, ...] = ()
-    """Plugins whose influences and derivatives count, in the order in which they are applied."""
+    """Plugins with influences, derivatives or a constraint, in the order in which they are applied."""
 
     def __call__(self, data: SimData) -> SimData:
         """Return the data one step later."""
@@ -137,11 +138,11 @@ class Integration:
 
     @property
     def couples_world(self) -> bool:
-        """True if a plugin couples the drones of a world, so that the stage is of one world."""
+        """True if a plugin couples the drones of a world, so that the stage has the scope ``world``."""
         return any(plugin.constrains and plugin.coupling == "world" for plugin in self.plugins)
 
     def derivative(self, data: SimData) -> SimStateDeriv:
-        """Return the derivative of the drones' states under all influences, and of the plugins' own states."""
+        """Return the derivative of the states of drones and plugins, under all influences and the constraint."""
         if self.couples_world:
             influenced, deriv = data, vmap_drones(lambda drone_data: self._free(drone_data)[1])(data)
         else:
@@ -156,18 +157,19 @@ class Integration:
         return apply_constraint(constraining[0], influenced, deriv, None if self.method is rk4 else dt)
 
     def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
-        """Return the data under all influences, and the derivative without constraints."""
+        """Return the data with all influences applied, and the derivative without constraints."""
         for plugin in self.plugins:
             data = apply_influence(plugin, data)
         deriv = self.deriv_fn(data)
-        of_drones = [plugin for plugin in self.plugins if plugin.scope == "drone"]
-        plugin_derivs = {plugin.name: rates for plugin in of_drones if (rates := plugin_rates(plugin, data))}
+        drone_plugins = [plugin for plugin in self.plugins if plugin.scope == "drone"]
+        plugin_derivs = {plugin.name: rates for plugin in drone_plugins if (rates := plugin_rates(plugin, data))}
         return data, deriv.replace(plugins=plugin_derivs) if plugin_derivs else deriv
 
     def stage(self) -> Stage:
-        """Return the stage. Plugins are written for one drone or one world, the rest takes any leading axes.
+        """Return the stage of a step pipeline.
 
-        The derivative is one of the package's own.
+        Without plugins it accepts any leading batch axes; plugins are written for one drone or one world. ``deriv_fn``
+        must be one of the derivatives of this package, so that the stage without plugins can be declared fixed.
         """
         scope = "world" if self.couples_world else "drone"
         return Stage(self, scope, batched=not self.plugins, name="integration", fixed=not self.plugins)

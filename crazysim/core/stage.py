@@ -1,4 +1,4 @@
-"""Stages with a declared scope, one drone or one world, and functions of one world applied to all worlds."""
+"""Stages with a declared scope, such as one drone or one world, and transformations of functions to all worlds."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ StageScope = str
 """``"drone"``, ``"world"``, ``"batch"`` for all worlds, or the name of a population."""
 
 Phase = Literal["before", "each", "after"]
-"""When in a call a stage runs: once before the first step, at each step, or once after the last."""
+"""Time within a call at which a stage runs: once before the first step, at each step, or once after the last."""
 
 PHASES: tuple[Phase, ...] = ("before", "each", "after")
 
 RESERVED_SCOPES = ("batch", "batched", "shared", "opaque", "parameter", "member")
-"""Names of other scopes, which neither a stage is declared for nor a population is named."""
+"""Names of other scopes, which are not allowed as the scope of a stage or the name of a population."""
 
 
 class Stage:
-    """A function ``SimData -> SimData`` with the scope that it is written for.
+    """A function ``SimData -> SimData``, with the scope that the function is written for.
 
-    Called with the data of a simulation, it applies its function to every drone, or to every world.
+    When the stage is called with the data of a simulation, it applies the function to every drone, to every member of a
+    population, or to every world.
     """
 
     def __init__(
@@ -56,9 +57,9 @@ class Stage:
     ):
         """Declare a stage; see ``stage``.
 
-        ``batched`` declares that the functions also take any leading axes. ``fixed`` declares that they always do the
-        same, for any numbers of worlds and drones, so that an engine traces them once in a process. ``why`` is the
-        reason of the scope ``"batch"``.
+        ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``fixed`` declares that they always
+        do the same, without reading the numbers of worlds and drones, so that an engine traces them only once in a
+        process. ``why`` is the reason for the scope ``"batch"``, for messages.
         """
         self.fn, self.when, self.batched, self.fixed, self.why = fn, when, batched, fixed, why
         self.scope: StageScope = scope
@@ -73,7 +74,7 @@ class Stage:
         return _apply_in_all_worlds(self, data)
 
     def apply_to_one(self, data: SimData) -> SimData:
-        """Return the data of one drone or world after the stage."""
+        """Return the data after the stage, for data of the scope that the stage is written for."""
         after = self.fn(data)
         mask = None if self.when is None else self.when(data)
         if mask is None:
@@ -85,7 +86,12 @@ class Stage:
         return jax.tree.map(select, after, data)
 
     def apply_in_worlds(self, data: SimData, mask: Array | None) -> SimData:
-        """Return the data after the stage in the worlds of a mask, (n_worlds,), or in all for None."""
+        """Return the data after the stage, with changes only in some worlds.
+
+        Args:
+            data: Data of the simulation.
+            mask: True in the worlds to change; None for all. (n_worlds,)
+        """
         after = self(data)
         return (
             after
@@ -100,25 +106,25 @@ class Stage:
 def stage(
     scope: StageScope, when: Callable[..., Array | None] | None = None, phase: Phase = "each"
 ) -> Callable[[Callable[..., Any]], Stage]:
-    """Declare the scope of a stage, so that an engine can fuse it with its neighbours.
+    """Declare the scope of a stage, so that an engine can fuse the stage with its neighbours.
 
     A stage without a declared scope receives the full batch.
 
-    ``@stage("drone")``: the data of one drone. Leaves of drones and worlds come without batch axes: ``pos`` is (3,),
-    ``steps`` (). Leaves of other populations come as (n_members, ...). The stage writes leaves of its drone, and reads
-    leaves of other drones by ``reduce_over_others``.
+    A stage with ``@stage("drone")`` receives the data of one drone. Leaves of drones and worlds have no batch axes:
+    ``pos`` is (3,), ``steps`` (). Leaves of other populations are (n_members, ...). The stage may write leaves of its
+    drone, and reads leaves of other drones with ``reduce_over_others``.
 
-    ``@stage("cars")``: the data of one member of the population of that name, likewise. Leaves of drones come as
-    (n_drones, ...). The stage writes leaves of the population.
+    A stage with ``@stage("cars")`` receives the data of one member of the population ``cars``, in the same way. Leaves
+    of drones are (n_drones, ...). The stage may write leaves of its member.
 
-    ``@stage("world")``: the data of one world. Leaves of drones come as (n_drones, ...), leaves of other populations as
-    (n_members, ...), leaves of worlds without batch axes. The stage writes leaves of any of these.
+    A stage with ``@stage("world")`` receives the data of one world. Leaves of drones are (n_drones, ...), leaves of
+    other populations (n_members, ...), and leaves of worlds have no batch axes. The stage may write all of these.
 
     Args:
         scope: ``"drone"``, ``"world"`` or the name of a population.
-        when: ``when(data)``: true if the stage acts at this step, (); None for always. An engine skips a stage at
-            steps where it acts nowhere.
-        phase: When in a call of the step it runs: ``"before"`` the first of its physics steps, at ``"each"`` of them,
+        when: Condition ``when(data)``, (): True if the stage acts at this step. None for a stage that always acts. An
+            engine skips a stage at steps at which it acts nowhere.
+        phase: Time within a call of the step function: ``"before"`` the first physics step, at ``"each"`` physics step,
             or ``"after"`` the last.
     """
     if not isinstance(scope, str) or not scope or scope in RESERVED_SCOPES:
@@ -132,21 +138,29 @@ def stage(
 
 
 def tick(data: SimData, freq: int) -> Array | None:
-    """Return where a controller of a rate acts at this step, or None if it does always. (n_worlds, 1), or () for one"""
+    """Return True in worlds where a controller with a rate, Hz, acts at this step; None if it acts at every step.
+
+    Returns:
+        (n_worlds, 1), or () for data of one world
+    """
     period = data.core.freq // freq
     return None if period == 1 else data.core.steps % period == 0
 
 
 def is_first_step(data: SimData) -> Array:
-    """Return True in the first step of an episode. (n_worlds, 1), or () for one
+    """Return True in the first step of an episode. (n_worlds, 1), or () for data of one world
 
-    Leading stages of a step with this condition run before the first step of a call.
+    An engine may run stages with this condition at the beginning of a step pipeline only once per call, before its
+    first step.
     """
     return data.core.steps == 0
 
 
 def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
-    """Return the functions of a pipeline as stages under the pipeline's names; undeclared ones get the full batch."""
+    """Return the functions of a pipeline as stages with the names in the pipeline.
+
+    A function without a declared scope receives the full batch.
+    """
     return [
         Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed, fn.why, fn.phase)
         if isinstance(fn, Stage)
@@ -156,17 +170,23 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
 
 
 class Axes:
-    """Names and batch axes of all leaves of a simulation's data."""
+    """Names, indices and scopes of all leaves of a simulation's data. The scopes give the batch axes."""
 
     def __init__(self, data: SimData):
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
         self.numbers = leaf_indices(data)
-        """Number of every leaf, by its path."""
+        """Record with the index of every leaf in place of the leaf."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 
     def written(self, before: list[Array], after: SimData, stage: Stage) -> list[int]:
-        """Return the numbers of the leaves that a stage wrote, and check that it may."""
+        """Return the indices of the leaves that a stage wrote, and check that it may write them.
+
+        Args:
+            before: Leaves before the stage.
+            after: Data after the stage. Leaves that are the same objects as before count as not written.
+            stage: The stage.
+        """
         name = stage.__name__
         new, treedef = jax.tree.flatten(after)
         if treedef != self.treedef:
@@ -192,7 +212,7 @@ class Axes:
         return written
 
     def writable(self, stage: Stage) -> list[str] | None:
-        """Return the scopes of the leaves that a stage may write; None for all."""
+        """Return the scopes of the leaves that a stage may write; None if it may write all leaves."""
         if stage.scope == "batch":
             return None
         populations = list(dict.fromkeys(scope for scope in self.scopes if has_members(scope)))
@@ -208,11 +228,11 @@ class Axes:
         return [stage.scope]
 
     def shapes_of_one(self, leaves: list[Array], scope: StageScope) -> list[jax.ShapeDtypeStruct]:
-        """Return the shape and type of each leaf as a stage receives it, for one drone or world."""
+        """Return the shape and type of each leaf as a stage with a scope receives it."""
         return [self.shape_of_one(i, x, scope) for i, x in enumerate(leaves)]
 
     def shape_of_one(self, i: int, x: Array, scope: StageScope) -> jax.ShapeDtypeStruct:
-        """Return the same for the leaf with number ``i``."""
+        """Return the shape and type of leaf ``i`` as a stage with a scope receives it."""
         leaf_scope, n_leading = self.scopes[i], 0
         if scope != "batch" and leaf_scope != "batched":
             n_leading = n_batch_axes(leaf_scope) if leaf_scope == scope else n_world_axes(leaf_scope)
@@ -220,66 +240,67 @@ class Axes:
 
 
 def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
-    """Return a function of one world as a function of all worlds.
+    """Transform a function of one world to a function of all worlds.
 
-    In records the batch axes are the declared ones: the function receives leaves of drones as (n_drones, ...), leaves
-    of other populations as (n_members, ...), and leaves of worlds and batched leaves without batch axes. It receives
-    all other leaves as they are, and must return them unchanged. An array outside of a record has worlds as its first
-    axis.
+    Leaves of records have the batch axes that they declare. The function receives leaves of drones as (n_drones, ...),
+    leaves of other populations as (n_members, ...), and leaves of worlds and batched leaves without batch axes. All
+    other leaves are passed unchanged, and must be returned unchanged. The first axis of an array outside of a record is
+    over worlds.
 
     Args:
-        fn: The function of one world: from any trees of arrays to one.
-        least: Number of batch axes from which a leaf is divided among worlds: 2 excludes batched leaves.
+        fn: The function of one world: takes any number of trees of arrays, and returns a tree of arrays.
+        least: Smallest number of batch axes with which a leaf is split into worlds: 2 excludes batched leaves.
     """
 
     def of_all(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
-        kinds = _kinds(args)
-        rows = [x[:, 0] if kind == "world" else x for kind, x in zip(kinds, leaves, strict=True)]
-        split = [n_batch_axes(kind) >= least for kind in kinds]
+        leaf_scopes = _kinds(args)
+        # Leaves of worlds, (n_worlds, 1, ...), lose their second axis.
+        inputs = [x[:, 0] if scope == "world" else x for scope, x in zip(leaf_scopes, leaves, strict=True)]
+        is_split = [n_batch_axes(scope) >= least for scope in leaf_scopes]
         returned: dict[str, Any] = {}
 
         def in_one_world(values: list[Any]) -> list[Any]:
             result = fn(*treedef.unflatten(values))
             paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
-            returned["kinds"] = after = _kinds(result)
-            # By identity, since ``fn`` may return other trees. Only shared leaves can be the very same array, and then
-            # each stands for the others.
-            numbers = {id(x): i for i, x in enumerate(values)}
-            unchanged = [numbers.get(id(x)) for _, x in paths]
-            for k, number in enumerate(unchanged):
-                if number is not None and not split[number] and n_batch_axes(after[k]) >= least:
-                    unchanged[k] = None  # shared, and now an array of every world
-                elif number is not None and n_batch_axes(after[k]) < least:
-                    after[k] = kinds[number]  # without its axis of worlds the scope of a foreign record is not known
+            returned["scopes"] = result_scopes = _kinds(result)
+            # Unchanged leaves are found by identity, since ``fn`` may return trees of another structure. Only shared
+            # leaves can be the same array, and then it does not matter which of them is found.
+            indices = {id(x): i for i, x in enumerate(values)}
+            unchanged = [indices.get(id(x)) for _, x in paths]
+            for k, i in enumerate(unchanged):
+                if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= least:
+                    unchanged[k] = None  # a shared leaf, returned in a field that has a value for every world
+                elif i is not None and n_batch_axes(result_scopes[k]) < least:
+                    result_scopes[k] = leaf_scopes[i]  # within one world, a leaf of a foreign record loses its scope
             returned["unchanged"] = unchanged
-            for (path, _), kind, number in zip(paths, after, unchanged, strict=True):
-                if n_batch_axes(kind) < least and number is None:
+            for (path, _), scope, i in zip(paths, result_scopes, unchanged, strict=True):
+                if n_batch_axes(scope) < least and i is None:
                     name = jax.tree_util.keystr(path).lstrip(".")
                     raise ConfigError(
                         f"{getattr(fn, '__name__', fn)!r} is written for one world and changes {name}, which all "
                         f"worlds share. Give every drone or world a leaf of its own first."
                     )
-            return [x for (_, x), number in zip(paths, unchanged, strict=True) if number is None]
+            return [x for (_, x), i in zip(paths, unchanged, strict=True) if i is None]
 
-        changed = iter(jax.vmap(in_one_world, ([0 if divided else None for divided in split],))(rows))
+        changed = iter(jax.vmap(in_one_world, ([0 if split else None for split in is_split],))(inputs))
         out = []
-        for kind, number in zip(returned["kinds"], returned["unchanged"], strict=True):
-            if number is not None and kinds[number] == kind:
-                out.append(leaves[number])
+        for scope, i in zip(returned["scopes"], returned["unchanged"], strict=True):
+            if i is not None and leaf_scopes[i] == scope:
+                out.append(leaves[i])
             else:
-                x = next(changed) if number is None else rows[number]
-                out.append(x[:, None] if kind == "world" else x)
+                x = next(changed) if i is None else inputs[i]
+                out.append(x[:, None] if scope == "world" else x)
         return returned["treedef"].unflatten(out)
 
     return of_all
 
 
 def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
-    """Return a function of the data of one drone as a function of the data of one world.
+    """Transform a function of the data of one drone to a function of the data of one world.
 
     Args:
-        fn: From the data of one drone to any tree of arrays; each gets a first axis over drones.
+        fn: Function that returns any tree of arrays. In the result each array has a first axis over drones.
     """
 
     def of_world(data: SimData) -> Any:
@@ -291,7 +312,7 @@ def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
 
 
 def _kinds(tree: object) -> list[str]:
-    """Return the scope of every leaf: as its record declares it, and ``batched`` outside of records."""
+    """Return the scope of every leaf: the one that its record declares, or ``batched`` outside of records."""
 
     def is_record(x: object) -> bool:
         return isinstance(x, PyTree)
@@ -300,12 +321,12 @@ def _kinds(tree: object) -> list[str]:
 
 
 def _apply_in_all_worlds(stage: Stage, data: SimData) -> SimData:
-    """Return the data after a stage in every world, and there for every drone or member if it is declared for one."""
+    """Return the data after a stage, applied in every world, and to every drone or member if it is declared for one."""
     return vmap_worlds(world_function(stage, Axes(data)), 2)(data)
 
 
 def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
-    """Return a stage as a function of the data of one world, with a condition that selects its results."""
+    """Return a stage as a function of the data of one world; its condition selects between new and old leaves."""
 
     def of_one_world(world: SimData) -> SimData:
         leaves = jax.tree.leaves(world)

@@ -1,14 +1,16 @@
-"""Plans: the engine that steps data of one structure, and the reason why it is not a faster one.
+"""Plans: the choice of the engine that steps data of one structure, and the reason why no faster engine was chosen.
 
-Everything that an engine can refuse it refuses here, before the first step. There are three outcomes:
+If an engine cannot run a step, this is found here, before the first step. There are three cases:
 
-- A documented limit, such as a stage without a scope or a machine without a compiler: a slower engine runs, and
-  ``explain`` names it.
-- Something unsupported (``UnsupportedError``): a primitive without a rule, a parameter that a new JAX has renamed, a
-  kernel that its compiler refuses. A slower engine runs, with one ``EngineWarning``; ``strict`` raises instead.
-- Any other exception is a bug of the stage or of the engine. If ``plain`` fails too, it is a bug of the stage and is
-  raised. Otherwise ``auto`` runs ``plain`` with a warning that suggests a report; ``strict``, and an engine that was
-  chosen by name, raise it.
+- A documented limit, such as a stage without a scope or a machine without a compiler. A slower engine runs, and
+  ``explain`` names the limit.
+- Something unsupported (``UnsupportedError``): a primitive without a rule, a parameter of a primitive that a newer JAX
+  has renamed, or a kernel that its compiler refuses. A slower engine runs, with one ``EngineWarning``. With ``strict``,
+  an error is raised instead.
+- Any other exception (except ``ConfigError`` and ``MemoryError``, which are raised as they are). It is a bug in a stage
+  or in the engine. With ``strict``, or with an engine chosen by name, it is raised. Otherwise ``plain`` is tried. If
+  ``plain`` fails too, the bug is in the stage, and the error of ``plain`` is raised. If not, ``plain`` runs, with a
+  warning that asks for a report.
 """
 
 from __future__ import annotations
@@ -41,14 +43,14 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import leaf_indices, n_batch_axes, replace_leaves, scopes
 
 ENGINES = ("auto", "plain", "lanes", "fused", "interpret")
-"""Values of ``engine=``. ``interpret`` runs the program in NumPy: slow, without derivatives, to find bugs with."""
+"""Values of ``engine=``. ``interpret`` runs programs in NumPy: it is slow, has no derivatives, and serves debugging."""
 
 BACKENDS: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "interpret": interpret.build}
-"""Backends of the engines that run programs."""
+"""Backends of the engines that run programs, by the name of the engine."""
 
 
 SeparateLeaves = frozenset[int] | None
-"""Leaves that stay arrays of their own where others become rows; None for no rows."""
+"""Leaves that stay separate arrays when the others are stored as rows of one array; None to store none as rows."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,34 +60,35 @@ class Plan:
     engine: str
     """Engine that runs."""
     why: str
-    """Reason why it is not a faster one."""
+    """Reason why no faster engine was chosen; empty for ``fused``."""
     programs: tuple[Program, ...]
-    """Programs that it runs, one for each group of populations that depend on each other, first the group of the
-    drones; none for ``plain``."""
+    """Programs that the engine runs, one for each group of populations that depend on each other. The group of the
+    drones comes first. Empty for ``plain``."""
     location: Location
-    """Devices that it runs on."""
+    """Devices that the step runs on."""
     inputs: tuple[int, ...]
-    """Leaves that are passed to the compiled step: leaves of the data, followed by the leaves that passes add."""
+    """Indices of the leaves that are passed to the compiled step. The leaves of the data come first, followed by the
+    leaves that compiler passes add."""
     packed: tuple[int, ...]
-    """Shared leaves that are passed as one, the first leaf after the leaves of the data."""
+    """Indices of the shared leaves that are passed as one concatenated leaf, the first after the leaves of the data."""
     rows: tuple[PackedRows, ...]
-    """Leaves of rows, behind that; empty where the data is stepped as it is."""
+    """Leaves whose rows are other leaves, after the packed leaf; empty if no leaf is stored as rows."""
     written: tuple[int, ...]
-    """Leaves that are returned."""
+    """Indices of the leaves that the compiled step returns."""
     numbers: SimData
-    """Number of every leaf, by its path."""
+    """Record with the index of every leaf in place of the leaf, as ``leaf_indices`` returns it."""
     dynamic: Callable[..., Any]
-    """The compiled step, for a number of steps that is an array."""
+    """Compiled step that takes the number of steps as an array."""
     static: Callable[..., Any]
-    """The same for a number of steps that is a Python number, which can be differentiated in reverse."""
+    """Compiled step that takes the number of steps as a Python number, and can be differentiated in reverse mode."""
     direct: Callable[..., Any] | None = None
-    """The step in NumPy, for arguments that are not traced; None for other engines."""
+    """Step in NumPy for arguments that are not traced; None unless ``interpret`` runs all of it without a mesh."""
     host_call: HostCall | None = None
-    """The step without XLA, for a simulation that holds its data between calls; None where it is not possible."""
+    """Step without XLA, for a simulation that holds its data between calls; None if it is not possible."""
 
     @property
     def synced(self) -> int:
-        """Leaf ``core.mjx_synced``, which is false after a step."""
+        """Index of the leaf ``core.mjx_synced``, which is False after a step."""
         return int(self.numbers.core.mjx_synced)
 
     @property
@@ -95,28 +98,28 @@ class Plan:
 
 
 class Planner(NamedTuple):
-    """Planning of steps: everything besides the data that determines a plan."""
+    """Planner of steps. Its fields are everything that determines a plan, besides the data."""
 
     stages: Sequence[Stage]
     """Stages of the step, in order."""
     engine: str
-    """Engine that was chosen, one of ``ENGINES``."""
+    """Engine that the user chose, one of ``ENGINES``."""
     strict: bool
-    """True to raise where a slower engine would be taken with a warning."""
+    """True to raise an error where otherwise a slower engine would run, with a warning."""
     location: Location
     """Devices that hold the data."""
     reported: set[str]
-    """Warnings that were given before, for data of another structure."""
+    """Warnings that have been given, for data of any structure; none is given twice."""
 
     def plan(self, data: SimData, zeros: Zeros, trace: Callable[[Plan], None], separate: SeparateLeaves = None) -> Plan:
-        """Return the plan of some data.
+        """Return the plan that steps data of one structure.
 
         Args:
             data: The data, or its shapes and types.
             zeros: Elements of shared parameters that are zero.
-            trace: Traces the compiled step of a plan, as its first call would, to find what fails there.
-            separate: Leaves that stay arrays of their own where the others that a call writes become rows, if one
-                kernel runs all of the step; None for no rows.
+            trace: Function that traces the compiled step of a plan, as its first call would, so that errors show here.
+            separate: Leaves that stay separate arrays. If one kernel runs the whole step, all other leaves that it
+                writes are stored as rows. None to store none as rows.
 
         Raises:
             ConfigError: If an engine chosen by name cannot run the stages; with ``strict``, if a stage is unsupported.
@@ -136,7 +139,7 @@ class Planner(NamedTuple):
         else:
             self._report(problems)
             return plan
-        plan = self._plain(data, f"the engine failed with {type(bug).__name__}")  # raises what is the stage's own error
+        plan = self._plain(data, f"the engine failed with {type(bug).__name__}")  # raises an error of the stage itself
         self._report(
             [
                 f"the engine failed with {type(bug).__name__}: {bug}{self._culprit(data)}, so the step runs on "
@@ -147,13 +150,16 @@ class Planner(NamedTuple):
         return plan
 
     def _fast(self, data: SimData, zeros: Zeros, separate: SeparateLeaves) -> tuple[Plan, list[str]]:
-        """Return a plan that runs a program, and what it does not support; a plan of ``plain`` on several devices."""
+        """Return a plan that runs programs, and messages on what its engine does not support.
+
+        For data on several devices it may be a plan of ``plain``.
+        """
         limit = self._spread_limit(data)
         if limit:
             return self._plain(data, limit), []
-        kinds = jax.tree.leaves(scopes(data))
-        # Zeros that a caller found earlier may belong to a parameter that was shared then and is one per drone now.
-        known = tuple([(i, indices) for i, indices in zeros if kinds[i] == "shared"])
+        leaf_scopes = jax.tree.leaves(scopes(data))
+        # ``zeros`` may be older than ``data``: a parameter that was shared then may have one value per drone now.
+        known = tuple([(i, indices) for i, indices in zeros if leaf_scopes[i] == "shared"])
         tracer = Tracer()
         groups = independent_groups(self.stages, data, tracer)
         lowered = [
@@ -162,20 +168,20 @@ class Planner(NamedTuple):
         one_kernel = self._has_kernels and not self.location.is_distributed and [x.fused for x in lowered] == [True]
         select = None
         if separate is not None and one_kernel:
-            unpacked = {*separate, leaf_indices(data).core.mjx_synced}
-            select = lambda written: [i for i in written if i not in unpacked]  # noqa: E731
+            not_rows = {*separate, leaf_indices(data).core.mjx_synced}
+            select = lambda written: [i for i in written if i not in not_rows]  # noqa: E731
         programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
-        split = [stage for program in programs for stage in program.unfused_stages]
-        problems = [f"stage {s.unfused}" for s in split if not isinstance(s.error, LimitError)]
-        if self.location.is_distributed and split:
-            return self._plain(data, f"with a mesh every stage must be fused, and {split[0].unfused}"), problems
+        unfused = [stage for program in programs for stage in program.unfused_stages]
+        problems = [f"stage {s.unfused}" for s in unfused if not isinstance(s.error, LimitError)]
+        if self.location.is_distributed and unfused:
+            return self._plain(data, f"with a mesh every stage must be fused, and {unfused[0].unfused}"), problems
         engine, why, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
             engine, why = "lanes", fused.unavailable_reason(self.location.platform) or ""
             if not why:
                 try:
-                    in_leaves = None if select is None else optimise(lowered[0])
-                    runs, engine = [fused.build(x, self.location, in_leaves) for x in programs], "fused"
+                    without_rows = None if select is None else optimise(lowered[0])
+                    runs, engine = [fused.build(x, self.location, without_rows) for x in programs], "fused"
                 except UnsupportedError as error:
                     error = self._error_of_stage(error, data)
                     why = str(error)
@@ -195,7 +201,7 @@ class Planner(NamedTuple):
         return plan, problems
 
     def _spread_limit(self, data: SimData) -> str:
-        """Return why data on several devices is stepped by ``plain``, or nothing."""
+        """Return the reason why data on several devices must be stepped by ``plain``; empty if there is none."""
         if not self.location.is_distributed:
             return ""
         if self.location.mesh is None:
@@ -205,9 +211,9 @@ class Planner(NamedTuple):
 
     def _plain(self, data: SimData, why: str) -> Plan:
         run, written = plain.build(self.stages, data)
-        everything = tuple(range(len(jax.tree.leaves(data))))
-        # XLA spreads the arrays of ``plain`` over devices by itself.
-        return self._wrap("plain", why, data, (), everything, tuple(written), run, len(everything))
+        all_leaves = tuple(range(len(jax.tree.leaves(data))))
+        # XLA itself distributes the computation of ``plain`` over the devices.
+        return self._wrap("plain", why, data, (), all_leaves, tuple(written), run, len(all_leaves))
 
     @property
     def _has_kernels(self) -> bool:
@@ -225,7 +231,7 @@ class Planner(NamedTuple):
         n_leaves: int,
     ) -> Plan:
         numbers, inputs = leaf_indices(data), tuple(sorted(needed))
-        # Where a stage writes the flags itself, there is no check.
+        # If a stage writes the flags itself, no check is added.
         checks = any(p.check is not None for p in programs) if programs else numbers.core.nonfinite not in written
         flags = (numbers.core.nonfinite,) if checks else ()
         written = (*written, *flags)
@@ -266,26 +272,33 @@ class Planner(NamedTuple):
         return sharded_step
 
     def _report(self, problems: list[str]) -> None:
-        """Warn of the problems of a plan, all in one warning, or raise them."""
+        """Warn of all problems of a plan in one warning, or raise them as one error if ``strict`` is True."""
         report_unsupported(problems, self.strict, self.reported, "Write the stage with supported operations")
 
     def _without_kernel(self, error: UnsupportedError) -> str:
-        """Return what a kernel does not support, with its stage, or the stages of the kernel, for a message."""
+        """Return a message on what a kernel does not support, with the stage, or with all stages if it is not known."""
         if error.stage:
             return f"stage {error.stage!r} has no kernel: {error.reason}"
         return f"the kernel of the stages {', '.join(s.__name__ for s in self.stages)} cannot be built: {error.reason}"
 
     def _error_of_stage(self, error: UnsupportedError, data: SimData) -> UnsupportedError:
-        """Return the error of the stage that has no source, given the error of a kernel of several stages."""
+        """Return the error of the first stage for which no kernel can be written.
+
+        If there is none, return the error of the kernel of all stages.
+
+        Args:
+            error: Error of the kernel of all stages.
+            data: The data, or its shapes and types.
+        """
         for stage in self.stages:
             try:
                 kernel.require_source(optimise(lower_stages([stage], data)))
-            except UnsupportedError as own:
-                return own
+            except UnsupportedError as stage_error:
+                return stage_error
         return error
 
     def _culprit(self, data: SimData) -> str:
-        """Return the stage at which the engine fails, for a message."""
+        """Return the end of a message that names the first stage that cannot be lowered; empty if there is none."""
         for stage in self.stages:
             try:
                 optimise(lower_stages([stage], data))
@@ -295,12 +308,12 @@ class Planner(NamedTuple):
 
 
 def _jit_step(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return the function compiled for any number of steps, and for a Python number."""
+    """Return a step compiled for a number of steps that is an array, and for one that is a Python number."""
     return jax.jit(advance), jax.jit(lambda values, n: advance(values, n), static_argnums=1)
 
 
 def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the step in NumPy, with results on the device of its arguments."""
+    """Return a step in NumPy that puts its results on the device of its arguments."""
 
     def direct(values: list[Any], n_steps: int | Array) -> list[Any]:
         committed = next((x for x in values if getattr(x, "committed", False)), None)
@@ -313,7 +326,7 @@ def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
 def _join_runs(
     groups: Sequence[Group], programs: Sequence[Program], runs: Sequence[Run]
 ) -> tuple[Run, tuple[int, ...]]:
-    """Return one function that runs independent programs, and the leaves that it writes."""
+    """Return a function that runs all of the independent programs, and the indices of the leaves that it writes."""
     runs = [on_data_leaves(program, run) for program, run in zip(programs, runs, strict=True)]
     if len(runs) == 1:
         return runs[0], tuple(programs[0].written)
@@ -335,19 +348,21 @@ def _join_runs(
 
 
 def _watched_leaves(data: SimData) -> list[Any]:
-    """Return the leaves whose NaN and infinities flag a world: states and commands."""
+    """Return the leaves in which NaN or infinity flags a world: states and commands of drones, other populations."""
     return jax.tree.leaves(watched_records(data))
 
 
 def _inputs(program: Program) -> list[int]:
-    """Return the leaves that a program reads, and one whose shape gives the number of worlds.
+    """Return the indices of the leaves that must be passed to a program.
 
-    A leaf that is written before it is read is not one of them, unless unfused stages split the step.
+    These are the leaves that it reads, and a leaf of the drones, whose shape gives the number of worlds. If unfused
+    stages split the step, leaves that are written before they are read are passed too.
     """
-    moved = {i for leaf in program.leaves for i in leaf.rows_of}
-    of_drones = [i for i, x in enumerate(program.leaves) if x.scope == "drone" and not x.rows_of and i not in moved]
+    in_rows = {i for leaf in program.leaves for i in leaf.rows_of}
+    alone = [i for i, leaf in enumerate(program.leaves) if not leaf.rows_of and i not in in_rows]
+    drone_leaves = [i for i in alone if program.leaves[i].scope == "drone"]
     if program.fused:
         needed = kernel.needed_leaves(program)
-        return [*needed, next((i for i in of_drones if i in needed), of_drones[0])]
+        return [*needed, next((i for i in drone_leaves if i in needed), drone_leaves[0])]
     checked = [leaf for leaf, _ in program.check.reads] if program.check is not None else []
-    return [*program.read, *program.written, *checked, of_drones[0]]
+    return [*program.read, *program.written, *checked, drone_leaves[0]]

@@ -1,4 +1,4 @@
-"""Environments with the interface of Brax, for its training algorithms. Brax is neither needed nor imported."""
+"""Adapter from environments to the interface of Brax, for its training algorithms. Brax itself is not required."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class State(PyTree):
     pipeline_state: EnvState
     """State of the environment."""
     obs: Array
-    """Observations concatenated by name, drone after drone. (n_worlds, observation_size)"""
+    """Observations of all drones, drone after drone, each concatenated by name. (n_worlds, observation_size)"""
     reward: Array
     """Mean reward of the drones. (n_worlds,)"""
     done: Array
-    """One where an episode ended with the step, zero elsewhere, as a float. (n_worlds,)"""
+    """One where the episode ended in this step, zero elsewhere, as a float. (n_worlds,)"""
     metrics: dict[str, Array]
     """``error``: mean task error of the drones. (n_worlds,) each"""
     info: dict[str, Any]
@@ -32,13 +32,15 @@ class State(PyTree):
 
 
 class BraxEnv:
-    """Brax's interface to a functional environment without automatic resets.
+    """Adapter that gives a functional environment without automatic resets the interface of Brax.
 
     Brax batches an environment of one world with ``vmap``. Here the worlds are batched already, so this class
-    corresponds to an environment after Brax's ``training.wrap``: keys, observations and actions have an axis of worlds,
-    episodes end at their time limit, a new one starts within the step that ends one, and ``info`` has the entries of
-    the wrappers. Pass it to an algorithm with ``wrap_env=False`` and ``num_envs`` equal to the number of worlds, and
-    another one of ``num_eval_envs`` worlds as ``eval_env``.
+    corresponds to an environment after Brax's ``training.wrap``. Keys, observations and actions have an axis over
+    worlds. Episodes end at their time limit, and the step that ends an episode also starts the next one. ``info`` has
+    the entries that Brax's wrappers add.
+
+    Pass it to an algorithm with ``wrap_env=False`` and ``num_envs`` equal to the number of worlds. Pass another
+    ``BraxEnv`` with ``num_eval_envs`` worlds as ``eval_env``.
     """
 
     def __init__(self, env: Env):
@@ -55,7 +57,7 @@ class BraxEnv:
 
     @property
     def action_size(self) -> int:
-        """Size of the action of a world: of all its drones together."""
+        """Size of the action of a world, for all of its drones together."""
         return self._action_shape[1] * self._action_shape[2]
 
     @property
@@ -70,19 +72,19 @@ class BraxEnv:
 
     @property
     def dt(self) -> float:
-        """Length of a step, s."""
+        """Duration of an environment step, s."""
         return self.env.task.seconds / self.env.max_steps
 
     def explain(self) -> str:
-        """Return how a step is executed, as ``Env.explain`` does."""
+        """Return a description of how a step is executed, as ``Env.explain`` does."""
         return self.env.explain()
 
     def reset(self, rng: Array) -> State:
-        """Return all worlds at the start of an episode.
+        """Return the state of all worlds at the start of an episode.
 
         Args:
-            rng: A key, or one per world as Brax passes them, typed or not. The first one seeds all worlds, each of
-                which draws its own numbers.
+            rng: A random key, or one key per world as Brax passes them; typed keys or raw key data. Only the first key
+                is used. It seeds all worlds, and each world draws its own numbers.
         """
         state = self.env.reset(self._seed_key(rng))
         zeros = jnp.zeros(self.sim.n_worlds, state.reward.dtype)
@@ -92,34 +94,34 @@ class BraxEnv:
         return State(state, self._flatten_obs(state.obs), zeros, zeros, metrics, info)
 
     def step(self, state: State, action: Array) -> State:
-        """Return all worlds one step later.
+        """Return the state of all worlds one environment step later.
 
         Args:
             state: State of all worlds.
             action: Action in [-1, 1], drone after drone. (n_worlds, action_size)
         """
-        needed = (self.sim.n_worlds, self.action_size)
-        if jnp.shape(action) != needed:
+        shape = (self.sim.n_worlds, self.action_size)
+        if jnp.shape(action) != shape:
             raise ValueError(
-                f"expected an action of shape {needed} = (n_worlds, action_size), got {jnp.shape(action)}. The worlds "
+                f"expected an action of shape {shape} = (n_worlds, action_size), got {jnp.shape(action)}. The worlds "
                 f"are batched already: leave out vmap and Brax's wrappers (wrap_env=False)."
             )
-        inner = self.env.step(state.pipeline_state, jnp.reshape(action, self._action_shape))
+        env_state = self.env.step(state.pipeline_state, jnp.reshape(action, self._action_shape))
         dtype = state.reward.dtype
-        done, reward = inner.done.astype(dtype), self._mean_over_drones(inner.reward)
-        metrics = {"error": self._mean_over_drones(inner.info["error"])}
+        done, reward = env_state.done.astype(dtype), self._mean_over_drones(env_state.reward)
+        metrics = {"error": self._mean_over_drones(env_state.info["error"])}
         continues = 1 - state.done
-        results = {"sum_reward": reward, "length": jnp.ones_like(reward)} | metrics
-        before = state.info["episode_metrics"]
+        increments = {"sum_reward": reward, "length": jnp.ones_like(reward)} | metrics
+        sums = state.info["episode_metrics"]
         info = {
             "steps": state.info["steps"] * continues + 1,
-            "truncation": (inner.truncated & ~inner.terminated).astype(dtype),
+            "truncation": (env_state.truncated & ~env_state.terminated).astype(dtype),
             "episode_done": done,
-            "episode_metrics": {name: before[name] * continues + x for name, x in results.items()},
+            "episode_metrics": {name: sums[name] * continues + x for name, x in increments.items()},
         }
         return state.replace(
-            pipeline_state=inner,
-            obs=self._flatten_obs(inner.obs),
+            pipeline_state=env_state,
+            obs=self._flatten_obs(env_state.obs),
             reward=reward,
             done=done,
             metrics=state.metrics | metrics,

@@ -1,4 +1,4 @@
-"""Simulations of the vehicles of an MJCF, by the names of their bodies: ``Crazyflie_0``, ``Fleet1Tenth_1``."""
+"""Vehicles of an MJCF file, found by the names of their bodies, such as ``Crazyflie_0`` and ``Fleet1Tenth_1``."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.build import read_spec
 
 VehicleKind = AirframeSource | type[Population]
-"""An airframe, or a subclass of ``Population``."""
+"""Kind of a vehicle: the airframe of a drone, or a subclass of ``Population``."""
 
 
 def known_kinds() -> dict[str, VehicleKind]:
-    """Return the built-in airframes and populations by the prefix of names."""
-    from crazysim.plugins.vehicles import Bicycles, Cars  # imported where a file is adopted
+    """Return the built-in airframes and populations, by the prefix of the names of their vehicles."""
+    from crazysim.plugins.vehicles import Bicycles, Cars  # imported only when an MJCF file is read
 
     return {"Crazyflie": "crazyflie", "Bumblebee": "bumblebee", Cars.prefix: Cars, Bicycles.prefix: Bicycles}
 
 
 VEHICLE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9]*)_(\d+)")
-"""Names of vehicles: prefix and number."""
+"""Pattern of the name of a vehicle: prefix, underscore and number."""
 
 
 class Vehicle(NamedTuple):
-    """A vehicle that was found in an MJCF."""
+    """A vehicle found in an MJCF file."""
 
     name: str
     """Name of its body."""
@@ -48,11 +48,11 @@ class Vehicle(NamedTuple):
 def read_vehicles(
     xml_path: str | Path, kinds: Mapping[str, VehicleKind]
 ) -> tuple[mujoco.MjSpec, list[Vehicle], dict[type[Population], list[Vehicle]]]:
-    """Return the spec of an MJCF without its vehicles, its drones, and the members of each population.
+    """Return three parts of an MJCF file: the spec without vehicles, the drones, and the members of each population.
 
     Args:
         xml_path: MJCF file.
-        kinds: Airframe or population by further prefixes, besides ``known_kinds``.
+        kinds: Airframes or populations by prefix, in addition to ``known_kinds``.
 
     Raises:
         ConfigError: If the file cannot be read, or has no drone.
@@ -77,21 +77,22 @@ def vehicle_poses(vehicles: list[Vehicle], template: Array) -> tuple[Array, Arra
 
     Args:
         vehicles: The vehicles.
-        template: An array of worlds, in whose type they are.
+        template: An array that gives the number of worlds, its first axis, and the type of the results.
     """
-    rows = [v.pos for v in vehicles], [v.quat for v in vehicles]
-    pos, quat = (jnp.asarray(np.broadcast_to(x, (template.shape[0], *np.shape(x))), template.dtype) for x in rows)
+    poses = [v.pos for v in vehicles], [v.quat for v in vehicles]
+    pos, quat = (jnp.asarray(np.broadcast_to(x, (template.shape[0], *np.shape(x))), template.dtype) for x in poses)
     return pos, quat
 
 
 def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list[Vehicle]:
     """Return the vehicles of a spec, and remove their bodies from it.
 
-    Vehicles are children of the world that can move and whose names are a prefix and a number.
+    A vehicle is a child of the world body that can move (a mocap body, or a body with joints) and whose name is a
+    prefix, an underscore and a number.
 
     Args:
-        spec: The spec.
-        kinds: Airframe or population by prefix.
+        spec: The spec, which is changed in place.
+        kinds: Airframes or populations by prefix.
     """
     vehicles = []
     for body in spec.worldbody.bodies:
@@ -106,9 +107,9 @@ def take_vehicles(spec: mujoco.MjSpec, kinds: Mapping[str, VehicleKind]) -> list
             )
         vehicles.append((body, Vehicle(body.name, kinds[prefix], np.array(body.pos), np.roll(body.quat, -1))))
     names = [vehicle.name for _, vehicle in vehicles]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise ConfigError(f"expected bodies with different names, got {twice[0]!r} twice. Rename one.")
+    repeated = [name for name in names if names.count(name) > 1]
+    if repeated:
+        raise ConfigError(f"expected bodies with different names, got {repeated[0]!r} twice. Rename one.")
     for body, _ in vehicles:
         spec.delete(body)
     return [vehicle for _, vehicle in vehicles]

@@ -1,4 +1,4 @@
-"""Functions that spread worlds over devices, where Crazyflow has them."""
+"""Functions that distribute worlds over devices, importable under the same module path as in Crazyflow."""
 
 from crazysim.core.sharding import shard, shardings_of, world_mesh
 

@@ -1,7 +1,7 @@
-"""Lanes: every number of a drone as a vector with a lane for each drone: XLA gets element-wise arithmetic only.
+"""Backend that runs programs in XLA. Each scalar of a drone is a vector with one lane per drone.
 
-Between fused stages nothing has the shape of a small vector or matrix. An unfused stage gets ordinary arrays, and
-splits the step there.
+XLA receives only element-wise arithmetic: within and between fused stages no array has the shape of a small vector or
+matrix. An unfused stage receives ordinary arrays, and the step is split around it.
 """
 
 from __future__ import annotations
@@ -27,20 +27,23 @@ from crazysim.engine.passes.schedule import separate
 from crazysim.jaxcompat import is_key
 
 Execute = Callable[[Block, Sequence[Any], tuple[int, ...]], Sequence[Any]]
-"""Runs a block: from the block, its inputs and the lanes' shape to its outputs."""
+"""Function that runs a block: from the block, its inputs and the shape of a vector of lanes to its outputs."""
 
 
 class LeafValues:
-    """Leaves of all drones, each as an array or as vectors over lanes, in the form that was last used."""
+    """Values of the leaves of a program, each as an array, as one vector of lanes per scalar, or as both.
+
+    A form that is missing is made from the other one when it is read, and removed when the other one is written.
+    """
 
     def __init__(self, program: Program, leaves: list[Any], execute: Execute = xla.run, library: Any = jnp):
         """Store leaves as arrays.
 
         Args:
             program: The program.
-            leaves: Leaves of all worlds; None for one that is written before it is read.
-            execute: Runs the blocks.
-            library: Library of the arrays: ``jax.numpy``, or ``numpy``, where random keys are 32-bit integers.
+            leaves: Leaves of all worlds; None for a leaf that is written before it is read.
+            execute: Function that runs blocks.
+            library: Array library: ``jax.numpy``, or ``numpy``, in which random keys are stored as 32-bit integers.
         """
         self.program, self.execute, self.library = program, execute, library
         self.n_worlds, self.n_drones = batch_counts(program, leaves)
@@ -48,18 +51,18 @@ class LeafValues:
         self.vectors: dict[Slot, Any] = {}
 
     def copy(self) -> LeafValues:
-        """Return the same leaves, to be written to."""
+        """Return a copy that can be written to without changing this object."""
         new = copy.copy(self)
         new.arrays, new.vectors = dict(self.arrays), dict(self.vectors)
         return new
 
     @property
     def shape(self) -> tuple[int]:
-        """Shape of a vector: a lane for each drone, world after world."""
+        """Shape of a vector of lanes: one lane for each drone, world after world."""
         return (self.n_worlds * self.n_drones,)
 
     def get(self, slot: Slot) -> Any:
-        """Return a number of every drone, or the one number that all share, or a table."""
+        """Return the value of a slot: a vector of lanes, a scalar if it is shared, or a flat table."""
         if slot[1] == TABLE_INDEX:
             return self.arrays[slot[0]].reshape(-1)
         if slot not in self.vectors:
@@ -67,14 +70,14 @@ class LeafValues:
         return self.vectors[slot]
 
     def set(self, slot: Slot, value: Any) -> None:
-        """Write a number of every drone."""
+        """Write the value of a slot for every drone; a scalar is broadcast to all lanes."""
         if slot not in self.vectors:
             self._split(slot[0])
         self.vectors[slot] = value if np.shape(value) == self.shape else self.library.broadcast_to(value, self.shape)
         self.arrays.pop(slot[0], None)
 
     def array(self, leaf: int) -> Any:
-        """Return a leaf as the array that it is outside."""
+        """Return a leaf as an array, in the form in which the program takes and returns it."""
         if leaf not in self.arrays:
             example = self.program.leaves[leaf]
             items = [self.vectors[leaf, k] for k in range(example.size)]
@@ -89,7 +92,7 @@ class LeafValues:
         return array[:, :1] if example.scope == "world" else array
 
     def set_array(self, leaf: int, value: Any) -> None:
-        """Write a leaf."""
+        """Write a leaf as an array."""
         self.arrays[leaf] = value
         for k in range(self.program.leaves[leaf].size):
             self.vectors.pop((leaf, k), None)
@@ -97,7 +100,7 @@ class LeafValues:
     def _split(self, leaf: int) -> None:
         x, example = self.arrays[leaf], self.program.leaves[leaf]
         size = example.size
-        if example.rows_of or x is None:  # what is not given is written before it is read
+        if example.rows_of or x is None:  # a leaf of None is written before it is read
             self.vectors.update(((leaf, k), self.library.zeros(self.shape) if x is None else x[k]) for k in range(size))
             return
         if is_key(x):
@@ -110,7 +113,7 @@ class LeafValues:
 
 
 def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
-    """Return the number of worlds and drones; under a mesh, on this device."""
+    """Return the numbers of worlds and of drones per world; within a mesh, those of this device."""
     drone = next(
         i
         for i, (leaf, x) in enumerate(zip(program.leaves, leaves, strict=True))
@@ -120,23 +123,23 @@ def batch_counts(program: Program, leaves: list[Any]) -> tuple[int, int]:
 
 
 def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct:
-    """Return shape and type of a leaf of all worlds that a program writes; random keys are written as integers."""
+    """Return the shape and type of a leaf that a program writes, for all worlds; random keys as integers."""
     example = program.leaves[leaf]
-    of_leaf = (n_worlds, *example.shape[1:])
+    shape = (n_worlds, *example.shape[1:])
     if leaf in program.rows:
-        of_leaf = (program.rows[leaf], n_worlds * program.n_drones)
-    return jax.ShapeDtypeStruct((*of_leaf, *([2] if is_key(example) else [])), example.number)
+        shape = (program.rows[leaf], n_worlds * program.n_drones)
+    return jax.ShapeDtypeStruct((*shape, *([2] if is_key(example) else [])), example.number)
 
 
 MIN_CHECKPOINTED_STEPS = 256
-"""Number of steps from which a gradient keeps only some of the carries between them."""
+"""Number of steps from which the backward pass stores the carries of only some steps; see ``repeat``."""
 
 Constants = dict[int, Sequence[Any]]
-"""Hoisted numbers, by the segment that uses them."""
+"""Results of hoisted blocks, by the index of their segment among the segments of the phase ``each``."""
 
 
 def prepare(program: Program, values: LeafValues) -> Constants:
-    """Run the segments before the first step, and the hoisted blocks."""
+    """Run the segments before the first step, then the hoisted blocks, and return the results of these blocks."""
     run(program, values, "before", {})
     return {
         k: values.execute(s.hoisted, [values.get(slot) for slot in s.hoisted_reads], values.shape)
@@ -163,10 +166,13 @@ def _run_drones(segment: Segment, values: LeafValues, constants: Sequence[Any]) 
 
 
 def _run_worlds(segment: Segment, values: LeafValues) -> None:
-    """Run a segment of worlds. In it, the numbers of a drone are numbers of its world."""
+    """Run a segment with scope ``world``, with one lane per world.
+
+    Its slots of a leaf of drones count the scalars of all drones of a world, drone after drone.
+    """
     leaves, shape, library = values.program.leaves, (values.n_worlds, values.n_drones), values.library
 
-    def of_world(slot: Slot) -> Any:
+    def get_per_world(slot: Slot) -> Any:
         leaf, k = slot
         if leaves[leaf].scope == "drone":
             drone, k = divmod(k, leaves[leaf].size)
@@ -174,20 +180,20 @@ def _run_worlds(segment: Segment, values: LeafValues) -> None:
         value = values.get(slot)
         return value.reshape(shape)[:, 0] if library.ndim(value) and k != TABLE_INDEX else value
 
-    outs = values.execute(segment.block, [of_world(slot) for slot in segment.reads], shape[:1])
-    new: dict[Slot, dict[int, Any]] = {}
+    outs = values.execute(segment.block, [get_per_world(slot) for slot in segment.reads], shape[:1])
+    written: dict[Slot, dict[int, Any]] = {}  # by slot of a drone and index of the drone
     for (leaf, k), value in zip(segment.writes, outs, strict=True):
         value = library.broadcast_to(value, shape[:1])
         if leaves[leaf].scope == "drone":
             drone, k = divmod(k, leaves[leaf].size)
-            new.setdefault((leaf, k), {})[drone] = value
+            written.setdefault((leaf, k), {})[drone] = value
         else:
-            new[leaf, k] = dict.fromkeys(range(values.n_drones), value)
-    for slot, columns in new.items():
+            written[leaf, k] = dict.fromkeys(range(values.n_drones), value)
+    for slot, by_drone in written.items():
         old = values.get(slot)
         old = library.broadcast_to(old, values.shape).reshape(shape)
-        rows = [columns.get(d, old[:, d]) for d in range(values.n_drones)]
-        values.set(slot, library.stack(rows, axis=-1).reshape(values.shape))
+        columns = [by_drone.get(d, old[:, d]) for d in range(values.n_drones)]
+        values.set(slot, library.stack(columns, axis=-1).reshape(values.shape))
 
 
 def _run_unfused(stage: UnfusedStage, values: LeafValues) -> None:
@@ -204,73 +210,74 @@ def build(program: Program, location: Location) -> Run:
 def steps(
     program: Program, leaves: list[Any], n_steps: int | Array, execute: Execute = xla.run
 ) -> tuple[list[Any], Array]:
-    """Return the written leaves after some steps, and which worlds are flagged as not finite. (n_worlds, 1)
+    """Return the written leaves after some steps, and True for worlds that are flagged as not finite. (n_worlds, 1)
 
-    A step count that is a Python number makes a loop that can be differentiated.
+    With a Python number as the number of steps, the loop can be differentiated in reverse mode.
 
     Args:
         program: The program.
         leaves: Leaves of all worlds.
         n_steps: Number of steps.
-        execute: Runs the blocks.
+        execute: Function that runs blocks.
     """
     start = LeafValues(program, leaves, execute)
     constants = prepare(program, start)
     segments = program.phase_segments("each")
-    by_array = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written})
+    carried_leaves = sorted({i for s in segments if isinstance(s, UnfusedStage) for i in s.written})
     fused = [s for s in segments if isinstance(s, Segment)]
-    by_slot = sorted({slot for s in fused for slot in program.per_drone(s, s.writes) if slot[0] not in by_array})
+    written_slots = {slot for s in fused for slot in program.per_drone(s, s.writes)}
+    carried_slots = sorted(slot for slot in written_slots if slot[0] not in carried_leaves)
 
-    def turn(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
-        values = after(carry)
+    def advance(carry: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
+        values = values_of(carry)
         run(program, values, "each", constants)
-        return [values.get(slot) for slot in by_slot], [values.array(leaf) for leaf in by_array]
+        return [values.get(slot) for slot in carried_slots], [values.array(leaf) for leaf in carried_leaves]
 
-    def after(carry: tuple[list[Any], list[Any]]) -> LeafValues:
+    def values_of(carry: tuple[list[Any], list[Any]]) -> LeafValues:
         values = start.copy()
-        for slot, value in zip(by_slot, carry[0], strict=True):
+        for slot, value in zip(carried_slots, carry[0], strict=True):
             values.set(slot, value)
-        for leaf, value in zip(by_array, carry[1], strict=True):
+        for leaf, value in zip(carried_leaves, carry[1], strict=True):
             values.set_array(leaf, value)
         return values
 
-    carry = ([jnp.broadcast_to(start.get(slot), start.shape) for slot in by_slot],
-             [start.array(leaf) for leaf in by_array])  # fmt: skip
-    for segment in fused:  # what is only read is split into vectors once, outside the loop
+    carry = ([jnp.broadcast_to(start.get(slot), start.shape) for slot in carried_slots],
+             [start.array(leaf) for leaf in carried_leaves])  # fmt: skip
+    for segment in fused:  # leaves that are only read are split into vectors once, outside the loop
         for slot in program.per_drone(segment, segment.reads):
             start.get(slot)
     if isinstance(n_steps, int):
-        carry = repeat(turn, carry, n_steps)
+        carry = repeat(advance, carry, n_steps)
     else:
-        carry = jax.lax.fori_loop(0, n_steps, lambda _, c: turn(c), carry)
-    end = after(carry)
+        carry = jax.lax.fori_loop(0, n_steps, lambda _, c: advance(c), carry)
+    end = values_of(carry)
     flagged = nonfinite_worlds(program, end)
     run(program, end, "after", {})
     return [end.array(i) for i in program.written], flagged
 
 
 def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
-    """Return a carry after ``n`` iterations, in a form whose gradient takes little memory.
+    """Return a carry after ``n`` iterations, computed so that its gradient needs little memory.
 
-    Only the carry before each iteration is kept. The backward pass computes the rest again, which costs less than
-    fetching it from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is kept, with k the
-    square root of n. The memory of a gradient then grows with that root, at the price of one more pass.
+    Only the carry before each iteration is stored. The backward pass recomputes the rest, which costs less than
+    fetching it from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is stored, where k is
+    the square root of n. The memory of a gradient then grows with that root, at the price of one more forward pass.
     """
-    turn = jax.checkpoint(turn, prevent_cse=False)  # a scan does that anyway
+    turn = jax.checkpoint(turn, prevent_cse=False)  # within a scan it is not needed
 
-    def turns(carry: Any, n: int) -> Any:
+    def scan(carry: Any, n: int) -> Any:
         return jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n)[0]
 
     if n < MIN_CHECKPOINTED_STEPS:
-        return turns(carry, n)
+        return scan(carry, n)
     inner = math.isqrt(n)
-    outer = jax.checkpoint(lambda c: turns(c, inner), prevent_cse=False)
+    outer = jax.checkpoint(lambda c: scan(c, inner), prevent_cse=False)
     carry, _ = jax.lax.scan(lambda c, _: (outer(c), None), carry, length=n // inner)
-    return turns(carry, n % inner) if n % inner else carry
+    return scan(carry, n % inner) if n % inner else carry
 
 
 def nonfinite_worlds(program: Program, values: LeafValues) -> Array:
-    """Return True for worlds that were flagged before, or have a watched number that is not finite. (n_worlds, 1)"""
+    """Return True for worlds that were flagged before or have a watched value that is not finite. (n_worlds, 1)"""
     check = program.check
     if check is None:
         return values.library.zeros((values.n_worlds, 1), bool)

@@ -1,9 +1,11 @@
-"""Algebra on operations whose operands are partly known.
+"""Algebraic simplification of operations with constant operands.
 
-Only what no number contradicts is used: ``x * 1``, ``x / 1``, ``x - 0`` and, as XLA does, ``x + 0``, which loses the
-sign of a zero. ``x * 0`` is kept, for it is NaN where x is infinite. A zero of a shared parameter is the exception
-(``known_zero``): the zeros of a diagonal inertia or of a missing drag say that a term is not there. A state that
-is infinite or NaN then gives what its other terms give, where plain XLA gives NaN; its world is flagged either way.
+Only identities that hold for every number are used: ``x * 1``, ``x / 1``, ``x - 0`` and, as in XLA, ``x + 0``, although
+it loses the sign of a zero. ``x * 0`` is kept, because it is NaN where x is infinite.
+
+Zeros of shared parameters are an exception (``known_zero``): terms that they multiply are removed, such as those of a
+diagonal inertia or of an absent drag. If a state in such a term is infinite or NaN, the sum of the other terms results,
+where plain XLA would return NaN. The world is flagged either way.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from crazysim.engine.ir.numpy_forms import bitcast, convert
 from crazysim.engine.ir.ops import TABLE
 
 Element = Any
+"""A ``Value`` of a block, or a NumPy scalar for a constant."""
 
 
 class KnownZero32(np.float32):
@@ -29,26 +32,27 @@ class KnownZero64(np.float64):
 
 
 ZEROS: dict[np.dtype, type] = {np.dtype(np.float32): KnownZero32, np.dtype(np.float64): KnownZero64}
+"""Classes of the zeros of shared parameters, by type."""
 
 
 def known_zero(dtype: DTypeLike) -> np.generic | None:
-    """Return the element for a parameter that is zero, and absent from sums and products; None for other types."""
-    kind = ZEROS.get(np.dtype(dtype))
-    return None if kind is None else kind(0)
+    """Return the element that stands for a zero of a shared parameter; None if the type is not float32 or float64."""
+    zero_type = ZEROS.get(np.dtype(dtype))
+    return None if zero_type is None else zero_type(0)
 
 
 def is_known_zero(x: Element) -> bool:
-    """Return True for a parameter that is zero."""
+    """Return True for a zero of a shared parameter, as ``known_zero`` makes it."""
     return isinstance(x, KnownZero32 | KnownZero64)
 
 
 def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tuple) -> Element | None:
-    """Return the element that an operation reduces to without being computed at run time, or None."""
+    """Return the element that an operation reduces to; None if it must be computed at run time."""
     n_known = sum([isinstance(x, np.generic) for x in args])
     if n_known and dtype.kind == "f" and any(map(is_known_zero, args)):
-        simple = _without_zero_terms(name, args, dtype)
-        if simple is not None:
-            return simple
+        simplified = _without_zero_terms(name, args, dtype)
+        if simplified is not None:
+            return simplified
     if n_known == len(args) and TABLE[name].exact:
         return fold(name, args, dtype, params)
     match name:
@@ -65,7 +69,7 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
         case "and" | "or" if n_known and dtype.kind == "b":
             known, other = args if isinstance(args[0], np.generic) else args[::-1]
             return other if bool(known) == (name == "and") else known
-        case "sin" | "cos" if n_known and _equals(args[0], 0):  # exact everywhere, as other values are not
+        case "sin" | "cos" if n_known and _equals(args[0], 0):  # exact on every platform, unlike other arguments
             return dtype.type(name == "cos")
         case "atan2" if n_known == 2 and _equals(args[0], 0) and args[1] > 0:
             return args[0]
@@ -77,7 +81,7 @@ def simplify(name: str, args: tuple[Element, ...], dtype: np.dtype, params: tupl
 
 
 def _without_zero_terms(name: str, args: tuple[Element, ...], dtype: np.dtype) -> Element | None:
-    """Return an operation without a term that a zero of a shared parameter multiplies."""
+    """Return the element that an operation with a zero of a shared parameter reduces to; None if it does not reduce."""
     zeros = [is_known_zero(x) for x in args]
     match name:
         case "mul" | "neg" | "convert_element_type":
@@ -101,17 +105,17 @@ def _select(which: Element, no: Element, yes: Element) -> Element | None:
 
 
 def fold(name: str, args: Sequence[np.generic], dtype: np.dtype, params: tuple) -> np.generic | None:
-    """Return the result for constants, where NumPy has it to the last bit."""
+    """Return the result of an operation on constants; None if NumPy does not compute it exactly as the engine does."""
     row = TABLE[name]
     if not row.exact or row.numpy is None:
         return None
-    settings = {"dtype": dtype} if row.numpy in (convert, bitcast) else dict(params)
+    kwargs = {"dtype": dtype} if row.numpy in (convert, bitcast) else dict(params)
     with np.errstate(all="ignore"):
-        return dtype.type(row.numpy(*args, **settings))
+        return dtype.type(row.numpy(*args, **kwargs))
 
 
 def constant_key(x: np.generic) -> Any:
-    """Return what two constants have in common that are the same to the last bit."""
+    """Return a key that is equal for constants of the same type and bits."""
     return x.dtype, type(x), x.tobytes()
 
 

@@ -1,4 +1,4 @@
-"""Wrapper that randomises the simulation with a function."""
+"""Wrapper that randomises a simulation at the start of every episode."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from crazysim.pytree import scopes
 
 
 class RandomizeWith(Wrapper):
-    """Begin every episode with other data: masses, motors, or whatever a function changes.
+    """Wrapper that changes the data at the start of every episode with a function: masses, motors or other fields.
 
-    ``fn(data, key) -> data`` receives one world and its key of the episode. Parameters that it changes are one per
-    drone; name them in ``params``.
+    ``fn(data, key) -> data`` receives the data of one world and the random key of its episode. Parameters that it
+    changes must have one value per drone. Name them in ``params``; those that the drones share are then repeated for
+    every drone.
     """
 
     def __init__(self, env: Env, fn: Callable[[SimData, Array], SimData], params: tuple[str, ...] = ()):
         super().__init__(env)
-        params_now = env.sim.data.params
-        known = {field.name: getattr(params_now, field.name) for field in dataclasses.fields(params_now)}
+        sim_params = env.sim.data.params
+        known = {field.name: getattr(sim_params, field.name) for field in dataclasses.fields(sim_params)}
         if missing := [name for name in params if known.get(name) is None]:
             raise ConfigError(
                 f"expected parameters of {env.sim.dynamics.value}, {', '.join(known)}, got {', '.join(missing)}"
@@ -36,20 +37,20 @@ class RandomizeWith(Wrapper):
         self.fn, self.params = fn, tuple(params)
 
     def prepare(self, data: SimData) -> SimData:
-        shape = data.states.pos.shape[:2]
+        batch_shape = data.states.pos.shape[:2]
         shared = [name for name in self.params if getattr(scopes(data.params), name) == "shared"]
         values = {name: getattr(data.params, name) for name in shared}
-        repeated = {name: jnp.broadcast_to(x, (*shape, *x.shape)) for name, x in values.items()}
+        repeated = {name: jnp.broadcast_to(x, (*batch_shape, *x.shape)) for name, x in values.items()}
         return data.replace(params=data.params.replace(**repeated))
 
     def after_spawn(self, data: SimData) -> SimData:
-        drawn = self.fn(data, episode_key(data, "randomize"))
+        randomised = self.fn(data, episode_key(data, "randomize"))
         axes = Axes(data)
-        leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(drawn), strict=True)
-        shared = [name for name, scope, x, new in leaves if scope in ("shared", "opaque") and new is not x]
-        if shared:
+        leaves = zip(axes.names, axes.scopes, jax.tree.leaves(data), jax.tree.leaves(randomised), strict=True)
+        fixed = [name for name, scope, x, new in leaves if scope in ("shared", "opaque") and new is not x]
+        if fixed:
             raise ConfigError(
-                f"{', '.join(shared)} cannot be randomised: all worlds share it. Name parameters that should be one "
+                f"{', '.join(fixed)} cannot be randomised: all worlds share it. Name parameters that should be one "
                 f"per drone in params=, as in RandomizeWith(env, fn, params=('mass',))."
             )
-        return drawn
+        return randomised

@@ -1,4 +1,4 @@
-"""Pictures of a live simulation: everything that a viewer draws at one moment, as arrays of the host."""
+"""Pictures of a live simulation: everything that a viewer draws at one moment, as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from crazysim.sim.sim import Sim
 LIGHT_RADIUS = 0.06
 """Radius of the glow around a lit drone, m."""
 WIND_SCALE = 0.1
-"""Length of a wind arrow per speed, s."""
+"""Length of a wind arrow divided by the wind speed, s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """The scene of some worlds at one moment."""
+    """Everything that a viewer draws of the worlds that it shows, at one moment."""
 
     worlds: NDArray
-    """Indices of the worlds. (n,)"""
+    """Indices of the worlds that are shown. (n,)"""
     time: float
     """Simulated time since the last reset, s."""
     status: str
@@ -43,7 +43,7 @@ class Picture:
     drones: NDArray
     """Positions of the drones, world frame, m. (n, n_drones, 3)"""
     setpoint: NDArray
-    """Positions of state commands, world frame, m; empty at other command levels. (n, n_drones or 0, 3)"""
+    """Positions in the state commands, world frame, m; empty at other command levels. (n, n_drones or 0, 3)"""
     touching: NDArray
     """True where a drone touches something. (n, n_drones)"""
     wind: NDArray
@@ -51,13 +51,13 @@ class Picture:
     lights: NDArray
     """Colours of the drones' LEDs, 0 to 1; zero for off. (n, n_drones, 3)"""
     selected: tuple[int, int] | None
-    """Selected world and drone; None for none."""
+    """World and index of the selected drone; None if no drone is selected."""
     followed: tuple[int, int] | None
-    """World and mocap id of the followed body; None for none."""
+    """World and mocap id of the body that the camera follows; None if it follows none."""
     name: str
-    """Name of the followed body; empty for none."""
+    """Name of the followed body; empty if there is none."""
     controls: tuple[str, ...]
-    """Buttons and sliders of the loop, for viewers without a panel."""
+    """Lines of text that list the buttons and sliders of the loop, for viewers without a panel."""
     plot: NDArray
     """Values of the plotted quantity of the selected drone. (k,)"""
 
@@ -66,14 +66,14 @@ class PictureSource:
     """Source of the pictures of one viewer."""
 
     def __init__(self, sim: Sim, bodies: SceneBodies, worlds: Sequence[int], contacts: bool, wind: bool):
-        """Create a source whose functions are compiled at the first picture.
+        """Create a source. Its functions are compiled when the first picture is taken.
 
         Args:
             sim: Simulation.
             bodies: Bodies that can be followed.
             worlds: Indices of the worlds to show.
             contacts: True to compute which drones touch something.
-            wind: True to compute the wind at every drone, where there is wind.
+            wind: True to compute the wind at every drone, if the simulation has wind.
         """
         self._sim, self._worlds = sim, np.asarray(worlds)
         self._bodies = {(body.kind, body.index): body for body in bodies.items}
@@ -91,17 +91,17 @@ class PictureSource:
         data = sim.data
         pos, quat = mocap_poses(sim, worlds)
         drones = np.asarray(data.states.pos, float)[worlds]
-        no_rows = np.zeros((len(worlds), 0, 3))
-        state, setpoint, air = data.controls.state, no_rows, no_rows
+        empty = np.zeros((len(worlds), 0, 3))
+        state, setpoint, wind = data.controls.state, empty, empty
         if state is not None:
             setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
         if self._wind and _winds(data):
-            air = np.asarray(self._wind_fn(data), float)[worlds]
+            wind = np.asarray(self._wind_fn(data), float)[worlds]
         touching = np.asarray(sim.contact_report().any)[worlds] if self._contacts else np.zeros(drones.shape[:2], bool)
-        values = np.zeros(0)
+        plotted = np.zeros(0)
         if plot and live.selected is not None:
             quantity_fn = live.quantities.get(plot)
-            values = (
+            plotted = (
                 quantity(data, plot, *live.selected)
                 if quantity_fn is None
                 else np.ravel(np.asarray(quantity_fn(live), float))
@@ -117,28 +117,32 @@ class PictureSource:
             drones=drones,
             setpoint=setpoint,
             touching=touching,
-            wind=air,
+            wind=wind,
             lights=np.clip(live.lights[worlds], 0.0, 1.0),
             selected=live.selected,
             followed=None if body is None or followed is None else (followed[0], body.mocap),
             name="" if body is None else body.name,
             controls=live.control_lines,
-            plot=values,
+            plot=plotted,
         )
 
 
 def _winds(data: SimData) -> list[WindData | WindFieldData]:
-    """Return the records of all winds."""
+    """Return the records of all wind plugins."""
     return [record for record in data.plugins.values() if isinstance(record, (WindData, WindFieldData))]
 
 
 def _air(data: SimData) -> jax.Array:
-    """Return the velocity of the air at a drone, world frame, m/s; of one drone. (3,)"""
+    """Return the velocity of the air at one drone, world frame, m/s. (3,)"""
     return sum((record.velocity_at(data.states.pos) for record in _winds(data)), jnp.zeros_like(data.states.pos))
 
 
 def quantities(sim: Sim) -> list[str]:
-    """Return the paths of everything in the data that changes: ``states.vel`` of drones, ``plugins.cars.pos[1]``."""
+    """Return the paths of all quantities that can be plotted.
+
+    These are leaves of drones and worlds, such as ``states.vel``, and leaves of each member of another population, such
+    as ``plugins.cars.pos[1]``.
+    """
     names = []
     for path, scope, x in _leaves(sim.data):
         if scope in ("drone", "world"):
@@ -149,24 +153,24 @@ def quantities(sim: Sim) -> list[str]:
 
 
 def quantity(data: SimData, path: str, world: int, drone: int) -> NDArray:
-    """Return the present values of a quantity. (k,)
+    """Return the current values of a quantity in one world. (k,)
 
     Args:
         data: Data of a simulation.
         path: One of ``quantities``.
         world: Index of the world.
-        drone: Index of the drone, for quantities of drones.
+        drone: Index of the drone; used only for quantities of drones.
     """
-    leaf, _, member = path.rstrip("]").partition("[")
+    wanted_path, _, member = path.rstrip("]").partition("[")
     for leaf_path, scope, x in _leaves(data):
-        if leaf_path == leaf:
+        if leaf_path == wanted_path:
             index = (world,) if scope == "world" else (world, int(member) if member else drone)
             return np.asarray(x)[index].ravel().astype(float)
     raise KeyError(path)
 
 
 def _leaves(data: SimData) -> list[tuple[str, str, jax.Array]]:
-    """Return path, scope and value of every leaf that holds numbers."""
+    """Return the path, scope and value of every numeric leaf."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(data)
     leaf_scopes = zip(leaves, jax.tree.leaves(scopes(data)), strict=True)
     return [(_path(path), scope, x) for (path, x), scope in leaf_scopes if getattr(x.dtype, "kind", "O") in "fiub"]

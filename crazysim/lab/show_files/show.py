@@ -1,4 +1,4 @@
-"""Light shows: trajectories and lights of named drones, with cues and settings."""
+"""Light shows: trajectories and lights of named drones, together with cues and settings."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class Cue:
     """A named instant of a show."""
 
     time: float
-    """Time, s."""
+    """Time since the start of the show, s."""
     name: str
-    """Name."""
+    """Name of the cue."""
 
 
 @dataclass(frozen=True)
 class ParameterChange:
-    """A change of a parameter of a drone's firmware during a show."""
+    """A change of a firmware parameter of one drone during a show."""
 
     time: float
-    """Time, s."""
+    """Time since the start of the show, s."""
     name: str
     """Name of the parameter, such as ``stabilizer.controller``."""
     value: float
@@ -45,24 +45,25 @@ class Show:
     names: tuple[str, ...]
     """Names of the drones, all different."""
     trajectories: Trajectory
-    """Trajectories of the drones, stacked; they begin with the show. (n_drones, ...)"""
+    """Trajectories of the drones, stacked. They start with the show, at time zero. (n_drones, ...)"""
     lights: Lights
     """Lights of the drones, stacked. (n_drones, ...)"""
     cues: tuple[Cue, ...] = ()
-    """Cues, by time."""
+    """Cues, in order of time."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the show but its cues, as in ``show.json``; ``validation`` has maxAltitude, m, maxVelocityXY and
-    maxVelocityZ, m/s, and minDistance, m."""
+    """Settings of the show other than its cues, as in ``show.json``. The entry ``validation`` has maxAltitude, m,
+    maxVelocityXY and maxVelocityZ, m/s, and minDistance, m."""
     homes: NDArray = None  # type: ignore[assignment]  # replaced at construction
-    """Home of each drone, m; None for where the trajectories start. (n_drones, 3)"""
+    """Home position of each drone, m; None for the start of its trajectory. (n_drones, 3)"""
     landings: NDArray = None  # type: ignore[assignment]  # replaced at construction
-    """Landing place of each drone, m; None for the ends of the trajectories. (n_drones, 3)"""
+    """Landing position of each drone, m; None for the end of its trajectory. (n_drones, 3)"""
     parameters: tuple[tuple[ParameterChange, ...], ...] = ()
-    """Changes of firmware parameters of each drone."""
+    """Changes of firmware parameters, one tuple for each drone; empty for no changes."""
     encodings: tuple[str, ...] = ()
-    """Format in which a Crazyflie receives each trajectory, ``COMPRESSED`` or ``POLY4D``."""
+    """Format in which each Crazyflie receives its trajectory: ``COMPRESSED`` or ``POLY4D``. If empty, all receive
+    ``COMPRESSED``."""
     environment: str = "indoor"
-    """``indoor`` or ``outdoor``."""
+    """Environment, ``indoor`` or ``outdoor``."""
     meta: Mapping[str, Any] = field(default_factory=dict)
     """Metadata, such as ``title``."""
 
@@ -87,10 +88,10 @@ class Show:
                 object.__setattr__(self, name, default)
         sizes = {name: len(getattr(self, name)) for name in defaults}
         sizes |= {"trajectories": len(self.trajectories.ends), "lights": len(self.lights.times)}
-        wrong = {name: size for name, size in sizes.items() if size != n}
-        if wrong:
+        wrong_sizes = {name: size for name, size in sizes.items() if size != n}
+        if wrong_sizes:
             raise ConfigError(
-                f"expected one entry for each of {n} drones, got {wrong}. Pass as many as there are names."
+                f"expected one entry for each of {n} drones, got {wrong_sizes}. Pass as many as there are names."
             )
 
     @property
@@ -116,6 +117,10 @@ class Show:
         return dataclasses.replace(self, **changes)
 
     def _points(self, time: float) -> NDArray:
-        """Return position, m, and yaw, rad, of every drone where its trajectory begins or ends. (n_drones, 4)"""
-        c = np.asarray(self.trajectories.coefficients, float)
-        return c[:, 0, :, 0] if time <= 0 else c[:, -1].sum(-1)
+        """Return the position, m, and yaw, rad, of every drone at an end of its trajectory. (n_drones, 4)
+
+        Args:
+            time: Zero or less for the start of the trajectories; any other time for their ends.
+        """
+        coefficients = np.asarray(self.trajectories.coefficients, float)
+        return coefficients[:, 0, :, 0] if time <= 0 else coefficients[:, -1].sum(-1)

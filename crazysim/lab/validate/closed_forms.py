@@ -1,4 +1,4 @@
-"""Motions with a closed form, and the order of the integrators."""
+"""Comparisons with closed-form motions, and of the integrators with their orders of convergence."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def free_body(
     gravity: bool = True,
     n_worlds: int = 1,
 ) -> Sim:
-    """Return a simulation of a drone without thrust or drag, thrown from a height of 100 m.
+    """Return a simulation of a drone without thrust and drag, thrown from a height of 100 m.
 
     Args:
         integrator: Integrator.
         freq: Steps per second, Hz.
-        ang_vel: Angular velocity, body frame, rad/s. (3,)
-        inertia: Moments of inertia, kg m^2. (3, 3)
-        gravity: True for weight.
+        ang_vel: Initial angular velocity, body frame, rad/s. (3,)
+        inertia: Inertia matrix, kg m^2; None for a diagonal matrix of ``INERTIA``. (3, 3)
+        gravity: True to apply gravity.
         n_worlds: Number of worlds.
     """
     sim = Sim(n_worlds, control="rotor_vel", integrator=integrator, freq=freq)
@@ -60,57 +60,62 @@ def free_body(
 
 
 def with_states(data: SimData, **changes: Any) -> SimData:
-    """Return the data with other states, broadcast to every drone."""
+    """Return the data with some states replaced, by values that are broadcast to all drones."""
     states = data.states
     new = {k: np.broadcast_to(v, getattr(states, k).shape).astype(getattr(states, k).dtype) for k, v in changes.items()}
     return data.replace(states=states.replace(**{k: jnp.asarray(v) for k, v in new.items()}))
 
 
 def turn(vector: NDArray) -> Array:
-    """Return the quaternion, xyzw, of a rotation vector, rad. (4,)"""
+    """Return the quaternion, xyzw, of a nonzero rotation vector, rad. (4,)"""
     angle = float(np.linalg.norm(vector))
     return jnp.asarray([*(vector / angle * math.sin(angle / 2)), math.cos(angle / 2)])
 
 
 def state_of(sim: Sim) -> dict[str, NDArray]:
-    """Return the states of the first drone."""
+    """Return the states of the first drone of the first world."""
     s = sim.data.states
     return {k: np.asarray(getattr(s, k))[0, 0] for k in ("pos", "vel", "quat", "ang_vel", "rotor_vel")}
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> float:
     """Return the angle between two attitudes, unit quaternions xyzw, rad."""
-    turn = rotation.multiply(rotation.conjugate(jnp.asarray(a)), jnp.asarray(b))
-    return 2 * math.asin(min(1.0, float(np.linalg.norm(turn[:3]))))
+    relative = rotation.multiply(rotation.conjugate(jnp.asarray(a)), jnp.asarray(b))
+    return 2 * math.asin(min(1.0, float(np.linalg.norm(relative[:3]))))
 
 
 def free_fall_error(integrator: str) -> float:
-    """Return the distance after 1 s from the closed form of the scheme, m.
+    """Return the distance between simulated and exact position after a free fall of 1 s, m.
 
-    Under constant acceleration a scheme is a sum: ``v0 t + g t^2 / 2``, minus or plus ``g t dt / 2`` for Euler's two.
+    The exact position is the closed form of the integration scheme itself. Under constant acceleration g the
+    displacement of a scheme is a sum: ``v0 t + g t^2 / 2``, minus ``g t dt / 2`` for explicit Euler and plus it for
+    symplectic Euler.
     """
     sim, t, dt = free_body(integrator), 1.0, 1 / 500
     sim.step(500)
-    extra = {
+    scheme_term = {
         "euler": 0.5 * GRAVITY_MAGNITUDE * t * dt,
         "symplectic_euler": -0.5 * GRAVITY_MAGNITUDE * t * dt,
         "rk4": 0.0,
     }[integrator]
-    expected = np.array([1.0, -2.0, 103.0 - 0.5 * GRAVITY_MAGNITUDE * t**2 + extra])
+    expected = np.array([1.0, -2.0, 103.0 - 0.5 * GRAVITY_MAGNITUDE * t**2 + scheme_term])
     return float(np.linalg.norm(state_of(sim)["pos"] - expected))
 
 
 def free_fall() -> Iterable[Row]:
-    """Yield the errors of a free fall."""
+    """Yield the error of the position in a free fall, for each integrator."""
     for name in ("euler", "symplectic_euler", "rk4"):
         with jax.enable_x64(True):
             error = free_fall_error(name)
-        # 500 additions of numbers near 100, each rounded to 1.4e-14
+        # bound: 500 additions of numbers near 100, each rounded to 1.4e-14
         yield Row(f"free fall, 1 s, {name}: position", "sum of the scheme", error, "m", (0, 1e-11))
 
 
 def precession() -> Iterable[Row]:
-    """Yield the attitude of a torque-free symmetric top: a product of two rotations at constant rates."""
+    """Yield the error of the attitude of a torque-free symmetric top.
+
+    The exact attitude is a product of two rotations at constant rates.
+    """
     a, c, w, t = 2e-5, 5e-5, np.array([4.0, 3.0, 8.0]), 0.5
     with jax.enable_x64(True):
         sim = free_body("rk4", 500, w, np.diag([a, a, c]))
@@ -118,28 +123,35 @@ def precession() -> Iterable[Row]:
         quat = state_of(sim)["quat"]
         exact = rotation.multiply(turn(np.array([a, a, c]) * w / a * t), turn(np.array([0, 0, w[2] * (1 - c / a) * t])))
         angle = angle_between(exact, quat)
-    # a step turns by 0.019 rad; ten times 250 * 0.019^5 / 120, the error of a linear system, as Euler's is not linear
+    # One step turns by 0.019 rad. The bound is ten times 250 * 0.019^5 / 120, which is the error for a linear system,
+    # because Euler's equations are not linear.
     yield Row("precession of a top at 9.4 rad/s, 0.5 s, RK4: attitude", "closed form", angle, "rad", (0, 5e-8))
 
 
 def terminal_velocity() -> Iterable[Row]:
-    """Yield the velocity of a drone that has fallen for 40 s with its rotors off."""
+    """Yield the relative error of the speed of a drone that has fallen for 40 s with its rotors off."""
     with jax.enable_x64(True):
         sim = Sim(control="rotor_vel", integrator="rk4")
         p = sim.data.params
-        fall = float(np.ravel(p.mass)[0]) * GRAVITY_MAGNITUDE / -float(np.asarray(p.drag_matrix)[..., 2, 2].ravel()[0])
+        mass, drag = float(np.ravel(p.mass)[0]), -float(np.asarray(p.drag_matrix)[..., 2, 2].ravel()[0])
+        terminal_speed = mass * GRAVITY_MAGNITUDE / drag
         sim.data = with_states(sim.data, pos=[0, 0, 2000.0], rotor_vel=np.zeros(4))
         sim.rotor_vel_control(np.zeros((1, 1, 4)))
         sim.step(20_000)
         speed = -state_of(sim)["vel"][2]
-    rate = GRAVITY_MAGNITUDE / fall
-    # the rest of the transient, and rounding
-    text = f"m g / D = {fall:.3f} m/s"
-    yield Row("terminal velocity, 40 s", text, abs(speed / fall - 1), "", (0, 2 * math.exp(-40 * rate)))
+    rate = GRAVITY_MAGNITUDE / terminal_speed
+    # bound: what remains of the transient after 40 s, twice to allow for rounding
+    bound = (0, 2 * math.exp(-40 * rate))
+    reference = f"m g / D = {terminal_speed:.3f} m/s"
+    yield Row("terminal velocity, 40 s", reference, abs(speed / terminal_speed - 1), "", bound)
 
 
 def motor_step() -> Iterable[Row]:
-    """Yield the speed of a rotor on its way up: ``r' = (c - r) (a + b (c + r))`` has a rational solution of exp."""
+    """Yield the error of the speed of a rotor that spins up.
+
+    The speed r for a commanded speed c follows ``r' = (c - r) (a + b (c + r))``. Its solution is a rational function of
+    an exponential.
+    """
     low, high, t = 10_000.0, 16_000.0, 0.05
     with jax.enable_x64(True):
         sim = Sim(control="rotor_vel", integrator="rk4")
@@ -147,18 +159,22 @@ def motor_step() -> Iterable[Row]:
         sim.data = with_states(sim.data, pos=[0, 0, 10.0], rotor_vel=np.full(4, low))
         sim.rotor_vel_control(np.full((1, 1, 4), high))
         sim.step(25)
-        speeds = state_of(sim)["rotor_vel"][0]
+        speed = state_of(sim)["rotor_vel"][0]
     # with e = c - r: e' = -e (a + 2 b c - b e), Bernoulli's equation
-    rate, start = a + 2 * b * high, high - low
-    e = rate / (b + (rate / start - b) * math.exp(rate * t))
-    # RK4: a step of 2 ms is 0.035 of the time constant; 25 * 0.035^5 / 120 of 6,000 rpm
+    rate, initial_error = a + 2 * b * high, high - low
+    e = rate / (b + (rate / initial_error - b) * math.exp(rate * t))
+    # bound: a step of 2 ms is 0.035 of the time constant, so RK4 errs by 25 * 0.035^5 / 120 of 6,000 rpm
     yield Row(
-        "motor, 50 ms after a step from 10,000 to 16,000 rpm", "closed form", abs(speeds - high + e), "rpm", (0, 1e-4)
+        "motor, 50 ms after a step from 10,000 to 16,000 rpm", "closed form", abs(speed - high + e), "rpm", (0, 1e-4)
     )
 
 
 def pendulum() -> Iterable[Row]:
-    """Yield the period of a load of 0.2 kg on 0.4 m below a body that does not move."""
+    """Yield the relative error of the period of a pendulum: a load of 0.2 kg on a rod of 0.4 m below a fixed body.
+
+    The body has a mass of 1e9 kg, and a force carries its weight. The exact period is an elliptic integral, computed
+    with the arithmetic-geometric mean.
+    """
     angles, length = np.array([0.2, 0.8, 1.4]), 0.4
     with jax.enable_x64(True):
         sim = Sim(3, drone="bumblebee", control="rotor_vel", integrator="rk4")
@@ -168,12 +184,12 @@ def pendulum() -> Iterable[Row]:
         record = load.read(sim.data)
         pos = np.stack([length * np.sin(angles), 0 * angles, 5 - length * np.cos(angles)], axis=-1)[:, None]
         sim.data = load.write(sim.data, record.replace(pos=jnp.asarray(pos, record.pos.dtype)))
-        x = []
+        offsets = []
         for _ in range(1500):
             sim.step()
-            x.append(np.asarray(load.read(sim.data).pos - sim.data.states.pos)[:, 0, 0])
+            offsets.append(np.asarray(load.read(sim.data).pos - sim.data.states.pos)[:, 0, 0])
     for k, angle in enumerate(angles):
-        swing = np.stack(x)[:, k]
+        swing = np.stack(offsets)[:, k]
         crossings = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))[:2]
         times = (crossings + 1 + swing[crossings] / (swing[crossings] - swing[crossings + 1])) / sim.freq
         mean, geometric_mean = 1.0, math.cos(angle / 2)
@@ -181,34 +197,38 @@ def pendulum() -> Iterable[Row]:
             mean, geometric_mean = (mean + geometric_mean) / 2, math.sqrt(mean * geometric_mean)
         period = 2 * math.pi * math.sqrt(length / GRAVITY_MAGNITUDE) / mean
         error = abs(float(times[1] - times[0]) / period - 1)
-        # crossings are interpolated linearly between samples of 2 ms: (2 ms)^3 of the curvature, relative to 1.3 s
+        # bound: crossings are interpolated linearly between samples 2 ms apart, which errs by the curvature times
+        # (2 ms)^3, relative to 1.3 s
         name = f"period of a load on a rod, amplitude {angle:g} rad"
         yield Row(name, f"elliptic integral, {period:.4f} s", error, "", (0, 1e-5))
 
 
 def dzhanibekov() -> Iterable[Row]:
-    """Yield the growth rate of a wobble about the middle axis: ``w sqrt((J2 - J1) (J3 - J2) / (J1 J3))``."""
+    """Yield the relative error of the growth rate of a wobble during rotation about the intermediate axis.
+
+    The exact rate is ``w sqrt((J2 - J1) (J3 - J2) / (J1 J3))``.
+    """
     j1, j2, j3 = INERTIA
-    w, small, t = 10.0, 1e-7, 1.0
+    w, wobble, t = 10.0, 1e-7, 1.0
     rate = w * math.sqrt((j2 - j1) * (j3 - j2) / (j1 * j3))
-    start = [small, w, rate * j1 / ((j2 - j3) * w) * small]
+    ang_vel = [wobble, w, rate * j1 / ((j2 - j3) * w) * wobble]
     with jax.enable_x64(True):
-        sim = free_body("rk4", 500, start)
+        sim = free_body("rk4", 500, ang_vel)
         sim.step(500)
-        growth = math.log(abs(state_of(sim)["ang_vel"][0]) / small) / t
-    # RK4: growth per step of 2 ms is exp(0.0126) to order five, 500 * 0.0126^5 / 120 over 6.3
+        growth = math.log(abs(state_of(sim)["ang_vel"][0]) / wobble) / t
+    # per step of 2 ms the wobble grows by exp(0.0089), which RK4 matches up to 0.0089^5 / 120: 500 times that over 4.5
     yield Row("Dzhanibekov effect: growth rate", f"{rate:.4f} 1/s", abs(growth / rate - 1), "", (0, 1e-8))
 
 
 STEPS = {"euler": (400, 800, 1600), "symplectic_euler": (400, 800, 1600), "rk4": (100, 200, 400)}
-"""Steps per second of the flights that show the order of an integrator, Hz."""
+"""Steps per second of the flights from which the order of an integrator is estimated, Hz."""
 
 
 def order_errors() -> dict[str, NDArray]:
-    """Return errors of position, m, and attitude of a tumbling body in drag, by integrator. (n_freqs, 2)
+    """Return the errors of position, m, and attitude of a tumbling body with drag, by integrator. (n_freqs, 2)
 
-    The drag depends on the attitude, and the axis turns, so that rotations which do not commute count. The reference
-    is RK4 at 6,400 Hz.
+    The error of the attitude is the norm of the difference of quaternions. The drag depends on the attitude and the
+    axis of rotation turns, so errors from rotations that do not commute are included. The reference is RK4 at 6,400 Hz.
     """
 
     def flight(freq: int, scheme: str) -> tuple[NDArray, NDArray]:
@@ -220,22 +240,22 @@ def order_errors() -> dict[str, NDArray]:
         return state["pos"], state["quat"]
 
     with jax.enable_x64(True):
-        exact = flight(6400, "rk4")
+        reference = flight(6400, "rk4")
         flights = {name: [flight(f, name) for f in freqs] for name, freqs in STEPS.items()}
     return {
-        name: np.array([[np.linalg.norm(x - e) for x, e in zip(flown, exact, strict=True)] for flown in by_freq])
+        name: np.array([[np.linalg.norm(x - e) for x, e in zip(final, reference, strict=True)] for final in by_freq])
         for name, by_freq in flights.items()
     }
 
 
 def orders() -> Iterable[Row]:
-    """Yield the orders of the integrators: slopes of the error over the step, both as logarithms."""
+    """Yield the measured orders of the integrators: slopes of log error over log time step."""
     for name, errors in order_errors().items():
         order = 4 if name == "rk4" else 1
-        for what, column in zip(("position", "attitude"), errors.T, strict=True):
+        for quantity, column in zip(("position", "attitude"), errors.T, strict=True):
             slope = float(np.polyfit(np.log(1 / np.array(STEPS[name])), np.log(column), 1)[0])
-            bound = (order - 0.35, order + 0.35)  # terms of the next order
-            yield Row(f"order of {name}: {what}", f"theory: {order}", slope, "", bound)
+            bound = (order - 0.35, order + 0.35)  # tolerance for terms of higher order
+            yield Row(f"order of {name}: {quantity}", f"theory: {order}", slope, "", bound)
 
 
 CHECKS = (free_fall, precession, terminal_velocity, motor_step, pendulum, dzhanibekov, orders)

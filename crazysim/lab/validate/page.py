@@ -1,4 +1,4 @@
-"""The page of comparisons."""
+"""Markdown page with the results of all comparisons."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazy
 
 A figure passes if it is within the range in its row; rows without a range only report.
 """
-"""Beginning of the page."""
+"""Introduction at the top of the page, in which ``packages`` is filled in."""
 COLUMNS: Mapping[str, Callable[[Row], str]] = {
     "Quantity": lambda row: row.what,
     "Reference": lambda row: row.against,
@@ -47,30 +47,30 @@ COLUMNS: Mapping[str, Callable[[Row], str]] = {
     "Passes": lambda row: bound_text(row.bound),
     "For comparison": lambda row: row.other,
 }
-"""Cells of a row by the heading of their column."""
+"""Functions from a row to the text of a cell, by the heading of the column."""
 
 
 def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: Mapping[str, str]) -> str:
     """Return the page in Markdown.
 
     Args:
-        sections: Sections, in the order of the page.
-        rows: Their rows.
-        made: Sentence with date, commit, machine and versions.
-        pictures: Paths of pictures, relative to the page, by the name of the section.
+        sections: Sections, in their order on the page.
+        rows: Rows of these sections.
+        made: Sentence with the date, commit, machine and versions with which the rows were measured.
+        pictures: Paths of pictures, relative to the page, by the name of their section.
     """
     bounded = [row for row in rows if row.bound is not None or row.problem]
-    bad = [row for row in bounded if row.failed]
-    summary = f" {len(bounded) - len(bad)} of {len(bounded)} figures with a range are within it." if bounded else ""
-    if bad:
-        summary += " Outside: " + "; ".join(row.what for row in bad) + "."
+    failed = [row for row in bounded if row.failed]
+    summary = f" {len(bounded) - len(failed)} of {len(bounded)} figures with a range are within it." if bounded else ""
+    if failed:
+        summary += " Outside: " + "; ".join(row.what for row in failed) + "."
     packages = dict.fromkeys(name for section in sections for name in section.packages.values())
     parts = [INTRODUCTION.format(packages=" ".join(['".[demo]"', *packages])).strip(), made + summary]
     for section in sections:
-        repeat = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.logs}`"
+        command = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.logs}`"
         if section.packages:
-            repeat = f"`pip install {' '.join(section.packages.values())}` and {repeat}"
-        parts += [f"## {section.title}", section.text, f"Repeat: {repeat}."]
+            command = f"`pip install {' '.join(section.packages.values())}` and {command}"
+        parts += [f"## {section.title}", section.text, f"Repeat: {command}."]
         if section.missing:
             parts.append(f"Not measured: {section.missing}.")
             continue
@@ -85,7 +85,7 @@ def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: 
 
 
 def bound_text(bound: tuple[float, float] | None) -> str:
-    """Return the bound in words, or an empty text."""
+    """Return a bound in words; empty for None."""
     if bound is None:
         return ""
     low, high = bound

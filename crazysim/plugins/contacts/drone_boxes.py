@@ -1,4 +1,4 @@
-"""Collision boxes of drones, of each airframe."""
+"""Collision boxes of the drones, one for each airframe."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from crazysim.core.plugin import Simulation
 from crazysim.scene.collision import DroneGeoms
 
 DroneBoxes = Sequence[tuple[DroneGeoms, np.ndarray]]
-"""Drones of each airframe, with centre and half extents of their collision box, body frame, m. (6,)"""
+"""For each airframe: its drones, with the centre and half extents of their collision box, body frame, m. (6,)"""
 
 
 def collision_boxes(sim: Simulation) -> DroneBoxes:
-    """Return the collision boxes of a simulation's drones."""
-    kinds = [DroneGeoms((), drones) for drones in sim.scene.kinds]
-    firsts = [0 if kind.drones is None else kind.drones[0] for kind in kinds]
-    boxes = [np.asarray(sim.airframes[k].value("shape.collision_box"), np.float64) for k in firsts]
-    return list(zip(kinds, boxes, strict=True))
+    """Return the collision box of each airframe in a simulation, with the drones that have it."""
+    drone_groups = [DroneGeoms((), drones) for drones in sim.scene.kinds]
+    first_drones = [0 if group.drones is None else group.drones[0] for group in drone_groups]
+    boxes = [np.asarray(sim.airframes[k].value("shape.collision_box"), np.float64) for k in first_drones]
+    return list(zip(drone_groups, boxes, strict=True))
 
 
 def select_airframe(results: Sequence[tuple[DroneGeoms, Any]], drone_id: Array) -> Any:
-    """Return for each drone the result for its airframe.
+    """Return the result of each drone's own airframe.
 
     Args:
-        results: Results for drones of each airframe: trees of arrays of one drone, or (..., n_drones, k).
-        drone_id: Indices of the drones. () or (n_drones,)
+        results: For each airframe: its drones, with a result that was computed as if all drones had this airframe. A
+            result is a tree of arrays, of one drone or (..., n_drones, k).
+        drone_id: Index of the drone, or indices of all drones. () or (n_drones,)
     """
     (_, result), *others = results
-    for kind, other in others:
-        present: Any = kind.drone_mask(drone_id)
-        mask = present[..., None] if present.ndim else present
+    for group, other in others:
+        in_group: Any = group.drone_mask(drone_id)
+        mask = in_group[..., None] if in_group.ndim else in_group
         result = jax.tree.map(lambda x, y, mask=mask: x if y is x else jnp.where(mask, y, x), result, other)
     return result

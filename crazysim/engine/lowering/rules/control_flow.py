@@ -1,4 +1,4 @@
-"""Rules for calls, which are inlined, for branches, which become selections, and for loops, which stay loops."""
+"""Lowering rules for calls (inlined), branches (all computed, one selected) and loops (kept as loops or unrolled)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 
 @rule("pure_callback", "io_callback")
 def _host_call(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Refuse a call of a function on the host, around which a step is split."""
+    """Refuse a callback to the host: its stage stays unfused, and the step is split around it."""
     raise LimitError("it calls a function on the host")
 
 
@@ -41,7 +41,7 @@ def _custom_jvp(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elem
 
 @rule("stop_gradient")
 def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Pass numbers on, with a derivative of zero."""
+    """Return the operands unchanged, with a derivative of zero."""
     aval = eqn.invars[0].aval
     if not jax.numpy.issubdtype(aval.dtype, np.inexact) or all(map(is_constant, args[0].reshape(-1))):
         return args
@@ -51,10 +51,10 @@ def _stop_gradient(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
 
 @rule("call_hi_primitive")
 def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Expand a primitive that is defined by others, which JAX has from 0.12 on.
+    """Expand a primitive that is defined in terms of other primitives (JAX 0.12 and later).
 
-    Results without a derivative, such as the indices that ``jnp.searchsorted`` finds, are computed as in any call, from
-    tables where the operands are tables.
+    If the results have no derivative, such as the indices from ``jnp.searchsorted``, the expansion is lowered like any
+    call, so it reads tables where the operands are tables.
     """
     avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
     called = jax.make_jaxpr(expand_primitive(eqn))(*avals)
@@ -64,19 +64,19 @@ def _high_level(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elem
 
 
 def _with_derivative(ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called: ClosedJaxpr) -> list[Elements]:
-    """Lower a call with a custom derivative, which is lowered only when a derivative is requested."""
+    """Lower a call with a custom derivative. The derivative itself is lowered only when it is requested."""
     body = ctx.inner()
     block = body.finish(body.lower(called, [_inputs(body, x) for x in args]))
 
     @functools.cache
     def slope() -> Block:
         """Return the block from operands and their tangents to the tangents of the results."""
-        single = as_function(eqn)
+        call_fn = as_function(eqn)
         avals = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-        traced = jax.make_jaxpr(lambda x, dx: jax.jvp(single, x, dx)[1])(avals, avals)
-        fresh = Lowering()
-        inputs = [_inputs(fresh, x) for x in (*args, *args)]
-        return fresh.finish(fresh.lower(traced, inputs))
+        traced = jax.make_jaxpr(lambda x, dx: jax.jvp(call_fn, x, dx)[1])(avals, avals)
+        tangents = Lowering()
+        inputs = [_inputs(tangents, x) for x in (*args, *args)]
+        return tangents.finish(tangents.lower(traced, inputs))
 
     return _results(ctx, "custom_jvp", eqn, scalars(*args), (block,), (("slope", slope),))
 
@@ -84,34 +84,35 @@ def _with_derivative(ctx: Lowering, eqn: JaxprEqn, args: list[Elements], called:
 @rule("custom_linear_solve")
 def _linear_solve(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    n_before = lengths.matvec + lengths.vecmat
-    solve = args[n_before : n_before + lengths.solve]
-    n_all = n_before + lengths.solve + lengths.transpose_solve
-    return ctx.lower(close_jaxpr(jaxprs.solve), [*solve, *args[n_all:]])
+    first = lengths.matvec + lengths.vecmat
+    solve_consts = args[first : first + lengths.solve]
+    n_consts = first + lengths.solve + lengths.transpose_solve
+    return ctx.lower(close_jaxpr(jaxprs.solve), [*solve_consts, *args[n_consts:]])
 
 
 @rule("cond")
 def _cond(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Compute all branches and select one: lanes differ in which."""
-    which, *operands = args
+    """Compute all branches and select one in each lane."""
+    index_array, *operands = args
     branches = [close_jaxpr(b) for b in eqn.params["branches"]]
-    index = which[()]
+    index = index_array[()]
     if is_constant(index):
         return ctx.lower(branches[int(np.clip(index, 0, len(branches) - 1))], operands)
     outs = [ctx.lower(b, operands) for b in branches]
     results = []
     for k, v in enumerate(eqn.outvars):
-        taken = outs[-1][k]
+        selected = outs[-1][k]
         for i in range(len(branches) - 2, -1, -1):
-            is_branch = ctx.scalar("le", index, constant(i, index.dtype), dtype=bool)
-            taken = ctx.elementwise("select_n", [as_elements([is_branch], ()), taken, outs[i][k]], v.aval.dtype)
-        results.append(taken)
+            is_at_most = ctx.scalar("le", index, constant(i, index.dtype), dtype=bool)
+            operands_of_select = [as_elements([is_at_most], ()), selected, outs[i][k]]
+            selected = ctx.elementwise("select_n", operands_of_select, v.aval.dtype)
+        results.append(selected)
     return results
 
 
 @rule("platform_index")
 def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Return the default branch: a program is lowered once for all platforms."""
+    """Return the index of the default branch, since a program is lowered once for all platforms."""
     platforms = list(eqn.params["platforms"])
     named = sorted({name for names in platforms for name in names or ()} & {"cpu", "gpu", "cuda", "rocm"})
     if named or None not in platforms:
@@ -125,15 +126,16 @@ def _platform_index(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[
 def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     p, length = eqn.params, eqn.params["length"]
     body = close_jaxpr(p["jaxpr"])
-    # Versions of JAX name the groups differently; operands per iteration have one axis more than in the body.
+    # The parameters with the sizes of these groups have different names in different versions of JAX, so the sizes are
+    # found by the number of axes: an operand per iteration has one axis more than in the body.
     n_carry = sum(o.aval.ndim == v.aval.ndim for o, v in zip(eqn.outvars, body.jaxpr.outvars, strict=True))
     n_stacked = sum(o.aval.ndim > v.aval.ndim for o, v in zip(eqn.invars, body.jaxpr.invars, strict=True))
     n_consts = len(eqn.invars) - n_carry - n_stacked
-    fixed, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
+    consts, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
     if len(body.jaxpr.outvars) == n_carry and not xs and length > 1:
         inner = ctx.inner()
         inputs = [_inputs(inner, x) for x in carry]
-        block = inner.finish(inner.lower(body, [*fixed, *inputs]))
+        block = inner.finish(inner.lower(body, [*consts, *inputs]))
         return _results(ctx, "loop", eqn, scalars(*carry), (block,), (("length", length),))
     if length > MAX_UNROLL:
         raise UnsupportedError(
@@ -141,14 +143,14 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
         )
     stacked: list[list[Elements]] = []
     for i in range(length)[::-1] if p["reverse"] else range(length):
-        outs = ctx.lower(body, [*fixed, *carry, *(x[i, ...] for x in xs)])
+        outs = ctx.lower(body, [*consts, *carry, *(x[i, ...] for x in xs)])
         carry = outs[:n_carry]
         stacked.append(outs[n_carry:])
     if p["reverse"]:
         stacked.reverse()
     if not length:
         return [*carry, *(np.empty(v.aval.shape, object) for v in eqn.outvars[n_carry:])]
-    ys = [np.stack([turn[k] for turn in stacked]) for k in range(len(body.jaxpr.outvars) - n_carry)]
+    ys = [np.stack([outs[k] for outs in stacked]) for k in range(len(body.jaxpr.outvars) - n_carry)]
     return [*carry, *ys]
 
 
@@ -156,11 +158,13 @@ def _scan(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 def _while(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     p = eqn.params
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
-    cond_fixed, body_fixed, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
-    test, body = ctx.inner(), ctx.inner()
-    goes_on = test.finish(test.lower(close_jaxpr(p["cond_jaxpr"]), [*cond_fixed, *(_inputs(test, x) for x in carry)]))
-    turn = body.finish(body.lower(close_jaxpr(p["body_jaxpr"]), [*body_fixed, *(_inputs(body, x) for x in carry)]))
-    return _results(ctx, "while", eqn, scalars(*carry), (goes_on, turn))
+    cond_consts, body_consts, carry = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
+    cond, body = ctx.inner(), ctx.inner()
+    cond_args = [*cond_consts, *(_inputs(cond, x) for x in carry)]
+    cond_block = cond.finish(cond.lower(close_jaxpr(p["cond_jaxpr"]), cond_args))
+    body_args = [*body_consts, *(_inputs(body, x) for x in carry)]
+    body_block = body.finish(body.lower(close_jaxpr(p["body_jaxpr"]), body_args))
+    return _results(ctx, "while", eqn, scalars(*carry), (cond_block, body_block))
 
 
 @rule("any_lane")
@@ -170,6 +174,8 @@ def _any_lane(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
 
 
 def _inputs(ctx: Lowering, template: Elements) -> Elements:
+    """Return new inputs of a block, with the shape and types of an array of elements."""
+
     def new(x: Any) -> Any:
         return tuple(map(new, x)) if isinstance(x, tuple) else ctx.builder.input(x.dtype)
 
@@ -179,12 +185,12 @@ def _inputs(ctx: Lowering, template: Elements) -> Elements:
 def _results(
     ctx: Lowering, op: str, eqn: JaxprEqn, args: list[Element], blocks: tuple[Block, ...], params: tuple = ()
 ) -> list[Elements]:
-    """Return the results of an operation that has many."""
+    """Add an operation with the results of an equation, and return the results as arrays of elements."""
     keys = [jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in eqn.outvars]
     sizes = [int(np.prod(v.aval.shape)) * (2 if is_key else 1) for v, is_key in zip(eqn.outvars, keys, strict=True)]
     dtypes = [np.uint32 if is_key else v.aval.dtype for v, is_key in zip(eqn.outvars, keys, strict=True)]
-    of_all = [dtype for dtype, size in zip(dtypes, sizes, strict=True) for _ in range(size)]
-    flat = iter(ctx.builder.add_many(op, tuple(args), of_all, params, blocks))
+    result_dtypes = [dtype for dtype, size in zip(dtypes, sizes, strict=True) for _ in range(size)]
+    flat = iter(ctx.builder.add_many(op, tuple(args), result_dtypes, params, blocks))
     out = []
     for v, is_key, size in zip(eqn.outvars, keys, sizes, strict=True):
         items = [next(flat) for _ in range(size)]

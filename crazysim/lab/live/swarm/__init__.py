@@ -1,4 +1,4 @@
-"""Swarms of simulated drones that take the commands of Crazyflies."""
+"""Swarms of simulated drones that accept the same commands as real Crazyflies."""
 
 from crazysim.lab.live.swarm.commander import Commander
 from crazysim.lab.live.swarm.motion import PlannedMotion
