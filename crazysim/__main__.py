@@ -14,7 +14,7 @@ from crazysim.errors import DivergedError, RenderError, not_installed
 EXTRAS = {"optax": "train", "matplotlib": "demo", "imageio_ffmpeg": "demo", "tqdm": "demo", "viser": "web",
           "websockets": "web", "onnx": "onnx", "motioncapture": "mocap", "cflib": "radio",
           "pymavlink": "mavlink"}  # fmt: skip
-"""Extra of crazysim that brings a package."""
+"""Extra of crazysim that installs each package."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # who reads the output, such as head, has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+    except BrokenPipeError:  # the reader of the output, such as head, has closed it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes stdout at exit
         return 141
     except (ValueError, ImportError, OSError, DivergedError, RenderError) as error:
         print(f"crazysim: {_named_extra(error, options.command)}", file=sys.stderr)
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _named_extra(error: Exception, command: str) -> str:
-    """Return the message of an error, for a missing package with the extra of crazysim that brings it."""
+    """Return the message of an error, or, for a missing package, a message with the extra that installs it."""
     package = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if package not in EXTRAS:
         return str(error)

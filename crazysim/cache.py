@@ -1,8 +1,8 @@
 """The folder in which compiled programs and kernels are kept between processes.
 
 The engine keeps its kernels there by default, and crazysim the XLA programs that it compiles itself
-(``keep_programs``). ``enable_cache`` keeps all programs of the process, the user's own included. What JAX is configured
-to use comes first: its folder then holds the kernels, too, and nothing of its configuration is changed.
+(``keep_programs``). ``enable_cache`` keeps all programs of the process, the user's own included. A cache folder in
+JAX's configuration takes precedence: it then holds the kernels, too. Only ``enable_cache`` changes that configuration.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ VARIABLE = "CRAZYSIM_CACHE"
 MAX_CACHE_BYTES = 1_000_000_000
 """Size of all files, bytes, above which the oldest are removed when the cache is first used: about 5,000 programs."""
 SHARE_AFTER_TRIM = 0.8
-"""Share of the limit that is left by a removal, so that not every process has to remove files."""
+"""Fraction of the limit to which a removal reduces the size, so that not every process has to remove files."""
 MIN_FREE = 50_000_000
 """Free space below which a disk counts as full, bytes: the programs of some simulations."""
 PATTERNS = ("*-cache", "*-atime", "xla_gpu_per_fusion_autotune_cache_dir/*", "xla_gpu_kernel_cache_file",
@@ -157,8 +157,8 @@ def enable_cache(
 ) -> Path | None:
     """Keep all programs that this process compiles from now on, your own included, and return the folder.
 
-    What crazysim compiles itself is kept without it. What is in the folder is executed, so it is made for this user
-    alone. Where it holds more than ``MAX_CACHE_BYTES``, those not used for the longest time are removed.
+    Programs that crazysim compiles itself are kept without this call. The contents of the folder are executed, so only
+    this user may write to it. If it holds more than ``MAX_CACHE_BYTES``, the least recently used files are removed.
 
     Args:
         cache_path: Folder; None for the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
@@ -206,7 +206,7 @@ class keep_programs(contextlib.ContextDecorator):
         stack.append(context)
 
     def __exit__(self, *error: Any) -> None:
-        """Close it."""
+        """Close the cache, if this block opened it."""
         context = self._entered.stack.pop()
         if context is not None:
             context.__exit__(*error)
@@ -233,7 +233,7 @@ def enable_for_command() -> None:
 
 
 PATIENCE = 1.0
-"""Time after which work that is not over is announced, s."""
+"""Time after which unfinished work is announced, s."""
 
 _announced: set[str] = set()
 

@@ -37,12 +37,12 @@ def jit_unless_traced(*static: str) -> Callable[[F], F]:
 
 
 def fetch_rows(x: Any, rows: Any) -> NDArray:
-    """Return ``x[rows]`` on the host; rows of an array of the CPU are read there, without a compiled call."""
+    """Return ``x[rows]`` on the host; rows of a CPU array are read by NumPy, without a compiled call."""
     return np.asarray(x)[rows] if is_on_host(x) else np.asarray(x[rows])
 
 
 def is_on_host(x: Any) -> bool:
-    """Return whether NumPy reads an array without copying it from a device, or has it already."""
+    """Return whether an array is in the host's memory: a NumPy array, or a JAX array on the CPU."""
     if isinstance(x, jax.core.Tracer):
         return False
     return not isinstance(x, jax.Array) or all(device.platform == "cpu" for device in x.devices())

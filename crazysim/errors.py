@@ -8,9 +8,9 @@ import warnings
 import jax
 
 MAX_REPR_LENGTH = 60
-"""Most characters of a value in a message."""
+"""Largest number of characters of a value in a message."""
 SKIPPED_PACKAGES = ("crazysim", "jax", "contextlib", "functools", "importlib")
-"""Packages whose lines may stand between a warning and the line of the user's that caused it."""
+"""Packages that are skipped in the search for the user's line that caused a warning."""
 
 
 def short_repr(value: object) -> str:
@@ -27,7 +27,7 @@ def _kind(value: object) -> str:
 
 
 def warn(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the line of the user's that led here, the nearest one outside of ``SKIPPED_PACKAGES``."""
+    """Warn at the user's line that led here, the nearest one outside of ``SKIPPED_PACKAGES``."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in SKIPPED_PACKAGES:
         frame = frame.f_back
@@ -42,7 +42,7 @@ def not_installed(use: str, package: str, extra: str) -> str:
     Args:
         use: Subject and verb of the sentence, such as ``"films need"``.
         package: Name of the package.
-        extra: Extra of crazysim that brings it.
+        extra: Extra of crazysim that installs it.
     """
     return f"{use} {package}, which is not installed. Run pip install 'crazysim[{extra}]'."
 
@@ -87,7 +87,7 @@ class UnsupportedError(Exception):
     """
 
     def __init__(self, why: str, primitive: str = "", stage: str = ""):
-        """Say why.
+        """Keep the reason and its place.
 
         Args:
             why: The reason, as a sentence without a full stop.

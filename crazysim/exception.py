@@ -1,4 +1,4 @@
-"""Errors, where Crazyflow has them."""
+"""Errors, under Crazyflow's import path."""
 
 from crazysim.errors import ConfigError, RenderError, UnknownNameError
 from crazysim.errors import ConfigError as CrazyflowError

@@ -1,15 +1,14 @@
-"""All use of JAX beyond its documented, stable interface; a new release of JAX is met here first.
+"""All use of JAX beyond its documented, stable interface; new releases of JAX should require changes here only.
 
 Each name has a test in ``tests/test_jaxcompat.py``, which continuous integration runs on the oldest and the
-newest JAX that are supported. What each use would be replaced by, if a release took it away:
+newest JAX that are supported. How each use would be replaced if a release removed it:
 
 - **The constructor of Jaxpr** (``select_inputs``, ``constants_to_inputs``): the function is traced again by
   ``jax.make_jaxpr``. A fallback here.
 - **batched_device_put** (``put_host_array``): ``jax.device_put``, ten times slower for a command. A fallback here, also
   used where jaxlib lacks the function.
-- **Donation on the host**: JAX copies an array that is donated while NumPy has a view of it, on which steps without XLA
-  rely (``engine/host_call.py``). Without them the compiled step runs, and ``jit_donating`` donates nothing. A fallback
-  here.
+- **Donation on the host**: steps without XLA (``engine/host_call.py``) rely on JAX to copy an array that is donated
+  while NumPy has a view of it. Replaced by the compiled step, while ``jit_donating`` donates nothing. A fallback here.
 - **The custom call __gpu$xla.gpu.ptx**, by which XLA launches kernels on a GPU (``engine/backends/cuda.py``): a handler
   of XLA's foreign function interface that launches them (``engine/backends/ffi_handlers.py``). A fallback there.
 - **Primitives of our own** (``batched_primitive``, ``simple_primitive``, ``primitive_by_platform``):
@@ -202,10 +201,10 @@ def batched_primitive(
 
     Args:
         name: Its name.
-        results: From operands and parameters to the shapes and types of its results.
-        batched: From the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched dimensions and
-            parameters to results and their batched dimensions.
-        outside: Called where no ``vmap`` replaced it, to raise an error.
+        results: Function from operands and parameters to the shapes and types of the results.
+        batched: Function from the axis of ``vmap``, which has ``name`` and ``size``, the operands, their batched
+            dimensions and parameters to results and their batched dimensions.
+        outside: Function that raises an error; called if no ``vmap`` has replaced the primitive.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -222,7 +221,7 @@ def simple_primitive(name: str, fn: Callable[..., list[Any]], batched: Callable[
     Args:
         name: Its name.
         fn: The function, from operands to a list of results.
-        batched: From operands and their batched dimensions to results and their batched dimensions.
+        batched: Function from operands and their batched dimensions to results and their batched dimensions.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -242,19 +241,19 @@ def primitive_by_platform(
     transposed: Callable[..., Sequence[Any]] | None = None,
     batched: Callable[..., Sequence[Any]] | None = None,
 ) -> Primitive:
-    """Return a primitive that is lowered, only then, as the function of the platform that it is compiled for.
+    """Return a primitive that is replaced, only when it is lowered, by the function of the target platform.
 
-    Functions of it take operands, and parameters, which are hashable, as keywords.
+    All functions take operands as positional arguments, and parameters, which are hashable, as keywords.
 
     Args:
         name: Its name.
-        results: To the shapes and types of its results.
-        on: To a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all others.
-        derivative: The same, written so that JAX can differentiate it.
-        transposed: For a function that is linear in all operands but the first ``n_fixed``, a parameter: from these
-            operands and cotangents of all results to the cotangents of the others.
-        batched: Rule for ``vmap``: from the primitive, the size of the axis, the operands, whose batched axis is the
-            first, and whether each has one, to results that all have one.
+        results: Function that returns the shapes and types of the results.
+        on: Functions that return a list of results, by platform: ``"cpu"``, ``"cuda"``, ...; ``""`` for all others.
+        derivative: The same function, written so that JAX can differentiate it.
+        transposed: For a function that is linear in all operands but the first ``n_fixed``, which is a
+            parameter: function from these operands and the cotangents of all results to the cotangents of the others.
+        batched: Rule for ``vmap``: function from the primitive, the size of the axis, the operands, whose batched axis
+            comes first, and whether each is batched, to results that are all batched.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -301,7 +300,7 @@ def _batched_by(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: A
 
 
 def vmap_rule_of(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the rule for ``vmap`` of a primitive that takes what a function makes of its operands."""
+    """Return a rule for ``vmap`` that replaces a primitive by a function, mapped over the operands."""
 
     def rule(primitive: Primitive, n: int, args: Sequence[Any], batched: Sequence[bool], **params: Any) -> Any:
         del primitive, n
@@ -316,7 +315,7 @@ def _compiled_primitive(primitive: Primitive, **params: Any) -> Callable[..., An
 
 
 def constants_to_inputs(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """Return a jaxpr that takes what it closes over as its first inputs."""
+    """Return a jaxpr that takes its constants as its first inputs."""
     x = closed.jaxpr
     if FALLBACKS:
         n = len(closed.consts)
@@ -352,9 +351,9 @@ def expand_primitive(eqn: Any) -> Callable[..., list[Any]]:
 
 
 def put_host_array(x: np.ndarray, sharding: jax.sharding.Sharding) -> jax.Array:
-    """Return an array of the host on a device, committed to it: ``jax.device_put`` in a tenth of the time.
+    """Return a host array on a device, committed to it: ``jax.device_put`` in a tenth of the time.
 
-    It is the same memory where that is possible, so the argument must not be written into afterwards.
+    The result shares the argument's memory where possible, so the argument must not be written to afterwards.
 
     Args:
         x: The array, of a type that JAX has.
@@ -427,8 +426,8 @@ def cache_folder() -> str | None:
 def compilation_cache(folder: str) -> Iterator[None]:
     """Let JAX keep the programs that this thread compiles in a block; its configuration stays as it is.
 
-    JAX opens the cache once a process. So that a folder which is configured later is used, the last of the blocks that
-    overlap, including blocks of other threads, closes it. Without these names of JAX nothing is kept.
+    JAX opens the cache once per process. The last of overlapping blocks, including blocks of other threads, closes it,
+    so that a folder that is configured later is used. If JAX lacks the names used here, nothing is kept.
     """
     try:
         from jax._src import compilation_cache as cache

@@ -1,4 +1,4 @@
-"""The one base class of every record, and how a record declares the axes of its leaves."""
+"""The base class of records, and the declarations of the axes of their leaves."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def leaf(
             with any further axes. ``shared``: core. ``parameter``: shared, or one per drone (or member), by its number
             of dimensions. ``opaque``: undeclared; masked resets and sharding do not change it.
         core_ndim: Number of dimensions of the core shape; None for any.
-        core: The core shape, if it is fixed. It keeps one mass for each of three worlds from passing for one along
-            each of three axes.
-        sparse: True for a parameter whose zeros are terms that are absent, as an offset along one axis has. While it is
-            shared, a step is compiled without them, and again after one of them changes.
+        core: The core shape, if it is fixed. It prevents, for example, masses of three worlds from being taken
+            for masses along three axes.
+        sparse: True for a parameter whose zeros are absent terms, as in an offset along one axis. While it is
+            shared, a step is compiled without these terms, and again after one of them changes.
         scratch: True for an array that only carries numbers from one stage of a step to another: what a step writes
             there is not kept.
         default: Value of the field where none is given.
@@ -123,7 +123,7 @@ def _lazy_child(x: Any, read: Callable[[Any], Any]) -> Any:
         return lazy_record(x, read)
     if isinstance(x, dict):
         return {k: _lazy_child(v, read) for k, v in x.items()}
-    if x is None or isinstance(x, int):  # the most common cases; JAX takes some time to say so
+    if x is None or isinstance(x, int):  # a fast path for the most common cases
         return x if x is None else read(x)
     return jax.tree.map(read, x)
 
@@ -163,7 +163,7 @@ def n_batch_axes(scope: str) -> int:
 
 
 def n_world_axes(scope: str) -> int:
-    """Return the number of batch axes that functions of one world receive a leaf without."""
+    """Return the number of batch axes that are removed from a leaf for functions of one world."""
     return 1 if has_members(scope) else n_batch_axes(scope)
 
 
@@ -197,7 +197,7 @@ def replace_leaves(leaves: Sequence[T], indices: Sequence[int], values: Sequence
 
 
 def leaf_flags(tree: Any, flag: Literal["sparse", "scratch"]) -> Any:
-    """Return a tree of the same structure: whether each leaf is declared with a flag of ``leaf``."""
+    """Return a tree of the same structure, True for leaves that are declared with a flag of ``leaf``."""
     return _map_leaves(lambda _, metadata, *__: bool(metadata.get(flag)), tree, {}, "", None)
 
 

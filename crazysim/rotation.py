@@ -65,7 +65,7 @@ def matvec(matrix: Array, vector: Array, offset: Array | None = None) -> Array:
 
 @jax.custom_jvp
 def safe_sqrt(x: Array) -> Array:
-    """Return the square root of positive values and zero, with gradient zero, of all others; NaN passes. (...)"""
+    """Return the square root of positive values, and zero with gradient zero for others; NaN stays NaN. (...)"""
     return jnp.sqrt(jnp.maximum(x, 0.0))
 
 
@@ -90,9 +90,9 @@ def safe_normalize(x: Array, fallback: Array) -> Array:
 
 
 def safe_clip(x: Array, low: Array | float, high: Array | float) -> Array:
-    """Return ``x`` clipped to limits, with gradient one at a limit itself, that of the inner side. (...)
+    """Return ``x`` clipped to limits, with gradient one at the limits, as between them. (...)
 
-    ``jnp.clip`` has one half there, the slope of neither side.
+    The gradient of ``jnp.clip`` at a limit is one half, the slope of neither side.
     """
     raised = jnp.where(x < low, low, x)
     return jnp.where(raised > high, high, raised)
@@ -161,10 +161,10 @@ def z_axis(q: Array) -> Array:
 def turn(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
     """Return the attitude after a rotation with a constant angular velocity, for small angles. (..., 4)
 
-    The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, to rounding
-    up to half a revolution. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a physics step. A result that
-    is normalised needs their ratio only, which is that of imaginary and real part of the Pade approximation of
-    ``exp(2ih)``. Otherwise both are Taylor polynomials.
+    The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, up to
+    rounding, for rotations of at most half a revolution. ``jnp.sin`` and ``jnp.cos`` would cost more than the rest of a
+    physics step. A normalised result needs only their ratio, which is the ratio of imaginary to real part of the
+    numerator of the Pade approximation of ``exp(2ih)``. Otherwise both are Taylor polynomials.
 
     Args:
         q: Attitude, body to world, unit, xyzw. (..., 4)
@@ -214,9 +214,9 @@ def from_rpy(rpy: Array) -> Array:
 def to_rpy(q: Array) -> Array:
     """Return roll, pitch, yaw in rad, pitch in [-pi/2, pi/2]. (..., 4) -> (..., 3)
 
-    Roll and yaw come from half their sum and half their difference (Bernardes and Viollet 2022), one of which is
-    well-defined at any pitch, so that :func:`from_rpy` gives the same rotation back. At a pitch of 90 degrees roll and
-    yaw are not unique, and the other half counts as zero.
+    Roll and yaw come from half their sum and half their difference (Bernardes and Viollet 2022), at least one of
+    which is well-defined at any pitch, so that :func:`from_rpy` gives the same rotation back. At a pitch of 90
+    degrees roll and yaw are not unique, and the half that is not well-defined is set to zero.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     half_sum, half_difference = safe_arctan2(z + x, w - y), safe_arctan2(z - x, w + y)
@@ -240,7 +240,8 @@ def yaw(q: Array) -> Array:
 def heading(q: Array) -> tuple[Array, Array]:
     """Return the horizontal unit vectors along the yaw of a quaternion of any length, and to the left. (..., 3) each
 
-    They need no angle. Those of yaw zero are returned for a quaternion shorter than 1e-6.
+    They are computed without an angle. For a quaternion shorter than 1e-6, or exactly at a pitch of 90 degrees, they
+    are the vectors of yaw zero.
     """
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     along = jnp.stack([x * x + w * w - y * y - z * z, 2 * (x * y + w * z)], axis=-1)
@@ -259,7 +260,7 @@ def level_axes(yaw: Array) -> tuple[Array, Array]:
 
 
 def axes_along(z: Array, ahead: Array, left: Array) -> tuple[Array, Array, Array]:
-    """Return unit axes x, y, z of a frame whose z axis is along a vector and whose x axis is above a heading.
+    """Return unit axes x, y, z of a frame with z along a vector, and x in the plane of z and a heading. (..., 3) each
 
     Args:
         z: Vector of any length; zero counts as up. (..., 3)
@@ -288,7 +289,7 @@ def quat_from_axes(x: Array, y: Array, z: Array) -> Array:
     """Return the quaternion of the frame with these orthonormal axes in the world frame. (..., 3) -> (..., 4)
 
     The products ``4 q_i q`` are linear in the axes. One with ``q_i^2 >= 1 / 4`` is scaled to length one, so that
-    nothing small is divided by, and value and gradient are accurate at every attitude. The sign varies.
+    there is no division by small numbers, and value and gradient are accurate at every attitude. The sign varies.
     """
     xx, yy, zz = x[..., 0], y[..., 1], z[..., 2]
     xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]

@@ -1,15 +1,16 @@
 """The import of crazysim: variables of the environment, JAX and MuJoCo, and names that are imported at their first use.
 
-JAX and MuJoCo read variables of the environment when they are imported, so these are set before.
+JAX and MuJoCo read variables of the environment when they are imported, so these variables are set first.
 
-XLA logs an error of 3,000 characters for each CPU program that it loads from a persistent cache: the options
-``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are no features of any CPU. What
-really fails is raised as an exception.
+XLA logs an error of 3,000 characters for each CPU program that it loads from a persistent cache, because the options
+``prefer-no-gather`` and ``prefer-no-scatter``, with which it compiled the program, are not features of any CPU. Real
+failures are raised as exceptions.
 
 MuJoCo draws through GLFW, which needs a screen. Without a screen, and where EGL is installed, it draws through EGL. A
-``MUJOCO_GL`` that it refuses would end the import of crazysim, so MuJoCo is imported here, and then without drawing.
+``MUJOCO_GL`` that it refuses would make the import of crazysim fail, so MuJoCo is imported here, and without
+drawing if need be.
 
-Where JAX or MuJoCo is broken, the command ``crazysim``, whose ``info`` is for finding out just that, ends with a line.
+If JAX or MuJoCo is broken, the command ``crazysim``, including ``crazysim info``, ends with one line that says so.
 """
 
 import ctypes
@@ -40,7 +41,7 @@ def import_mujoco() -> None:
     """Import MuJoCo, and warn where ``MUJOCO_GL`` must be ``disable`` for that."""
     try:
         import mujoco
-    except Exception as error:  # of OpenGL's libraries, whose faults have many types
+    except Exception as error:  # OpenGL's libraries raise errors of many types
         backend = os.environ.get("MUJOCO_GL", "")
         os.environ["MUJOCO_GL"] = "disable"
         import mujoco  # noqa: F401
@@ -72,7 +73,7 @@ def import_required() -> None:
 
     Raises:
         ImportError: If one of them is broken or missing, with its name.
-        SystemExit: Instead, in the command ``crazysim``, after the same line.
+        SystemExit: Instead, in the command ``crazysim``, which prints the message.
     """
     for name, load in (("jax", lambda: importlib.import_module("jax")), ("mujoco", import_mujoco)):
         try:

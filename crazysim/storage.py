@@ -24,17 +24,17 @@ PICTURES = (".png", ".jpg", ".svg", ".pdf")
 MAX_TOML = 2**20
 """Largest TOML file, bytes; the built-in ones have up to 12,000."""
 MAX_ARRAYS = 10_000
-"""Most arrays of an ``.npz`` file."""
+"""Largest number of arrays in an ``.npz`` file."""
 MAX_UNPACKED, MAX_RATIO = 2**30, 100
-"""Most bytes that are unpacked from an ``.npz`` file: so many, or so many times its size if that is more."""
+"""Limit of bytes unpacked from an ``.npz`` file: the first number, or the second times its size if that is more."""
 FOLDER_REMEDY = "Remove it, since its files may not be yours, or use another."
 """End of the message for a folder that is refused."""
 SYSTEM_USERS = (0, 65534)
-"""Users that may own the folders above: root, and the user that containers show instead of an unmapped root."""
+"""Ids of users that may own parent folders: root, and the user that containers show instead of an unmapped root."""
 
 
 def is_file(path: str | Path) -> bool:
-    """Return True if a file of that path exists, and False for text that can be no path."""
+    """Return True if a file of that path exists, and False for text that cannot be a path."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -99,7 +99,7 @@ def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
 
 @contextmanager
 def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
-    """Raise the errors of a block that reads a file as errors of crazysim that name the file.
+    """Convert errors in a block that reads a file to errors of crazysim that name the file.
 
     Damaged files raise errors of almost any type in the libraries that read them. A ``ConfigError``, and the
     ``ImportError`` of a missing library, are passed on.
@@ -127,7 +127,7 @@ def reading(path: str | Path, content: str, remedy: str) -> Iterator[None]:
 
 
 def unfinished_path(path: Path) -> Path:
-    """Return the path of a file that takes the place of another one when it is whole."""
+    """Return the path of the temporary file that replaces ``path`` once it is complete."""
     return path.with_name(path.name + ".part")
 
 
@@ -188,14 +188,14 @@ class _NothingToWriteError(Exception):
 
 
 def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, before the work whose result it is for; it is not changed.
+    """Check that a file can be written, before the work that produces its contents; it is not changed.
 
     Args:
         path: The file.
-        suffixes: Accepted ends of its name; empty for any.
+        suffixes: Accepted endings of its name; empty for any.
 
     Raises:
-        ConfigError: If its name has another end, the folder does not exist, or it cannot be written.
+        ConfigError: If its name has another ending, the folder does not exist, or it cannot be written.
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
         raise ConfigError(
@@ -216,7 +216,7 @@ class ZipReader:
             place: Name of the archive, for messages.
             max_files: Largest number of files.
             max_file: Largest file that is unpacked, bytes.
-            max_total: Most bytes that are unpacked in all.
+            max_total: Largest number of bytes that are unpacked in all.
 
         Raises:
             ConfigError: If it has more files.
@@ -267,7 +267,7 @@ def read_arrays(file: BinaryIO, place: str) -> dict[str, NDArray]:
 
 
 def _array(content: bytes, place: str) -> NDArray:
-    """Return the array of a ``.npy`` file, whose header states no more bytes than follow it."""
+    """Return the array of a ``.npy`` file, after a check that its header states no more bytes than follow it."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -283,7 +283,7 @@ def _array(content: bytes, place: str) -> NDArray:
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder that only this user can enter, with the folders above it as usual; it may exist.
+    """Make a folder that only this user can enter, and its parents with default permissions; it may exist.
 
     Raises:
         OSError: If it cannot be made.

@@ -16,11 +16,11 @@ from crazysim.errors import ConfigError, UnknownNameError, short_repr
 from crazysim.storage import is_file, read_toml
 
 MAX_NUMBER = 1e30
-"""Largest size of a number, and inverse of the smallest positive one; float32 represents both, and their inverses."""
+"""Largest magnitude of a number, and inverse of the smallest positive one; float32 can represent both."""
 ENTRY = ("value", "unit", "source")
 """Keys of a number that is written with its unit and source."""
 MAX_BASES = 8
-"""Most tables that extend each other."""
+"""Largest number of tables in a chain of bases."""
 
 Shapes = tuple[tuple[int | str, ...], ...]
 """Allowed shapes; ``"n"`` is the number of rotors, ``"any"`` any length."""
@@ -78,7 +78,7 @@ def read_numbers(
     owner: str = "",
     remedy: str = "",
 ) -> NDArray:
-    """Return a number or an array of numbers, checked, read-only, in float64 or, whole ones, in int64.
+    """Return a number or an array of numbers, checked and read-only, as float64, or int64 for whole numbers.
 
     Args:
         name: Name for messages.
@@ -95,7 +95,7 @@ def read_numbers(
         raise ConfigError(f"{owner}expected {name} as a number or array, got an empty one{remedy}")
     if shapes is not None and not any(_fits(array.shape, shape) for shape in shapes):
         raise ConfigError(f"{owner}expected {name} of shape {' or '.join(map(str, shapes))}, got {array.shape}{remedy}")
-    # A float32 is compared with the bound in float32, which may be larger: pi / 2 is.
+    # Compare a float32 in float32: a bound such as pi / 2, rounded to float32, may exceed the bound itself.
     compared = np.asarray(value) if getattr(value, "dtype", None) == np.float32 else array
     if not np.all((compared >= allowed.low) & (compared <= allowed.high)):
         raise ConfigError(f"{owner}expected {name} to be {allowed.text}, got {short_repr(array.tolist())}{remedy}")
@@ -131,7 +131,7 @@ def as_numbers(owner: str, path: str, value: Any) -> NDArray[np.float64]:
     """Return a number or an array of numbers in float64, read-only.
 
     Args:
-        owner: Kind and name of what the number belongs to, for messages.
+        owner: Kind and name of the number's owner, for messages.
         path: Table and key.
         value: The number, plain or as ``{ value, unit, source }``.
     """
@@ -144,7 +144,7 @@ def check_numbers(owner: str, path: str, value: NDArray, key: Key, n: int = 0) -
     """Check the shape and the range of a number or array.
 
     Args:
-        owner: Kind and name of what the number belongs to, for messages.
+        owner: Kind and name of the number's owner, for messages.
         path: Table and key.
         value: The number or array.
         key: Its shapes and range.
@@ -206,7 +206,7 @@ class Layout:
                 raise ConfigError(f"{owner}: expected a key that exists, got {path!r}. {self.suggestion(path, paths)}")
 
     def suggestion(self, path: str, paths: Iterable[str]) -> str:
-        """Return the paths that are probably meant: first the same key in another table, then those spelt alike."""
+        """Return a hint at paths that are probably meant: first the same key in other tables, then similar ones."""
         paths = list(paths)
         table, _, key = path.rpartition(".")
         same_table = {p.rpartition(".")[2]: p for p in paths if p.rpartition(".")[0] == table}
@@ -262,7 +262,7 @@ def _built_in(path: Path, guide: str) -> Mapping[str, Any]:
 
 
 def extend_bases(bases: tuple[str, ...], source: Any) -> tuple[str, ...]:
-    """Return the sources that extend each other, with one more.
+    """Return a chain of sources, each the base of the previous one, extended by one.
 
     Args:
         bases: Names, paths or kinds of the sources so far, each with the next one as its base.

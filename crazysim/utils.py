@@ -1,4 +1,4 @@
-"""Helpers, where Crazyflow has them."""
+"""Helpers, under Crazyflow's import path."""
 
 from crazysim.cache import enable_cache
 from crazysim.core.data import grid_2d

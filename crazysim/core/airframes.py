@@ -19,11 +19,11 @@ from crazysim.pytree import PyTree
 T = TypeVar("T")
 
 NAME_PREFIXES = {"Crazyflie": ("cf", "crazyflie"), "Bumblebee": ("bumblebee",)}
-"""Names of drones of some airframes, by the beginnings of the names of these, as AIMotionLab-Virtual has them."""
+"""Prefixes of drones' names, as in AIMotionLab-Virtual, to the lower-case beginnings of names of their airframes."""
 ROTOR_MASK = "rotors"
 """Name of fields that are True for the rotors that a drone has; None where all drones have equally many."""
 PER_ROTOR_FIELDS = ("L", "prop_inertia", "rpm2thrust", "rpm2torque", "rotor_dyn_coef")
-"""Fields that missing rotors have like the last one; all others are zero for missing rotors."""
+"""Fields in which missing rotors repeat the value of the last rotor; all other fields are zero for missing rotors."""
 
 
 Airframes = Airframe | Sequence[Airframe]
@@ -31,7 +31,7 @@ Airframes = Airframe | Sequence[Airframe]
 
 
 def load_airframes(drone: AirframeSource | Sequence[AirframeSource], n_drones: int) -> tuple[Airframe, ...]:
-    """Return the airframe of each drone; drones of the same source have the same one. (n_drones,)"""
+    """Return the airframe of each drone; drones with the same source share one object. (n_drones,)"""
     if not is_list(drone):
         return (load_airframe(drone),) * n_drones  # type: ignore[arg-type]
     if not drone:
@@ -57,7 +57,7 @@ def as_airframes(airframes: Airframes, n_drones: int = 1) -> tuple[Airframe, ...
 
 
 def airframe_of(airframes: Airframes) -> Airframe:
-    """Return the airframe of all drones."""
+    """Return the airframe that all drones share."""
     first, *others = as_airframes(airframes)
     if any(other is not first for other in others):
         names = ", ".join(dict.fromkeys(repr(airframe.name) for airframe in (first, *others)))
@@ -66,7 +66,7 @@ def airframe_of(airframes: Airframes) -> Airframe:
 
 
 def n_rotors_of(airframes: Airframes) -> int:
-    """Return the largest number of rotors."""
+    """Return the largest number of rotors of any of the airframes."""
     kinds = {id(airframe): airframe for airframe in as_airframes(airframes)}  # thousands of drones have a few kinds
     return max(airframe.n_rotors for airframe in kinds.values())
 
@@ -92,14 +92,14 @@ def drone_names(airframes: Sequence[Airframe]) -> tuple[str, ...]:
 
 
 def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_worlds: int) -> T:
-    """Return the record of parameters of all drones: shared where their airframes are alike, one per drone elsewhere.
+    """Return the record of parameters of all drones: leaves with equal values are shared, others are per drone.
 
-    Axes over rotors are as long as the largest number of rotors. The others do not exist: their thrust, their part in
-    the mixing matrix and their largest speed are zero.
+    Axes over rotors are as long as the largest number of rotors. For the rotors that a drone lacks, thrust, entries of
+    the mixing matrix and largest speed are zero.
 
     Args:
         airframes: Airframe of each drone.
-        create: From an airframe to its record, shared by all drones of it.
+        create: Function from an airframe to its record, which all drones of the airframe share.
         n_worlds: Number of worlds.
     """
     airframes = as_airframes(airframes)
@@ -131,7 +131,7 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
 
 
 def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
-    """Return arrays with their axes over rotors, along which their lengths differ, as long as the longest."""
+    """Return arrays padded to equal lengths along the axes over rotors, along which their lengths differ."""
     shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
     out = []
     for x in arrays:

@@ -27,7 +27,7 @@ def any_lane(condition: Array) -> Array:
 
 
 def _batched(args: Sequence[Array], dims: Sequence[int]) -> tuple[list[Array], list[None]]:
-    """Return the condition of any element of a batch, which all of them share."""
+    """Return whether the condition holds for any element of a batch, as a result that all of them share."""
     return any_lane_p.bind(jnp.any(args[0], axis=dims[0])), [None]
 
 
@@ -38,7 +38,8 @@ any_lane_p = simple_primitive("any_lane", lambda condition: [condition], _batche
 def compute_where(condition: Array, fn: Callable[[Carry], Carry], value: Carry) -> Carry:
     """Return ``fn(value)`` where a condition holds and the value elsewhere; ``fn`` is skipped if it holds nowhere.
 
-    Kernels branch. ``lax.cond`` computes both cases in functions of one element. There is no reverse mode.
+    Kernels compile it to a branch; ``lax.cond`` in a function of one element would compute both cases. It has no
+    reverse-mode derivative.
 
     Args:
         condition: The condition. ()
@@ -60,6 +61,6 @@ def table_row(table: Array, index: Array) -> Array:
 
 
 def table_rows(table: Array, index: Array) -> list[Any]:
-    """Return the numbers of a row of a table, each for itself. k of ()"""
+    """Return the elements of a row of a table as a list of k scalars. () each"""
     row = table_row(table, index)
     return [row[k] for k in range(table.shape[1])]

@@ -1,4 +1,4 @@
-"""Stages of controllers: staged commands take effect, and the controller's command is staged for what follows."""
+"""Stages of controllers: staged commands take effect, and the controller's command is staged for the level below."""
 
 from __future__ import annotations
 

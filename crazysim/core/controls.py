@@ -21,9 +21,9 @@ class ControllerData(PyTree):
     """Memory and parameters of a controller, in the record of the command level that it follows."""
 
     memory: Any
-    """Memory of the drones, a record of the controller's own, or None."""
+    """Memory for every drone, in a record that the controller defines, or None."""
     params: Any
-    """Gains and constants, a record of the controller's own, or None."""
+    """Gains and constants, in a record that the controller defines, or None."""
     freq: int = static()
     """Rate of the controller, Hz; an outer loop runs at the rate of the command."""
 
@@ -112,10 +112,10 @@ class StateControlData(_LevelData):
     freq: int = static()
     """Rate at which setpoints take effect, Hz."""
     feedforward: Array | None = leaf("drone", 1)
-    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, and yaw acceleration, rad/s^2, of the setpoint in force; None with a
-    controller that follows none, as Crazyflow's. (n_worlds, n_drones, 8)"""
+    """Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, and yaw acceleration, rad/s^2, of the setpoint in force; None if
+    the controller accepts none, such as Crazyflow's. (n_worlds, n_drones, 8)"""
     staged_feedforward: Array | None = leaf("drone", 1)
-    """The same of the staged setpoint; None likewise. (n_worlds, n_drones, 8)"""
+    """Feedforward of the staged setpoint; see ``feedforward``. (n_worlds, n_drones, 8)"""
 
 
 class AttitudeControlData(_LevelData):
@@ -297,7 +297,7 @@ def require_pair(dynamics: Dynamics, control: Control) -> None:
 
 
 def require_controller(dynamics: Dynamics, control: Control, controller: Controller | None) -> None:
-    """Check that controllers follow their levels, and that the dynamics follow the last command."""
+    """Check that controllers accept their command levels, and the dynamics the output of the last controller."""
     followers, last = controller_chain(controller, control)
     for level, follower in followers:
         for member in follower.members:

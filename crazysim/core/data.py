@@ -231,7 +231,7 @@ def create_params(dynamics: Dynamics, airframe: Airframes, n_worlds: int = 1) ->
 
 
 def n_rotor_states(dynamics: Dynamics, airframes: Airframes) -> int:
-    """Return the length of ``states.rotor_vel``: the most rotors, or four for a fitted model, as in Crazyflow."""
+    """Return the length of ``states.rotor_vel``: the largest number of rotors, or 4 in fitted models."""
     return n_rotors_of(airframes) if dynamics == Dynamics.first_principles else 4
 
 

@@ -34,7 +34,7 @@ def state_control(
     yaw: ArrayLike | None = None,
     feedforward: ArrayLike | None = None,
 ) -> SimData:
-    """Stage a full-state setpoint for every drone: a vector for each, or ``pos`` and what else is not zero.
+    """Stage a full-state setpoint for every drone: a vector, or ``pos`` and the other parts that are not zero.
 
     ``pos``, ``vel`` and ``acc`` broadcast to (n_worlds, n_drones, 3) by NumPy's rules, ``yaw`` to (n_worlds, n_drones):
     (3,) is one position for all, (n_drones, 3) one for each drone, (n_worlds, 1, 3) one for each world.
@@ -49,7 +49,7 @@ def state_control(
         acc: Acceleration, world frame, m/s^2, with ``pos``. (..., 3)
         yaw: Yaw, rad, with ``pos``. (...)
         feedforward: Jerk, m/s^3, snap, m/s^4, yaw rate, rad/s, yaw acceleration, rad/s^2; None for the yaw rate of the
-            setpoint and zeros. Crazyflow's controller follows none. (n_worlds, n_drones, 8)
+            setpoint and zeros. Crazyflow's controller accepts none. (n_worlds, n_drones, 8)
     """
     command, feedforward = check_setpoint(
         data, controls, check_finite, pos=pos, vel=vel, acc=acc, yaw=yaw, feedforward=feedforward
@@ -68,7 +68,7 @@ def check_setpoint(
 ) -> tuple[Array | NDArray, Array | NDArray | None]:
     """Return a full-state setpoint and its feedforward as arrays of the state's dtype, for ``stage_command``.
 
-    Arguments and errors as in ``state_control``; of the data, shapes and types are enough.
+    Arguments and errors as in ``state_control``; ``data`` may hold shapes and types instead of arrays.
     """
     present = {name: x for name, x in parts.items() if x is not None}
     if controls is None:
@@ -91,7 +91,7 @@ def check_setpoint(
 
 
 def _join_setpoint(data: SimData, parts: dict[str, ArrayLike]) -> Array | np.ndarray:
-    """Return the setpoint of some parts, on the host if all of them are. (n_worlds, n_drones, 16)"""
+    """Return the setpoint with the given parts, a NumPy array if no part is a JAX array. (n_worlds, n_drones, 16)"""
     if "pos" not in parts:
         raise ConfigError("expected a state command, got no position. Use pos=(0, 0, 1), or 16 numbers per drone.")
     counts = data.states.pos.shape[:2]
@@ -117,7 +117,7 @@ def _check_part(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array | 
 
 
 def _setpoint(xp: Any, counts: tuple[int, ...], dtype: DTypeLike, parts: Mapping[str, ArrayLike]) -> Any:
-    """Return the setpoint of some parts, with zeros for the others and for the body rates. (n_worlds, n_drones, 16)"""
+    """Return the setpoint with the given parts, and zeros for other parts and body rates. (n_worlds, n_drones, 16)"""
     zeros = xp.zeros((*counts, 3), dtype)
     vectors = [xp.asarray(parts.get(name, zeros), dtype) for name in ("pos", "vel", "acc")]
     half = xp.asarray(parts.get("yaw", 0.0), dtype)[..., None] / 2 + zeros[..., :1]
@@ -153,7 +153,7 @@ def force_torque_control(data: SimData, controls: ArrayLike, check_finite: bool 
 
 
 def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = False) -> SimData:
-    """Command rotor speeds, rpm, for every drone; they hold from the next step on. (n_worlds, n_drones, n_rotors)
+    """Command rotor speeds, rpm, for every drone; they take effect at the next step. (n_worlds, n_drones, n_rotors)
 
     Arguments and errors as in ``state_control``.
     """
@@ -161,7 +161,7 @@ def rotor_vel_control(data: SimData, controls: ArrayLike, check_finite: bool = F
 
 
 def stage_command(data: SimData, command: Array, feedforward: Array | None = None) -> SimData:
-    """Return the data with a command at its command level, which is not checked.
+    """Return the data with a command staged at its command level; the command is not checked.
 
     For data of one drone, one world or all worlds alike. Rotor speeds take effect at the next step, other commands at
     the next tick of their controller.
@@ -226,9 +226,9 @@ def controllable(data: SimData) -> Array:
 
 
 def check_command(data: SimData, control: Control, command: ArrayLike, check_finite: bool = False) -> Array | NDArray:
-    """Return a command as an array of the state's dtype; of the data, shapes and types are enough.
+    """Return a command as an array of the state's dtype; ``data`` may hold shapes and types instead of arrays.
 
-    One of the host is a copy of its caller's; it is still on the host, and ``put_command`` moves it.
+    A command on the host is copied and stays on the host; ``put_command`` moves it to the device.
     """
     if data.controls.mode != control:
         raise ConfigError(
@@ -243,7 +243,7 @@ def check_command(data: SimData, control: Control, command: ArrayLike, check_fin
 def _as_command(
     data: SimData, name: str, shape: tuple[int, ...], fields: str, command: ArrayLike, check_finite: bool
 ) -> Array | NDArray:
-    """Return a command of some shape as an array of the state's dtype, as ``check_command``."""
+    """Return a command of the given shape as an array of the state's dtype; see ``check_command``."""
     on_host = not isinstance(command, jax.Array)
     try:
         array = np.asarray(command) if on_host else command
@@ -276,7 +276,7 @@ def _as_command(
 
 
 def put_command(data: SimData, command: Array | NDArray) -> Array:
-    """Return a checked command as an array on the device of the data, which may be shapes with shardings."""
+    """Return a checked command as an array on the device of the data, whose leaves may be shapes with shardings."""
     if isinstance(command, jax.core.Tracer) or isinstance(data.states.pos, jax.core.Tracer):
         return jnp.asarray(command)
     sharding = data.states.pos.sharding

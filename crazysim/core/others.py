@@ -1,7 +1,7 @@
 """Reductions over the drones of a world, for functions that are written for one drone.
 
-A drone publishes some of its values, and a function of one pair says what the values of another drone mean for it. No
-array has an axis of pairs there: ``plain`` forms one, kernels loop over the drones of a world.
+Each drone publishes some of its values, and a function of one pair computes the effect of another drone's values on it.
+The function has no axis over pairs: the ``plain`` engine adds one, kernels loop over the drones of a world.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Reduction = Literal["sum", "min", "max"]
 def safe_min(x: Array, axis: int) -> Array:
     """Return the smallest number along an axis, or NaN if there is one; ``jnp.min`` with a safe derivative.
 
-    The derivative of ``jnp.min`` goes to the numbers that equal the result. Where XLA computes them once more, with
-    another rounding, none does, and the derivative is lost.
+    ``jnp.min`` passes the derivative to the elements that equal the result. If XLA recomputes the elements with other
+    rounding, no element equals the result, and the derivative is lost.
     """
     return jnp.squeeze(jnp.take_along_axis(x, jnp.argmin(x, axis=axis, keepdims=True), axis), axis)
 
@@ -39,15 +39,15 @@ def safe_max(x: Array, axis: int) -> Array:
 REDUCTIONS: dict[str, Callable[..., Array]] = {"sum": jnp.sum, "min": safe_min, "max": safe_max}
 
 MAX_PAIRS = 2**20
-"""Pairs of a world that are computed at once. A larger swarm is computed in several turns, which bounds the memory."""
+"""Largest number of pairs of a world computed at once. Larger swarms are computed in batches, to bound memory."""
 
 
 def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Reduction = "sum") -> Any:
     """Return the reduction of a function of pairs over all drones of the world, for use in functions of one drone.
 
     ``fn`` also runs for the pair of the drone with itself, where ``is_self`` is true. Values of the drone itself are
-    captured by ``fn``. What depends on the other drone alone belongs into ``values``: it is computed once for each
-    drone, and ``fn`` once for each pair.
+    captured by ``fn``. Compute anything that depends on the other drone alone in ``values``: it is computed once
+    for each drone, and ``fn`` once for each pair.
 
         gap = reduce_over_others(
             lambda other, is_self: jnp.where(is_self, jnp.inf, rotation.norm(pos - other)), pos, "min"
@@ -57,7 +57,7 @@ def reduce_over_others(fn: Callable[[Any, Array], Any], values: Any, reduce: Red
         fn: ``fn(other, is_self)`` returns any tree of arrays for one pair: ``other`` are the ``values`` of the other
             drone, ``is_self`` is true where it is the drone itself, ().
         values: Values of this drone that are passed to all drones of its world, any tree of small arrays.
-        reduce: ``"sum"``, ``"min"`` or ``"max"`` over the other drones; of bools ``"max"`` is true where any is true.
+        reduce: ``"sum"``, ``"min"`` or ``"max"`` over all drones; for bools ``"max"`` is true where any is true.
 
     Returns:
         The tree of ``fn``, reduced.
@@ -95,7 +95,7 @@ def _results(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list
 
 
 def _batched(axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> Any:
-    """Return the reduction under ``vmap``: over drones it is computed, over any other axis it stays one."""
+    """Batch the reduction: compute it over the axis of drones, and bind a batched reduction over any other axis."""
     in_axes = [None if d is None else 0 for d in dims]
     rows = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     if axis.name == MEMBER_AXIS:

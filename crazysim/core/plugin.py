@@ -99,11 +99,11 @@ def parameter(
 
 
 def airframe_numbers(sim: Simulation, number: Callable[[Airframe], ArrayLike]) -> np.ndarray:
-    """Return a number of the airframe, as ``check_parameter`` takes it: one for all drones, or one for each.
+    """Return a number of the airframes for ``check_parameter``: one for all drones, or one for each.
 
     Args:
         sim: The simulation.
-        number: From an airframe to a number or array. (*core)
+        number: Function from an airframe to a number or array. (*core)
 
     Returns:
         (*core), or (n_worlds, n_drones, *core) where the drones have several airframes
@@ -136,11 +136,11 @@ def check_parameter(
         value: One number for every entry (not for vectors), ``core``, or (n_worlds, n_drones, *core); the last axis
             may be omitted where it has length one.
         core: Shape of the value of one drone.
-        low: Least value allowed.
+        low: Smallest value allowed.
         high: Largest value allowed.
         dtype: Type; None for the type of the states.
         positive: Refuse zero and negative values.
-        per_axis: Accept one number for a vector, for each axis.
+        per_axis: Accept one number for all axes of a vector.
 
     Returns:
         (*core) or (n_worlds, n_drones, *core)
@@ -237,7 +237,7 @@ class Plugin:
         return self.record(sim)
 
     def filled(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        """Return a record for all worlds, whose other fields follow from their declarations.
+        """Return a record for all worlds; fields that are not passed follow from their declarations.
 
         A parameter has the value of the plugin's setting of that name, checked; without a fixed core shape it has one
         number for each rotor. A state of drones with a fixed core shape is zero. A setting of None is None.
@@ -245,7 +245,7 @@ class Plugin:
         Args:
             sim: The simulation.
             kind: Class of the record.
-            fields: Values of fields. If one is None, the setting of its name is checked nevertheless.
+            fields: Values of fields. Where one is None, the setting of its name is still checked.
         """
         settings = {name: declared for name, declared in settings_of(type(self)).items() if declared.is_parameter}
         values = dict(fields)
@@ -302,7 +302,7 @@ class Plugin:
         return {}
 
     def constrain(self, data: SimData, deriv: SimStateDeriv, dt: float | None) -> SimStateDeriv:
-        """Return the derivative with the reaction of bodies that are joined to the drone, and the rates of these.
+        """Return the derivative with the reaction of bodies that are joined to the drone, and the bodies' own rates.
 
         A joint is a constraint: the accelerations of drone and joined body follow from one system of equations. Here
         ``deriv`` is the derivative of the drone as if it were free, evaluated once. The reaction is added to ``acc``
@@ -348,7 +348,7 @@ class Plugin:
         """Draw overlays into the next image of a world, on ``sim.scene``."""
 
     def read(self, data: SimData) -> Any:
-        """Return the plugin's record in some data.
+        """Return the plugin's record in the given data.
 
         Raises:
             UnknownNameError: If the data has none: the plugin was not added, or was removed.
@@ -385,7 +385,7 @@ def with_measured_states(plugins: Sequence[Plugin], data: SimData) -> SimData:
     """Return the data of one drone with the states that plugins measure instead of the true ones.
 
     Args:
-        plugins: The plugins; of several that measure one state, the last one counts.
+        plugins: The plugins; if several measure the same state, the last one is used.
         data: The data of one drone.
     """
     measured = {}

@@ -27,7 +27,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, float_dtype
 
 MAX_MEMBERS = 100_000
-"""Most members of a population in a world."""
+"""Largest number of members of a population in a world."""
 
 R = TypeVar("R", bound=Members)
 
@@ -35,12 +35,12 @@ R = TypeVar("R", bound=Members)
 class Population(Plugin):
     """Base class of populations, which ``sim.add`` adds.
 
-    A subclass overrides ``record``, ``derivative`` and what else it needs. The methods that take ``data`` are written
-    for one member: leaves of the population and of worlds come without batch axes, leaves of other populations, drones
-    included, as (n_members, ...), to be read only. ``self.read(data)`` is the record of the member.
+    A subclass overrides ``record``, ``derivative`` and any other method it needs. The methods that take ``data`` are
+    written for one member: leaves of the population and of worlds come without batch axes, leaves of other populations,
+    drones included, as (n_members, ...), which they may only read. ``self.read(data)`` is the record of the member.
 
-    A population has two stages, whose scope is its name: its controller runs before the integration of the drones, its
-    own integration after it.
+    A population has up to two stages, whose scope is its name: its controller runs before the integration of the
+    drones, its own integration after it.
     """
 
     members: int | Sequence[str] = 1
@@ -95,7 +95,7 @@ class Population(Plugin):
         return type(self).influence is not Plugin.influence or self.constrains
 
     def create(self, sim: Simulation, kind: type[R], **fields: Any) -> R:
-        """Return a record for all worlds, each number repeated for every member that it is not given for.
+        """Return a record for all worlds, with values repeated along axes of worlds and members that they lack.
 
         Args:
             sim: The simulation.
@@ -121,7 +121,7 @@ class Population(Plugin):
             dividing_rate(f"control_freq of {self.name!r}", self.control_freq, sim.data.core.freq)
 
     def control(self, data: SimData) -> Members:
-        """Return the record of one member with what its controller computes, at ``control_freq``."""
+        """Return the record of one member with the outputs of its controller; called at ``control_freq``."""
         return self.read(data)
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:
@@ -144,7 +144,7 @@ class Population(Plugin):
         return record
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stages of controller and integration, each if the class overrides its method."""
+        """Return the stages of ``control`` and ``derivative``, for each that the class overrides."""
         cls, placements = type(self), []
         if cls.control is not Population.control:
             rate = self.control_freq
@@ -233,7 +233,7 @@ def _fields(record: Members) -> set[str]:
 
 
 def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: Any) -> Array | np.ndarray:
-    """Return a command of some shape as an array of a type."""
+    """Return a command as an array of the given shape and dtype."""
     on_host = not isinstance(command, jax.Array)
     array = np.asarray(command, dtype) if on_host else command
     if array.shape != shape:
@@ -249,9 +249,7 @@ def check_command(name: str, shape: tuple[int, ...], command: ArrayLike, dtype: 
 def _repeat_for_members(name: str, value: Any, metadata: Mapping[str, Any], counts: tuple[int, int]) -> np.ndarray:
     """Return a value repeated for every member of every world."""
     array = np.asarray(value)
-    is_integer = array.dtype.kind in "iu" and hasattr(
-        value, "dtype"
-    )  # numbers of Python may be written without a point
+    is_integer = array.dtype.kind in "iu" and hasattr(value, "dtype")  # a Python int such as 1 stands for the float 1.0
     dtype = np.int32 if is_integer else float_dtype() if array.dtype.kind in "iuf" else array.dtype
     n_core = metadata["core_ndim"]
     core = array.shape[max(array.ndim - n_core, 0) :] if array.ndim >= n_core else None

@@ -106,8 +106,8 @@ def uniform(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array
 def _fractions(key: Array, shape: Sequence[int], dtype: Any) -> Array | None:
     """Return random multiples of 2^-23, in float64 of 2^-52, from zero to below one, (*shape).
 
-    None for keys and types for which JAX's own functions are used. In float64 these functions need 64-bit integers,
-    which kernels do not have.
+    None for keys and types for which JAX's own functions are used. In float64, JAX's functions need 64-bit
+    integers, which kernels do not have.
     """
     if dtype not in (jnp.float32, jnp.float64) or bits_generator(key.dtype) != threefry_prng_impl.name:
         return None
@@ -131,7 +131,7 @@ def _words(key: Array, shape: Sequence[int]) -> Array:
 def _key(data: SimData, name: str, *members: Array) -> Array:
     """Return the random key of a world, or of one of its members, at a step.
 
-    What changes from step to step comes late, and the name last: all names share the hashes before.
+    The step is hashed late, and the name last, so that all names share the hashes before.
     """
     core, key = data.core, data.core.rng_key
     for number in (core.world_id, core.episode, *members, core.steps, zlib.crc32(name.encode())):

@@ -28,7 +28,7 @@ from crazysim.tables import ANY_NUMBER, Range, Shapes, range_between, read_numbe
 E = TypeVar("E", bound=Enum)
 
 MAX_ITERATIONS = 1000
-"""Most iterations of a solver of contacts; the defaults are 8 to 20."""
+"""Largest number of iterations of a contact solver; the defaults are 8 to 20."""
 MAX_FRICTION = 1000.0
 """Largest coefficient of friction; rubber has about 1."""
 MAX_SOFTNESS = 10.0
@@ -37,8 +37,9 @@ MAX_SOFTNESS = 10.0
 NUMERIC_TYPES = frozenset((int, float, np.ndarray))
 """Types of fields with numbers; an array stands for ``ArrayLike``."""
 SLOW_FREQ = 200
-"""Rate of physics steps, Hz, below which half of it is too slow for a controller: the cascades of small drones are
-stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``, euler)."""
+"""Rate of physics steps, Hz; with fewer steps, the default rate of a controller still must not fall below half of this
+rate. The cascades of small drones are stable from 100 Hz on, and none of them at 50 Hz (hover of ``cf21B_500``,
+euler)."""
 
 
 def positive_integer(name: str, value: object, at_most: int | None = None) -> int:
@@ -69,11 +70,11 @@ def check_flag(name: str, value: object) -> bool:
 
 
 class Numbers:
-    """Stands for ``ArrayLike`` in annotations, which is a union of many types."""
+    """Stand-in for ``ArrayLike`` in annotations, which is a union of many types."""
 
 
 class NumbersByName:
-    """Stands for ``Mapping[str, float]`` among the types of a field."""
+    """Stand-in for ``Mapping[str, float]`` among the types of a field."""
 
 
 TYPE_DESCRIPTIONS = {Callable: "a function", Mapping: "a dict"}
@@ -88,7 +89,7 @@ class Setting(NamedTuple):
     is_parameter: bool = False
     """True for a field of a plugin that only fills numbers of its record."""
     per_axis: bool = False
-    """True to accept one number for a vector, for each axis."""
+    """True to accept one number for all axes of a vector."""
     dtype: DTypeLike | None = None
     """Type of the numbers; None for real ones."""
     shapes: Shapes | None = None
@@ -104,17 +105,17 @@ def setting(
     positive: bool = False,
     shapes: Shapes | None = None,
 ) -> Any:
-    """Declare a field with numbers of a record of settings, such as a task, and the values that it may have.
+    """Declare a numeric field of a record of settings, such as a task, with the values that it may have.
 
-    ``check_settings`` checks it. Numbers of fields that are not declared so must be finite.
+    ``check_settings`` checks it. Numbers of other fields must be finite.
 
     Args:
-        default: Value where none is given.
-        default_factory: Function that returns it.
-        low: Least value allowed.
+        default: Default value.
+        default_factory: Function that returns the default value.
+        low: Smallest value allowed.
         high: Largest value allowed.
         positive: Refuse zero and negative values.
-        shapes: Shapes of an array, ``"any"`` for any length; None for all.
+        shapes: Shapes of an array, ``"any"`` for an axis of any length; None for any shape.
     """
     default = {"default": default} if default_factory is dataclasses.MISSING else {"default_factory": default_factory}
     return dataclasses.field(
@@ -133,9 +134,9 @@ def color(n: bool = False) -> Any:
 
 @functools.cache
 def settings_of(kind: type) -> dict[str, Setting]:
-    """Return what the fields of a class declare by ``setting`` or ``parameter``.
+    """Return the declarations of a class's fields by ``setting`` or ``parameter``.
 
-    A field that overrides one of a base class keeps the declaration of that one, unless it has its own.
+    A field that overrides a field of a base class inherits its declaration, unless it has one of its own.
     """
     declared = {}
     for base in reversed(kind.__mro__):
@@ -147,10 +148,11 @@ def settings_of(kind: type) -> dict[str, Setting]:
 def check_settings(settings: Any) -> None:
     """Check every field of a record of settings, such as a plugin or a task, by its annotation and declaration.
 
-    Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` have values of that kind, with
-    finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and fields
-    of ``Callable`` and ``Mapping`` have functions and mappings of any kind. None is accepted where the annotation or
-    the default allows it. Shapes that depend on the simulation, such as shapes of parameters, are checked with it.
+    Fields of ``bool``, ``int``, ``float``, ``ArrayLike`` and ``Mapping[str, float]`` must have values of that kind,
+    with finite numbers in the range of ``setting`` or ``parameter``; fields of classes have instances of them, and
+    fields of ``Callable`` and ``Mapping`` have functions and mappings of any kind. None is accepted where the
+    annotation or the default allows it. Shapes that depend on the simulation, such as shapes of
+    parameters, are checked with it.
     """
     kind = type(settings)
     for field in dataclasses.fields(settings):
@@ -193,7 +195,7 @@ def alternatives(kind: type) -> dict[str, tuple[type, ...]]:
 
 
 def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
-    """Return the types of an annotation; an empty tuple if it has others than classes, functions and numbers."""
+    """Return the types of an annotation; an empty tuple if it contains anything but classes, functions and numbers."""
     if isinstance(hint, str):
         try:
             hint = eval(hint, dict(names))
@@ -212,7 +214,7 @@ def _types(hint: Any, names: Mapping[str, Any]) -> tuple[type, ...]:
         return (np.ndarray,) if NUMERIC_TYPES.issuperset(inner) else ()
     if hint is None:
         return (type(None),)
-    # Arrays may be of any type, such as bool, and a JAX array one of NumPy; ``ArrayLike`` is for numbers.
+    # Fields of arrays are not checked: they may have any dtype, and NumPy arrays for JAX arrays.
     is_class = inspect.isclass(hint) and hint not in (Any, object, Array, np.ndarray) and not typing.get_args(hint)
     return (hint,) if is_class and not getattr(hint, "_is_protocol", False) else ()
 
@@ -283,7 +285,7 @@ def as_rgba(rgba: object, n: int | None = None) -> NDArray[np.float64]:
 def as_mask(mask: object, *shapes: tuple[int, ...], each: str = "world") -> Array | None:
     """Return a mask as an array; None, for all, stays None.
 
-    Of a traced mask shape and type are checked, which are known while it is traced.
+    Shape and type are checked, also of a traced mask.
 
     Args:
         mask: One bool for each world, or for each of something else.
@@ -349,7 +351,7 @@ def default_rates(freq: int, defaults: Mapping[str, int], of: str = "") -> dict[
     Args:
         freq: Rate of physics steps, Hz.
         defaults: Default rates by the names of their settings, Hz.
-        of: End of the names in the message.
+        of: Suffix of the names in messages.
     """
 
     def low(freq: int) -> list[str]:
@@ -384,7 +386,8 @@ def controller_at_rates(
     """Return a controller with the rates that it has in a simulation, each a divisor of ``freq``.
 
     The requested rate of the command level is the rate of the outer loop if there is one; then the requested rate of
-    attitude is the rate of ``update``. A rate that is the default of its class becomes one of ``default_rates``.
+    attitude is the rate of ``update``. A rate equal to the default of its class is replaced by
+    a rate from ``default_rates``.
 
     Args:
         controller: The controller.

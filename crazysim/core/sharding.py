@@ -49,11 +49,11 @@ def location_of(x: jax.Array) -> Location:
 
 
 def put_on_device(tree: T, device: jax.Device) -> T:
-    """Return the tree committed to a device. A tree that is already, and leaves that are, stay the same objects.
+    """Return the tree committed to a device. Trees and leaves that are already committed to it stay the same objects.
 
-    JAX compiles a function of uncommitted arrays for its default device. A traced leaf of another device gets a
-    constraint, so that the compiled function runs on this one. Under a mesh, which has its own devices, it stays as it
-    is.
+    JAX compiles a function of uncommitted arrays for its default device. If that is another device, traced leaves get a
+    constraint, so that the compiled function runs on this one. Under a mesh, which has its own devices, they stay
+    unconstrained.
     """
     sharding = SingleDeviceSharding(device)
     leaves, treedef = jax.tree.flatten(tree)
@@ -73,7 +73,7 @@ def _is_on(x: object, sharding: SingleDeviceSharding) -> bool:
 
 
 def _runs_on(device: jax.Device) -> bool:
-    """Return True where a function that is traced now will run on a device, or on a mesh."""
+    """Return True if a function that is traced now will run on the device, or on a mesh."""
     with jax.ensure_compile_time_eval():
         default = jax.device_put(np.int8(0)).devices()
     return default == {device} or not jax.sharding.get_abstract_mesh().empty
@@ -114,7 +114,7 @@ def shardings_of(data: SimData, mesh: Mesh) -> SimData:
 
 
 def shard(data: SimData, mesh: Mesh) -> SimData:
-    """Return the data distributed over a mesh. Under a trace, the results of the compiled function are."""
+    """Return the data distributed over a mesh; under a trace, constrain the compiled function to distribute it."""
     put = jax.lax.with_sharding_constraint if isinstance(data.states.pos, jax.core.Tracer) else jax.device_put
     return put(data, shardings_of(data, mesh))
 

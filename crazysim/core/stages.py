@@ -26,7 +26,7 @@ FLOOR_HEIGHT = -0.001
 
 
 def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
-    """Declare a stage whose functions take data of one drone, one world or all worlds alike."""
+    """Return a decorator that declares a built-in stage, whose function takes data of one drone, one world or all."""
     return lambda fn: Stage(fn, scope, when, batched=True, fixed=True)
 
 
@@ -82,14 +82,14 @@ def force_torque_controller(data: SimData) -> SimData:
 
 @_built_in("drone")
 def clip_rotor_vel_cmd(data: SimData) -> SimData:
-    """Limit commanded rotor speeds to the range of the motors; zero or less is off."""
+    """Limit commanded rotor speeds to the range of the motors; zero or less switches a motor off."""
     rotor_vel = first_principles.saturate(controls_of(data).rotor_vel, data.params)
     return data.replace(controls=data.controls.replace(rotor_vel=rotor_vel))
 
 
 @_built_in("drone")
 def clip_thrust_cmd(data: SimData) -> SimData:
-    """Limit the commanded collective thrust to the range of the rotors; zero or less is off."""
+    """Limit the commanded collective thrust to the range of the rotors; zero or less switches them off."""
     ctrl = data.controls.attitude
     ctrl = ctrl.replace(cmd=fitted.saturate(ctrl.cmd, data.params))
     return data.replace(controls=data.controls.replace(attitude=ctrl))
@@ -123,8 +123,8 @@ def _derivative(data: SimData, dynamics: Callable[..., tuple[Array, ...]], cmd: 
 def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
     """Return a derivative in which a drone that stands on the floor and does not lift off neither slides nor turns.
 
-    Needed where positions move with velocities of the same step. Explicit Euler moves them with velocities of the step
-    before, which ``clip_floor_pos`` has set to zero.
+    Integrators that move positions with the velocities of the same step need it. Explicit Euler moves them with the
+    velocities of the previous step, which ``clip_floor_pos`` has set to zero.
     """
 
     def held_derivative(data: SimData) -> SimStateDeriv:
@@ -136,7 +136,7 @@ def hold_on_floor(deriv_fn: DerivFn) -> DerivFn:
 
 
 def stop_below(s: SimState, lowest: Array | float) -> SimState:
-    """Return states in which a drone below a height, m (..., 1), or on it and not rising, is on it, at rest."""
+    """Return states with drones that are below a height, or at it and not rising, at rest on it. m, (..., 1)"""
     height, climb = s.pos[..., 2:], s.vel[..., 2:]
     stopped = (height < lowest) | ((height == lowest) & (climb <= 0))
     return s.replace(
@@ -165,9 +165,10 @@ def watched_records(data: SimData) -> Any:
 
 
 def nonfinite_worlds(data: SimData) -> Array:
-    """Return True where a world was flagged, holds NaN or infinity in a state or command, or has counted too far.
+    """Return True for worlds that are flagged, hold NaN or infinity in a state or command, or exceed ``MAX_STEPS``.
 
-    As a call takes at most ``MAX_STEPS``, a count beyond that is negative. For data of all worlds or of one world.
+    A count of steps beyond ``MAX_STEPS`` wraps around and is negative, as one call takes at most that many. The data
+    may be of all worlds or of one world.
 
     Returns:
         (n_worlds, 1), or () in one world
@@ -181,10 +182,10 @@ def nonfinite_worlds(data: SimData) -> Array:
 
 
 def reset(data: SimData, default_data: SimData, mask: Array | None = None) -> SimData:
-    """Return the data with worlds, or the whole simulation, brought back to the default data.
+    """Return the data with some worlds, or the whole simulation, reset to the default data.
 
     With a mask, everything that belongs to the worlds of the mask is restored. What worlds share (parameters that are
-    not one per drone, plugins without declared axes) stays. Without a mask that is restored too. Either way the
+    not one per drone, plugins without declared axes) stays. Without a mask, shared data is restored too. Either way the
     seed stays, a parameter that has become one per drone stays one per drone, with its default values, and plugins
     that the default data lack stay as they are.
 

@@ -24,7 +24,7 @@ def is_installed() -> bool:
 class BatchRenderer:
     """Renderer of one camera in many worlds, with lights, shadows and materials, without overlays.
 
-    It needs memory for the images and for the scene in as many worlds.
+    It allocates memory for the images and for the state of the scene in every world.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class BatchRenderer:
 
 
 def _unpack_colors(pixels: Array, shape: tuple[int, int, int]) -> Array:
-    """Return packed pixels as three colours; a copy, because the next call writes to the same buffer."""
+    """Return packed pixels as red, green and blue; a copy, because the next call writes to the same buffer."""
     return _color_bytes(pixels).reshape(*shape, 3)
 
 

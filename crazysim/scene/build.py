@@ -21,7 +21,7 @@ from crazysim.scene import mjx
 SCENE_FILE = Path(__file__).parents[1] / "scene.xml"
 
 DRONES_PER_CHUNK = 128
-"""Most drones that are added to a spec one by one."""
+"""Largest number of drones that are added to a spec one by one."""
 
 
 def build_spec(
@@ -33,7 +33,7 @@ def build_spec(
         xml_path: MJCF scene without drones, or its spec; None for the package's own floor, light and sky.
         airframes: Airframe of each drone. (n_drones,)
         freq: Physics steps per second, Hz.
-        max_geom_pairs: Most pairs that MJX checks per kind of collision; -1 for all.
+        max_geom_pairs: Largest number of pairs that MJX checks per kind of collision; -1 for all.
 
     Raises:
         ConfigError: If the file does not exist, cannot be read, or has names that are reserved for drones.
@@ -77,7 +77,7 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
     """Add the drones' bodies element by element, large swarms in chunks.
 
     MuJoCo goes through the whole spec for every geom that is added and every body that is attached: 4,096 drones
-    take 30 s one by one, 2 s in chunks that are filled alone.
+    take 30 s one by one, 2 s in chunks that are filled separately.
     """
     n_drones = len(airframes)
     for name, rgba in MATERIALS.items():
@@ -97,7 +97,7 @@ def _add_drones(spec: mujoco.MjSpec, airframes: Sequence[Airframe]) -> None:
 
 @contextlib.contextmanager
 def _no_warnings() -> Iterator[None]:
-    """Keep MuJoCo from writing to the terminal and to MUJOCO_LOG.TXT that names have no prefix."""
+    """Suppress MuJoCo's warning, on the terminal and in MUJOCO_LOG.TXT, that attached names have no prefix."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -197,7 +197,7 @@ def _explain_mjx_errors() -> Iterator[None]:
 
 
 def check_poses(mjx_data: mjx.Data, mj_model: mujoco.MjModel, n_worlds: int) -> mjx.Data:
-    """Return a scene's state that a user has written poses into, with these as floats."""
+    """Return MJX data that a user has written poses into, with the poses checked and converted to floats."""
     changes = {}
     for name, size in (("mocap_pos", 3), ("mocap_quat", 4)):
         value, shape = getattr(mjx_data, name), (n_worlds, mj_model.nmocap, size)

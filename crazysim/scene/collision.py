@@ -17,11 +17,11 @@ from crazysim.geometry import Shape, hfield, hull
 GEOM_KINDS = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")): kind for kind in
          ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")}  # fmt: skip
 DRONE_BITS = (3, 1)
-"""Bits contype and conaffinity of the geoms by which drones touch."""
+"""``contype`` and ``conaffinity`` of the geoms with which drones collide."""
 VISIBLE_GROUPS = range(3)
 """Groups of geoms that are drawn, as in MuJoCo's own pictures."""
 MIN_ALPHA = 0.5
-"""Least alpha of geoms that rays hit."""
+"""Smallest alpha of geoms that rays hit."""
 
 Kinds = Sequence[tuple[int, ...] | None]
 """Indices of the drones of each airframe; None for all drones."""
@@ -59,12 +59,12 @@ class DroneGeoms:
     """Geoms of drones of one airframe."""
 
     geoms: tuple[CollisionGeom, ...]
-    """Geoms of each, in its body frame."""
+    """Geoms of one of these drones, in its body frame."""
     drones: tuple[int, ...] | None = None
     """Indices of the drones; None for all."""
 
     def drone_mask(self, drone_id: Array) -> Array | None:
-        """Return True for the drones, by index; None if they are all. (...)"""
+        """Return True where an index is of one of these drones; None if all drones have these geoms. (...)"""
         if self.drones is None:
             return None
         return functools.reduce(
@@ -92,9 +92,9 @@ class CollisionModel:
     objects: tuple[CollisionBody, ...]
     """Objects with at least one geom; other geoms of the world body are an object ``world``."""
     drones: tuple[DroneGeoms, ...]
-    """Geoms of the drones, of each airframe."""
+    """Geoms of the drones, one entry per airframe."""
     mocap_bodies: tuple[str, ...]
-    """Mocap bodies without a handle, whose poses are in ``mjx_data`` only; they follow the rows of ``data.objects``."""
+    """Mocap bodies without a handle, with poses in ``mjx_data`` only; they follow the rows of ``data.objects``."""
     mocap_ids: tuple[int, ...]
     """Mocap ids of those bodies."""
 
@@ -186,7 +186,7 @@ def _model(
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Return the name of a body; one without a name is called by its id."""
+    """Return the name of a body, or ``body <id>`` if it has none."""
     return model.body(body).name or f"body {body}"
 
 
@@ -217,7 +217,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> Shape:
 
 
 def _hull(model: mujoco.MjModel, mesh: int) -> Shape:
-    """Return the convex hull of a mesh, with which MuJoCo computes contacts, too.
+    """Return the convex hull of a mesh, which MuJoCo uses for contacts, too.
 
     MuJoCo's ``mesh_graph`` of a hull holds the numbers of vertices and faces, an address for each vertex, the indices
     of the vertices in the mesh, edges, and three vertices for each face.

@@ -31,7 +31,7 @@ from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_
 from crazysim.scene.objects import Handle
 
 MAX_UNROLLED_GEOMS = 16
-"""Most fixed geoms of one shape that are computed one by one."""
+"""Largest number of fixed geoms of one shape whose distances are computed one by one."""
 DRONES_PER_CHUNK = 64
 """Drones whose distances to all others of their world are computed at a time."""
 
@@ -182,7 +182,7 @@ def _group_key(body: CollisionBody) -> tuple[Any, ...]:
 
 
 def kernel_size(model: CollisionModel, objects: ObjectSelection) -> int:
-    """Return a measure of the length of a kernel for the contacts with some objects: geoms, movable ones times four."""
+    """Return a measure of the length of a contact kernel: the number of geoms, with movable ones counted four times."""
     return sum(
         len(body.geoms) * (1 if body.row is None else 4) for body in select_bodies(model, objects, in_data=False)
     )
@@ -226,7 +226,7 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
 def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[CollisionGeom]) -> Array:
     """Return the distance to the nearest of some geoms in the world frame, m. (...)
 
-    Of many of one shape, the distances are computed side by side.
+    Distances to many geoms of one shape are computed side by side.
     """
     kinds: dict[Any, list[CollisionGeom]] = {}
     for geom in geoms:

@@ -24,10 +24,10 @@ from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_
 from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays_in_worlds
 
 MAX_RAYS = 1 << 22
-"""Most rays that XLA casts at a time; larger batches of worlds are split."""
+"""Largest number of rays that XLA casts at a time; larger batches of worlds are split."""
 
 MAX_RAYS_OF_KERNEL = 1 << 28
-"""Most rays of a kernel; numbers of rays and indices of tables are int32."""
+"""Largest number of rays in a kernel; numbers of rays and indices of tables are int32."""
 
 TILE_SIDE = 4
 """Height and width of the tiles of pixels, whose rays follow each other: rays side by side in a kernel meet much the
@@ -49,7 +49,7 @@ class Camera:
     pos: tuple[float, ...]
     """Position in the frame of that body, m. (3,)"""
     rot: tuple[tuple[float, ...], ...]
-    """Columns right, up and back of the camera in that frame. (3, 3)"""
+    """Rotation matrix whose columns are the camera's right, up and back in that frame. (3, 3)"""
     turns: bool
     """True if it turns with that body; false if it follows its position only."""
     fovy: float
@@ -57,7 +57,7 @@ class Camera:
 
 
 def find_cameras(model: mujoco.MjModel, name: str | int, objects: Sequence[str]) -> list[Camera]:
-    """Return the camera of a name or id, or every drone's camera for a name without index, such as ``fpv_cam``.
+    """Return the camera with a name or id, or every drone's camera for a name without index, such as ``fpv_cam``.
 
     Args:
         model: Compiled scene.
@@ -161,7 +161,7 @@ def build_depth_fn(
 
         return jax.tree.map(picture, hits)
 
-    # Their poses become part of the data before the rays are cast.
+    # Poses of mocap bodies become part of the data before the rays are cast.
     in_data = model.without_mocap_bodies()
 
     def depth(data: SimData, mocap: MocapPoses = None) -> Hits:

@@ -27,7 +27,7 @@ from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 
 NOBODY, NO_DRONE = -1, -2
-"""Drone that a ray passes through if it passes through none, and owner of geoms that belong to no drone."""
+"""Drone index of rays that pass through no drone, and drone index of geoms that belong to no drone."""
 
 BALL_SLACK = 1e-3
 """Relative enlargement of a ball for rounding, in addition to ``hierarchy.BOX_PADDING``."""
@@ -51,7 +51,7 @@ class Target:
 
     @property
     def surface(self) -> Surface:
-        """Kind of the shape, or the shape itself if its size is not enough."""
+        """Kind of the shape, or the shape itself if kind and size do not describe it."""
         shape = self.geom.shape
         return shape if shape.kind in ("mesh", "hfield") else shape.kind
 
@@ -85,7 +85,7 @@ class Tables(NamedTuple):
     """Everything that rays of all worlds need, as tables in memory."""
 
     counts: Array
-    """Numbers of nodes, fixed geoms and movable geoms. (1, 3)"""
+    """Numbers of nodes in one order, of fixed geoms and of movable geoms. (1, 3)"""
     codes: Array
     """Index of the surface, and the drone that a geom belongs to, of fixed and then movable geoms. (n, 2)"""
     boxes: Array
@@ -129,9 +129,9 @@ class Targets:
         self.movable = [x for carrier in ("object", "drone") for x in targets if x.carrier == carrier]
         """Geoms of movable objects, then geoms of drones."""
         self.all = [*self.fixed, *self.movable]
-        """All of them, in the order of their indices."""
+        """All geoms, in the order of their indices."""
         self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all))
-        """Surfaces that there are."""
+        """Distinct surfaces of the geoms."""
         owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
         codes = [(self.surfaces.index(x.surface), owner) for x, owner in zip(self.all, owners, strict=True)]
         self.codes = np.array(codes, np.int32).reshape(-1, 2)
@@ -197,7 +197,7 @@ class Targets:
         fixed = self.hierarchy(eyes.dtype)
         counts = np.array([[len(fixed.boxes) // hierarchy.N_ORDERS, len(self.fixed), len(self.movable)]], np.int32)
         tables = (jnp.asarray(counts), jnp.asarray(self.codes), *fixed[1:], balls, geoms, eyes, pixels)
-        # No table is empty, since one of no rows has no memory.
+        # Empty tables get a row of zeros, since an array without rows has no memory.
         flat = [x.reshape(-1, x.shape[-1]) for x in tables]
         return Tables(*(x if x.shape[0] else jnp.zeros((1, x.shape[1]), x.dtype) for x in flat))
 
@@ -223,7 +223,7 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     Of geoms at the same distance the lowest index is returned.
 
     Args:
-        surfaces: Surfaces that there are.
+        surfaces: ``Targets.surfaces``.
         n_pixels: Rays of a camera.
         n_cameras: Cameras of a world.
         index: Number of the ray: pixels of the first camera of the first world come first. ()
@@ -261,11 +261,11 @@ def first_fixed_hit(
     """Return the nearer of the best hit and the first fixed geom that a ray meets.
 
     Args:
-        surfaces: Surfaces that there are.
+        surfaces: ``Targets.surfaces``.
         tables: The fixed geoms.
         ray: The ray.
         best: Best hit so far.
-        n_nodes: Nodes of an order of the hierarchy; None for as many as the tables have.
+        n_nodes: Number of nodes in one order of the hierarchy; None to take it from the tables.
     """
     n_nodes = len(tables.boxes) // hierarchy.N_ORDERS if n_nodes is None else n_nodes
     inverse = [1 / jnp.where(jnp.abs(d) < MIN_COMPONENT, MIN_COMPONENT, d) for d in ray.direction]
@@ -304,8 +304,8 @@ def _meets_box(
     """Return True where a ray meets a box before its best hit.
 
     Args:
-        low: Least corner of the box, m.
-        high: Greatest corner, m.
+        low: Lower corner of the box, m.
+        high: Upper corner, m.
         scaled: Origin of the ray times ``inverse``.
         inverse: Inverses of the components of its direction.
         best: Distance to its best hit, m.
@@ -323,7 +323,7 @@ def _meets_ball(ball: Sequence[Array], ray: Ray, best: Array) -> Array:
     *centre, radius = ball
     away = [c - o for c, o in zip(centre, ray.origin, strict=True)]
     middle = sum(a * d for a, d in zip(away, ray.direction, strict=True))
-    # The point of the line nearest to the centre: differences of squares would cancel far away.
+    # From the nearest point of the line to the centre; a difference of squares would lose precision for distant balls.
     aside = [a - middle * d for a, d in zip(away, ray.direction, strict=True)]
     square = sum(a * a for a in aside)
     return (square <= radius * radius) & (middle + radius >= 0) & (middle - radius <= best)
@@ -346,7 +346,7 @@ def _nearer_hit(
 
 
 def ray_in_frame(row: Sequence[Array], origin: Components, direction: Components) -> tuple[Components, Components]:
-    """Return a ray in the frame of a geom, whose row is given."""
+    """Return a ray in the frame of the geom with the given row; see ``Target.numbers``."""
     away = [o - p for o, p in zip(origin, row, strict=False)]
     start, along = (
         tuple(sum(row[4 + 3 * i + k] * v[i] for i in range(3)) for k in range(3)) for v in (away, direction)
@@ -355,7 +355,7 @@ def ray_in_frame(row: Sequence[Array], origin: Components, direction: Components
 
 
 def geom_shape(surface: Surface, row: Sequence[Array]) -> Shape | SizedShapes:
-    """Return the shape of a geom, whose row is given."""
+    """Return the shape of the geom with the given row; see ``Target.numbers``."""
     return SizedShapes(surface, row[13 : 13 + N_SIZES[surface]]) if isinstance(surface, str) else surface
 
 
@@ -369,7 +369,7 @@ def _ray_length(surface: Surface, row: Sequence[Array], start: Components, along
 
 
 def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) -> Array:
-    """Return the distance along one ray to a mesh, in a loop over its planes, as ``hit_distance`` has it, m. ()"""
+    """Return the distance along one ray to a mesh, in a loop over its planes; see ``hit_distance``. m, ()"""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
     def turn(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:

@@ -1,7 +1,7 @@
 """Bounding volume hierarchy of geoms that do not move, as a table that a ray walks without a stack.
 
-Nodes follow each other in the order of a visit, and each has the index behind its subtree, where a ray continues that
-misses its box. Each of the eight octants of directions has an order, in which nearer boxes come first.
+Nodes are in depth-first order, each with the index of the node after its subtree, where a ray that misses its box
+continues. Each of the eight octants of directions has an order of its own, in which nearer boxes come first.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ than the spacing of numbers in float32 up to 1 km, which is 6e-5 m."""
 @dataclasses.dataclass
 class _Node:
     low: np.ndarray
-    """Least corner of the box, m. (3,)"""
+    """Lower corner of the box, m. (3,)"""
     high: np.ndarray
-    """Greatest corner of the box, m. (3,)"""
+    """Upper corner of the box, m. (3,)"""
     axis: int = 0
     """Axis along which the children are sorted."""
     children: tuple[_Node, _Node] | None = None
@@ -34,17 +34,17 @@ class _Node:
 
 
 def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes of the hierarchy of some boxes, in all orders.
+    """Return the nodes of a hierarchy of boxes, in all orders.
 
     Bit k of an order's number is set where directions along axis k are negative.
 
     Args:
-        low: Least corners of the boxes, m. (n, 3)
-        high: Greatest corners, m. (n, 3)
+        low: Lower corners of the boxes, m. (n, 3)
+        high: Upper corners, m. (n, 3)
 
     Returns:
-        Least and greatest corner of the box of each node, m. (8, n_nodes, 6)
-        Index of the node behind its subtree, and index of the geom of a leaf or -1. (8, n_nodes, 2)
+        Lower and upper corner of the box of each node, m. (8, n_nodes, 6)
+        Index of the node after its subtree, and index of the geom of a leaf or -1. (8, n_nodes, 2)
     """
     low, high = low - BOX_PADDING, high + BOX_PADDING
     bounded = np.all(high - low < UNBOUNDED_LENGTH, axis=1)
@@ -56,9 +56,9 @@ def build_hierarchy(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
-    """Return the tree of some boxes, split where the surfaces of both parts, times their counts, are least.
+    """Return a tree of boxes, split so that surface area times number of boxes, summed over both parts, is smallest.
 
-    No part has less than an eighth of the boxes, which bounds the depth.
+    Each part has more than an eighth of the boxes, which bounds the depth.
     """
     node = _Node(low[geoms].min(axis=0), high[geoms].max(axis=0), geom=int(geoms[0]))
     n = len(geoms)

@@ -1,7 +1,7 @@
-"""MJX, imported when it is first used, which takes more than half a second: only contacts need it.
+"""MJX, imported on first use: the import takes more than half a second, and only contacts need it.
 
-It is imported without NVIDIA Warp, which nothing here uses MJX on, and which would take two more seconds where it is
-installed. A program that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts.
+It is imported without NVIDIA Warp: nothing here runs MJX on Warp, whose import would take two more seconds. A program
+that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts.
 """
 
 from __future__ import annotations

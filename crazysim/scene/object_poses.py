@@ -25,7 +25,7 @@ def moving_plugins(plugins: Iterable[Plugin], names: Sequence[str]) -> dict[str,
 
 
 def with_moved_objects(data: SimData, plugins: Mapping[str, Plugin]) -> SimData:
-    """Return the data of all worlds, or of one world, with the objects of plugins at their poses.
+    """Return the data of all worlds, or of one world, with the poses of objects that plugins move.
 
     Recorded poses stay.
     """

@@ -22,7 +22,7 @@ from crazysim.pytree import device_array, select_worlds
 from crazysim.scene.primitives import PRIMITIVES, primitive_geoms
 
 MAX_OBJECTS = 100_000
-"""Most objects that are added at once."""
+"""Largest number of objects that can be added at once."""
 IDENTITY_QUAT = (0.0, 0.0, 0.0, 1.0)
 """Identity attitude, xyzw."""
 Source = str | Path | mujoco.MjSpec | mujoco.MjsBody
@@ -72,8 +72,8 @@ class Handle:
             data: Simulation, or one world of it in a stage.
             pos: Positions of the bodies' frames, world frame, m; None to keep. (3,), (n, 3) or (n_worlds, n, 3)
             quat: Attitudes, body to world, xyzw, normalised here; None to keep. The same shapes with 4
-            vel: Velocities for contact response, world frame, m/s; they move nothing. Shapes as ``pos``; zero if left
-                out beside ``pos``.
+            vel: Velocities for contact response, world frame, m/s; they do not move the objects. Shapes as ``pos``;
+                zero if ``pos`` is set without them.
             mask: True in the worlds to change; None for all. (n_worlds,)
         """
         objects = self._objects(data)
@@ -119,7 +119,7 @@ def _replace_rows(
         value = value * jax.lax.rsqrt(jnp.sum(value**2, axis=-1, keepdims=True))
     value = jnp.broadcast_to(value[:, None] if value.ndim == 3 else value, (*old.shape[:-2], n, size))
     start, end = numbers[0], numbers[0] + n
-    if numbers == tuple(range(start, end)):  # as long to compile for thousands as for one
+    if numbers == tuple(range(start, end)):  # compile time does not grow with the number of objects
         new = jnp.concatenate([old[..., :start, :], value, old[..., end:, :]], axis=-2)
     else:
         rows = [old[..., k, :] for k in range(old.shape[-2])]
@@ -157,7 +157,7 @@ class SceneSnapshot(NamedTuple):
     """Contents of a scene at some time, to which ``restore_snapshot`` returns."""
 
     names: list[set[str]]
-    """Names of the elements of the spec, as ``_elements`` has them."""
+    """Names of the elements of the spec, in the order of ``_elements``."""
     handles: list[Handle]
     """Handles of all objects."""
     initial: list[tuple[NDArray, NDArray]]
@@ -214,7 +214,7 @@ class SceneObjects:
         return handle
 
     def number_of(self, name: str) -> int:
-        """Return the number of objects of a kind, or of a body of that name: 0 if it was not added."""
+        """Return the number of added objects of a kind, by its name as in ``Handle.name``; 0 if there are none."""
         return sum(len(handle) for handle in self._handles if handle.name == name)
 
     def take_snapshot(self, spec: mujoco.MjSpec) -> SceneSnapshot:
@@ -251,7 +251,7 @@ class SceneObjects:
 
 
 def _elements(spec: mujoco.MjSpec) -> tuple[Sequence[Any], ...]:
-    """Return the bodies of the world, and what comes with them in an attached spec; users before what they use."""
+    """Return the elements that attached specs add, in the order of deletion: users before the elements they use."""
     return spec.worldbody.bodies, spec.materials, spec.textures, spec.meshes, spec.hfields
 
 
@@ -262,8 +262,8 @@ def add_bodies(
 
     Args:
         spec: Scene.
-        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of one of these,
-            but no primitive, for each body.
+        what: Name of a primitive, path of an MJCF file, MJCF text, spec, or body of a spec; or a list of
+            these, but no primitives, with one for each body.
         names: Names of the bodies.
         pos: Positions, m. (n, 3)
         quat: Attitudes, xyzw. (n, 4)

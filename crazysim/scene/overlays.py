@@ -22,7 +22,7 @@ IMAGE_CORNERS = {
 }
 """Corners of an image for text."""
 MAX_LABEL = 99
-"""Most characters of a label, which MuJoCo cuts off there."""
+"""Largest number of characters of a label; MuJoCo cuts off longer ones."""
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Overlays:
     """Geoms and text that are drawn over the scene in the next image only."""
 
     limit: int = 10_000
-    """Most geoms of one image."""
+    """Largest number of geoms in one image."""
     _geoms: list[tuple] = field(default_factory=list)
     _texts: dict[str, str] = field(default_factory=dict)
 
@@ -112,7 +112,7 @@ class Overlays:
         self._texts.clear()
 
     def copy(self) -> Overlays:
-        """Return a copy that later changes leave alone."""
+        """Return a copy that later changes do not affect."""
         return Overlays(self.limit, list(self._geoms), dict(self._texts))
 
     def restore(self, overlays: Overlays) -> None:

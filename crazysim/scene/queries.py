@@ -25,7 +25,7 @@ from crazysim.scene.scene import Scene
 
 MAX_SIZE = 256
 """Largest ``kernel_size`` of a contact report that gets a kernel, which takes 20 s to compile for 64 movable boxes. XLA
-takes 1 s for any number, and 1.4 times as long in each call."""
+compiles any number in 1 s, but takes 1.4 times as long in each call."""
 
 
 class SceneQueries:
@@ -79,7 +79,7 @@ class SceneQueries:
         by_xla = contact_report.build_contact_fn(model, objects, floor, drones)
         if platform is None or contact_report.kernel_size(model, objects) > MAX_SIZE:
             return by_xla
-        # Their poses become part of the data before the kernel runs, which is for data alone.
+        # Poses of mocap bodies become part of the data before the kernel runs, which reads the data alone.
         in_data = model.without_mocap_bodies()
         queries: list[Query] = []
         if floor or contact_report.select_bodies(in_data, objects):

@@ -28,12 +28,12 @@ from crazysim.scene.first_hit import NOBODY, Ray, Surface, Targets, first_fixed_
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 MAX_UNROLLED_GEOMS = 16
-"""Movable geoms of one world up to which a stage of one world or drone should cast rays: its program is unrolled."""
+"""Largest number of movable geoms of a world with which a stage should cast rays: its program is unrolled."""
 MAX_PAIRS = 36
-"""Rays times fixed geoms of one world or drone up to which the program is unrolled: it is two to three times as fast as
-a hierarchy then, and compiles in about the same time."""
+"""Largest number of rays times fixed geoms of one world or drone for which the program is unrolled. It is two to three
+times as fast as a hierarchy then, and compiles in about the same time."""
 MAX_LOOP_RAYS = 64
-"""Rays of a loop within a step; an index that is computed at run time selects among at most 64 entries."""
+"""Largest number of rays in a loop within a step; an index computed at run time selects among at most 64 entries."""
 
 
 class Hits(PyTree):
@@ -65,7 +65,7 @@ def cast_rays(
     kernels: RayKernels | None = None,
     limit: Array | float = np.inf,
 ) -> Hits:
-    """Return the first surfaces that rays meet, in all worlds, in one world, or around one drone, as the data is.
+    """Return the first surfaces that rays meet, in all worlds, in one world, or around one drone, as in ``data``.
 
     Args:
         model: Visual or collision model of the scene.
@@ -81,7 +81,7 @@ def cast_rays(
     require_poses(model, [body.name for body in model.objects], mocap)
     data = with_mocap_bodies(model, data, mocap)
     if origin.ndim == 3:
-        # A camera for each ray, whose first axis is its direction.
+        # Each ray is a camera of one pixel, whose first axis is the direction of the ray.
         zero, passes = (
             jnp.zeros((*direction.shape, 2), direction.dtype),
             NOBODY if drone_of_ray is None else drone_of_ray,
@@ -130,7 +130,7 @@ def _hit_bodies(
     direction: Array,
     row_of_ray: np.ndarray | None,
 ) -> Hits:
-    """Return earlier hits, or nearer hits of movable bodies with equal geoms.
+    """Return the nearer of earlier hits and hits of movable bodies with equal geoms.
 
     Args:
         best: Earlier hits.
@@ -227,10 +227,10 @@ def _hit_fixed_geoms(
 def _hit_rows(
     surfaces: Sequence[Surface], codes: np.ndarray, which: Array, rows: Array, origin: Array, direction: Array
 ) -> tuple[Array, Callable[[Array], Array]]:
-    """Return the distance along rays to a geom each, and a function from distances to unit normals, world frame.
+    """Return the distance along each ray to its geom, and a function from distances to unit normals, world frame.
 
     Args:
-        surfaces: Surfaces that there are.
+        surfaces: ``Targets.surfaces``, or the first of them.
         codes: Index of the surface of each geom in the first column. (n, 2)
         which: Index of the geom of each ray, -1 for none. (...)
         rows: Rows of these geoms; see ``Target.numbers``. (..., 16)
@@ -245,7 +245,7 @@ def _hit_rows(
     exact = jnp.full_like(start[0], jnp.inf)
     for number, surface in enumerate(surfaces):
         mine = (which >= 0) & (code == number)
-        # A size for geoms of other kinds, so that their slopes are finite.
+        # Geoms of other kinds get sizes of 1, so that derivatives are finite.
         shape = geom_shape(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
         if isinstance(shape, Shape) and shape.kind == "hfield":
             far, normal = ray_distance(shape, ray_start, ray_direction)

@@ -16,7 +16,7 @@ from crazysim.scene.scene_window import SceneWindow
 from crazysim.scene.software import rendering_quality
 
 MAX_SIZES = 4
-"""Most image sizes whose contexts are kept."""
+"""Largest number of image sizes whose contexts are kept."""
 
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple")
 """Modes of ``Sim.render``."""
@@ -154,7 +154,7 @@ def font_scale(height: int) -> mujoco.mjtFontScale:
 
 def _read_image(renderer: mujoco.Renderer, overlays: Overlays) -> NDArray:
     image = renderer.render().copy()
-    if overlays.has_text:  # mujoco.Renderer has no text: it is written into its buffer, which is read again
+    if overlays.has_text:  # mujoco.Renderer draws no text: write it into the buffer and read that again
         overlays.write_text(renderer._rect, renderer._mjr_context)
         mujoco.mjr_readPixels(image, None, renderer._rect, renderer._mjr_context)
         image = np.flipud(image).copy() if renderer._gl_context else image

@@ -16,7 +16,7 @@ from crazysim.scene.render import ModelRenderer
 
 
 class SceneRenderer:
-    """Renderers of a scene, made when first used, and the overlays of the next image."""
+    """Renderers of a scene, created on first use, and the overlays of the next image."""
 
     overlays: Overlays
     """Lines, points, labels and text of the next image."""
@@ -39,7 +39,7 @@ class SceneRenderer:
         width: int,
         height: int,
     ) -> NDArray | tuple[NDArray, NDArray] | None:
-        """Return or show an image of one world with the overlays, and clear those; see ``Sim.render``."""
+        """Return or show an image of one world with the overlays, then clear them; see ``Sim.render``."""
         if self.viewer is None:
             self.viewer = ModelRenderer(model, data, self.overlays.limit + model.ngeom)
         image = self.viewer.render(mode, camera, cam_config, width, height, self.overlays)
@@ -56,14 +56,14 @@ class SceneRenderer:
     ) -> Array:
         """Return images of a camera in several worlds; see ``Scene.render_worlds``. (n, height, width, 3), uint8"""
         key = (camera, width, height, len(poses[0]))
-        if self._batch is None or self._batch[0] != key:  # one only, as each holds the scene of all its worlds
+        if self._batch is None or self._batch[0] != key:  # keep only one: each holds the state of all its worlds
             self._batch = None
             self._batch = (key, BatchRenderer(model, camera, width, height, len(poses[0]), self._device))
         return self._batch[1](*poses)
 
     @property
     def max_visual_geom(self) -> int:
-        """Most overlays of one image."""
+        """Largest number of overlays in one image."""
         return self.overlays.limit
 
     @max_visual_geom.setter

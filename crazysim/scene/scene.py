@@ -32,7 +32,7 @@ LARGE_SWARM = 64
 
 
 class Scene:
-    """MuJoCo's side of a simulation.
+    """The MuJoCo scene of a simulation.
 
     The scene is updated lazily: ``sync`` does so for all worlds when contacts are requested and the data's flag is
     clear, ``sync_one`` for the world of an image. Nothing is allocated per world before the first ``contacts``.
@@ -41,7 +41,7 @@ class Scene:
     spec: mujoco.MjSpec
     """Editable scene; ``compile`` makes edits take effect."""
     max_geom_pairs: int
-    """Most pairs that MJX checks per kind of collision, from the next ``compile`` on; -1 for all."""
+    """Largest number of pairs that MJX checks per kind of collision, from the next ``compile`` on; -1 for all."""
     renderer: SceneRenderer
     """Renderers and the overlays of the next image."""
     added: SceneObjects
@@ -51,8 +51,8 @@ class Scene:
     ray_kernels: RayKernels
     """Kernels that cast rays and answer contact reports."""
     revision: int
-    """Number of edits of the spec. The compiled model belongs to one of them, as do the objects and mocap ids in
-    the data."""
+    """Number of edits of the spec so far. The compiled model, and the objects and mocap ids in the data, each
+    correspond to one revision, and are updated when it is no longer the present one."""
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class Scene:
         """Compile the spec; closes the window and returns bodies moved through ``mjx_data`` to where the spec has them.
 
         Raises:
-            ConfigError: If the spec does not compile or lacks a drone; the scene stays as it was then.
+            ConfigError: If the spec does not compile or lacks a drone; the scene is then unchanged.
         """
         self._compile()
         self.revision += 1  # the spec may have been edited by hand
@@ -235,8 +235,8 @@ class Scene:
     ) -> contact_report.ContactFn:
         """Return ``contacts(data, mocap=None) -> ContactReport``, pure, for the present scene.
 
-        The function takes all worlds or, in a stage, one world or one drone; for a stage of one drone pass
-        ``drones=False``. Fields that were not requested are None and are not computed.
+        The function takes all worlds or, in a stage, one world or one drone; in a stage of one drone ``nearest_drone``
+        is None. Fields that were not requested are None and are not computed.
 
         Bodies that were attached to ``spec`` and are moved through ``mjx_data`` are not part of the data: for those
         pass ``mocap=mjx_data``, or the pair ``(mocap_pos, mocap_quat)`` as ``mjx_data`` has them. Objects of plugins,
@@ -260,9 +260,9 @@ class Scene:
     ) -> depth.DepthFn:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
-        ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), with ``normal`` and ``number`` (the
-        body that was hit) with it. Inside jit, fields that are not used are not computed. Objects of plugins, such as
-        loads, are where the plugins' records in ``data`` have them.
+        ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal`` and
+        ``number``, the index of the body that was hit. Inside jit, fields that are not used are not computed. Objects
+        of plugins, such as loads, are where the plugins' records in ``data`` have them.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name
@@ -271,7 +271,7 @@ class Scene:
             height: Pixels.
             drones: True for drones to be visible.
             hide_own: True for a drone to be invisible to its own camera.
-            along: ``"axis"`` for the distance along the camera's axis, as ``Sim.render`` has it, ``"ray"`` for the
+            along: ``"axis"`` for the distance along the camera's axis, as in ``Sim.render``, ``"ray"`` for the
                 distance from the camera.
         """
         objects = (*self.added.movable, *self.visual_model.mocap_bodies)
@@ -295,7 +295,7 @@ class Scene:
         return self._mjx.data
 
     def assign_mjx(self, mjx_data: mjx.Data) -> None:
-        """Store the ``mjx_data`` of a user; ``Sim.mjx_data`` also clears the flag of the data."""
+        """Store the ``mjx_data`` of a user; ``Sim.mjx_data`` also clears ``core.mjx_synced``."""
         self._mjx.data = mjx_data
 
     @property
@@ -313,7 +313,7 @@ class Scene:
         return self._mjx.poses()[:2]
 
     def shard(self, mesh: Mesh) -> None:
-        """Spread the scene of all worlds over devices, where XLA answers queries."""
+        """Spread the scene of all worlds over devices; from then on XLA, without kernels, answers queries."""
         self.mesh, self.ray_kernels = mesh, RayKernels()
         self._mjx.shard(mesh)
 

@@ -1,4 +1,4 @@
-"""A window that draws within ``draw``, in the thread of its caller, and whose view the mouse moves."""
+"""A window that draws in the thread of its caller, with a view that the mouse moves."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Tile = tuple[mujoco.MjData, Overlays]
 class SceneWindow:
     """A window that shows one model, in one or several states.
 
-    MuJoCo's passive viewer draws in another thread, and sometimes crashes the process when it is closed.
+    Unlike it, MuJoCo's passive viewer draws in another thread, and sometimes crashes the process when it is closed.
     """
 
     def __init__(self, model: mujoco.MjModel, max_geom: int, width: int, height: int):
@@ -39,7 +39,7 @@ class SceneWindow:
         """
         self._model = model
         self._glfw = glfw = _glfw()
-        # A thread cannot use an EGL context for images in memory and a context of another kind.
+        # One thread cannot use both an EGL context, for images in memory, and a context of another kind.
         egl = os.environ.get("MUJOCO_GL", "").lower() == "egl"
         glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API if egl else glfw.NATIVE_CONTEXT_API)
         glfw.window_hint(glfw.VISIBLE, True)
@@ -73,7 +73,7 @@ class SceneWindow:
         return self._window is not None
 
     def draw(self, data: mujoco.MjData, camera: mujoco.MjvCamera, overlays: Overlays, width: int, height: int) -> None:
-        """Show ``data``. A camera or size that differs from the last call replaces the view that the mouse has set."""
+        """Show ``data``; a camera or size that differs from the last call replaces the user's view or window size."""
         self.draw_tiles(1, lambda _: (data, overlays), camera, width, height)
 
     def draw_tiles(
@@ -85,7 +85,7 @@ class SceneWindow:
             n: Number of tiles.
             tile: Returns the k-th tile; called right before it is drawn, so that all may share one ``MjData``.
             camera: Camera; one that differs from the last call replaces the view that the mouse has set.
-            width: Width of the window, pixels; likewise.
+            width: Width of the window, pixels; a size that differs from the last call replaces the user's.
             height: Height of the window, pixels.
         """
         glfw = self._glfw
@@ -199,7 +199,7 @@ class SceneWindow:
 
 
 def require_screen() -> None:
-    """Check that there is a screen, as far as the environment says.
+    """Check that there is a screen, as far as environment variables show.
 
     Raises:
         RenderError: If there is none.

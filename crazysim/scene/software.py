@@ -15,14 +15,14 @@ from crazysim.errors import ConfigError
 QUALITY_VARIABLE = "CRAZYSIM_RENDERING"
 """Environment variable: ``full`` for the scene's quality on every machine, ``fast`` for the quality of CPUs."""
 CPU_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
-"""Names of OpenGL's renderers that run on CPUs."""
+"""Parts of the names of OpenGL renderers that run on CPUs, in lower case."""
 QUALITY_LIMITS = {"offsamples": 0, "shadowsize": 0, "numslices": 16, "numstacks": 8}
 """Largest settings of MuJoCo's quality where a CPU draws.
 
 Samples of a pixel; width of the map of shadows, pixels, 0 for no shadows; meridians and parallels of round shapes. With
 llvmpipe an image of 640 x 360 pixels takes less than a third of the time that it takes with 4 samples and a map of
-4096, and four Crazyflies a third less than with MuJoCo's 28 meridians. Smaller maps draw shadows of nothing in small
-images.
+4096, and four Crazyflies a third less than with MuJoCo's 28 meridians. With smaller maps, small images show false
+shadows.
 """
 
 
@@ -53,7 +53,7 @@ def is_software() -> bool:
 
 @contextlib.contextmanager
 def rendering_quality(model: mujoco.MjModel) -> Iterator[None]:
-    """Give a model the settings for this machine while a context is made, which reads them then."""
+    """Give a model the settings for this machine while a context is created, which reads them only then."""
     if not is_fast():
         yield
         return

@@ -15,7 +15,7 @@ from crazysim.scene import mjx
 from crazysim.scene.kinematics import N_DUMMY_JOINTS, update_kinematics
 
 COM_CAMERAS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)
-"""Modes of cameras that follow a centre of mass; a sync computes it for them only."""
+"""Modes of cameras that follow a centre of mass, which a sync computes only for them."""
 
 
 @jax.jit
@@ -109,8 +109,8 @@ def sync_one_world(
     Args:
         data: Simulation.
         world: Index of the world.
-        poses: Mocap positions, m (n_mocap, 3), attitudes, wxyz (n_mocap, 4), joint positions (n_qpos,): those of bodies
-            that are moved through ``mjx_data`` are used.
+        poses: Mocap positions, m (n_mocap, 3), attitudes, wxyz (n_mocap, 4), joint positions (n_qpos,). The
+            poses of drones and of objects with handles are replaced by their poses in the data.
         mj_model: Compiled scene.
         mj_data: State to write.
     """

@@ -1,4 +1,4 @@
-"""Functions that only users of Crazyflow call; the modules with its import paths name them."""
+"""Functions of Crazyflow's API that only its users call; modules with Crazyflow's import paths export them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Record = TypeVar("Record", bound=PyTree)
 Tree = TypeVar("Tree")
 
 ControlData = StateControlData | AttitudeControlData | BodyRateControlData | ForceTorqueControlData
-"""Records of controllers."""
+"""Record of a command level."""
 
 
 def leaf_replace(record: Record, mask: Array | None = None, **changes: Array) -> Record:

@@ -131,7 +131,7 @@ def to_casadi(sim: Sim, parameters: Sequence[str] = (), world: int = 0, drone: i
         leaf: casadi.vertcat(*(after.get((leaf, k), symbol[k]) for k in range(symbol.numel())))
         for leaf, symbol in symbols.items()
     }
-    # What the state depends on from step to step belongs to it, and what that depends on in turn.
+    # Leaves that the next state depends on belong to the state, and so do leaves that these depend on.
     while memory := [
         leaf
         for leaf, symbol in symbols.items()
@@ -178,7 +178,7 @@ def _refusal(stage: str, why: str) -> ConfigError:
 
 
 def _with_feedforward(data: SimData) -> SimData:
-    """Return the data with the feedforward that the setter of the staged setpoint gives it."""
+    """Return the data with the default feedforward of the staged setpoint."""
     return stage_command(data, staged_leaves(data)[0])
 
 

@@ -26,14 +26,14 @@ from crazysim.pytree import PyTree
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 StageCommand = Callable[[Array | NDArray, Array | NDArray | None], None]
-"""Stages a command of all drones, and its feedforward."""
+"""Function that stages a command for all drones, with its feedforward or None."""
 
 DRONE_POPULATION = "drone"
-"""Population of the drones."""
+"""Name of the population of drones."""
 
 
 def locked(method: Method) -> Method:
-    """Return a method that holds ``self.lock`` while it runs; the lock must be one that a thread may take twice."""
+    """Return a method that holds ``self.lock`` while it runs; the lock must be re-entrant."""
 
     @functools.wraps(method)
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -78,7 +78,7 @@ class Member:
 
     @locked
     def command(self, command: ArrayLike) -> None:
-        """Stage a command for this one alone: (k,), or (n_worlds, k) for each world.
+        """Stage a command for this drone or member alone: (k,), or (n_worlds, k) for each world.
 
         A drone takes a command of the simulation's level, a member a command of its population's level.
         """
@@ -102,7 +102,7 @@ class Member:
         self._stage(staged, *feedforward)
 
     def _pad_rotors(self, command: ArrayLike, n_rotors: int) -> ArrayLike:
-        """Return rotor speeds with zeros for rotors that other drones of the simulation have."""
+        """Return rotor speeds padded with zeros for the rotors that this drone lacks."""
         n_own_rotors = self._sim.airframes[self.index].n_rotors
         if np.shape(command)[-1:] != (n_own_rotors,) or n_own_rotors == n_rotors:
             return command
@@ -143,7 +143,10 @@ def _read_row(x: Array | NDArray, index: int) -> Any:
 
 
 def _replace_row(x: Array, index: int, value: ArrayLike) -> Array | NDArray:
-    """Return rows with the row of one drone or member replaced, on the host if they are there. (n_worlds, n, ...)"""
+    """Return rows with the row of one drone or member replaced. (n_worlds, n, ...)
+
+    They are a NumPy array if ``x`` is on the host and ``value`` is not a JAX array.
+    """
     if is_on_host(x) and not isinstance(value, jax.Array):
         rows = np.array(x)
         rows[:, index] = value

@@ -25,12 +25,12 @@ from crazysim.pytree import PyTree, float_dtype, leaf, n_batch_axes, scopes
 from crazysim.sim.sim import Sim
 
 CostFn = Callable[[SimState, Setpoint, Array], Array]
-"""States of one drone, its setpoint at the same time and its command to the cost of one control step. ()"""
+"""Function ``(states, setpoint, command)`` of one drone, at one time, that returns the cost of a control step. ()"""
 
 RECORD_NAME = "mppi"
 """Key in ``data.plugins`` of a rollout's record."""
 MAX_KNOTS = 64
-"""Largest number of knots; the engine selects among that many."""
+"""Largest number of knots; engines select among at most that many entries at run time."""
 COMMAND_LEVELS = (Control.attitude, Control.body_rate, Control.force_torque, Control.rotor_vel)
 """Command levels that can be sampled."""
 
@@ -56,9 +56,10 @@ class RolloutRecord(PyTree):
 
 
 def tracking_cost(states: SimState, setpoint: Setpoint, command: Array) -> Array:
-    """Return the cost of a drone off its setpoint: squared errors in m, m/s, yaw, and body rates. ()
+    """Return the cost of a drone off its setpoint: squared errors of position and velocity, yaw error, body rates. ()
 
-    A metre counts as much as 2 m/s, 1 rad of yaw, or 10 rad/s; drones within 5 cm of the floor pay 10 more.
+    An error of 1 m costs as much as 2 m/s, 90 degrees of yaw, or a body rate of 10 rad/s; a height below 5 cm costs 10
+    more.
     """
     del command
     pos, vel = states.pos - setpoint.pos, states.vel - setpoint.vel
@@ -97,7 +98,7 @@ class MPPI:
     the plan moves on by one control step. A plan is a polyline through ``knots`` commands over the horizon. With one
     seed, equal calls return equal commands.
 
-    Drones of a world are sampled together and weighted each on its own, which suits drones that do not interact.
+    Drones of a world are sampled together but weighted separately, which suits drones that do not interact.
     Rollouts begin at step 0, also for effects that depend on the time since the reset.
     """
 
@@ -118,7 +119,7 @@ class MPPI:
         """Build the rollouts.
 
         Args:
-            sim: Simulation that is controlled; the rollouts have its settings and plugins of this time.
+            sim: Simulation that is controlled; the rollouts use its present settings and plugins.
             horizon: Number of control steps of a rollout.
             samples: Number of rollouts for each world.
             substeps: Physics steps of a control step.
@@ -127,7 +128,7 @@ class MPPI:
                 ``substeps / freq`` s, and ``command`` must be called once in that time.
             noise: Standard deviation of the samples around the plan, in the units of the command, (k,); None for a
                 default of the level.
-            temperature: Temperature over the mean excess of the costs over the least, 1.
+            temperature: Temperature as a fraction of the mean excess of the costs over the lowest cost.
             cost: Cost of a control step; the cost of a rollout is the sum over its control steps.
             seed: Seed of the samples.
         """
@@ -276,7 +277,7 @@ class MPPI:
         return stage_command(data, self._command_at(data, data.core.steps))
 
     def _cost_stage(self, data: SimData) -> SimData:
-        """Add the cost of the control step that ends; the clock has moved on."""
+        """Add the cost of the control step that has just ended; the clock has advanced already."""
         record = data.plugins[RECORD_NAME]
         t = data.core.steps.astype(record.cost.dtype) / data.core.freq
         command = self._command_at(data, data.core.steps - self.substeps)
@@ -300,7 +301,7 @@ class MPPI:
 
 
 def _command_range(sim: Sim) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the command of hover, the least, the largest and the standard deviation of samples. (k,) each"""
+    """Return the hover command, smallest and largest commands, and standard deviation of samples. (k,) each"""
     airframe, level = sim.airframe, sim.control
     mass = float(airframe.value("rigid_body.mass", ()))
     low = airframe.n_rotors * float(airframe.value("rotors.thrust_min", ()))

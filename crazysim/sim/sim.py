@@ -69,12 +69,12 @@ class Sim:
     ``data`` holds everything that changes, ``step_pipeline`` and ``reset_pipeline`` the stages that change it, ``spec``
     the scene. Physics does not depend on the scene, which is updated lazily, when contacts or images are requested.
 
-    Threads may share a simulation: calls that change its data follow each other.
+    Threads may share a simulation: a lock lets only one call at a time change its data.
     """
 
     lock: threading.RLock
-    """Lock that these calls take. A thread holds it to change data that another one steps: ``with sim.lock: sim.data =
-    load.release(sim.data)``."""
+    """Lock held by calls that change data. Hold it to change data that another thread steps: ``with sim.lock:
+    sim.data = load.release(sim.data)``."""
     plugins: PluginRegistry
     """The plugins by name, in the order in which they were added."""
 
@@ -138,8 +138,9 @@ class Sim:
                 Short for its sensors and itself at the head of ``plugins``.
             aero: ``"identified"`` for the forces and torques that were identified from flights of the airframes; None
                 for the model alone. Short for ``Residual()`` at the head of ``plugins``.
-            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. One that begins
-                where the drones are, such as a load, is added when they are in place.
+            plugins: Plugins, such as ``Wind`` and ``IMU``, which are added in this order as by ``add``. A
+                plugin whose initial state depends on the drones' poses, such as a load, should be added by ``add``
+                when they are in place.
         """
         rates = {
             Control.state: state_freq,
@@ -301,7 +302,7 @@ class Sim:
         return self.data
 
     def build_default_data(self) -> SimData:
-        """Make the data as it is now the data that resets return to, and return it."""
+        """Make the present data the data that resets return to, and return it."""
         self.default_data = self.data
         return self.default_data
 
@@ -357,7 +358,7 @@ class Sim:
 
     # Commands ---------------------------------------------------------------------------------------------------------
 
-    # A command moves nothing, so the scene stays as fresh as it was. All methods have the arguments and errors of
+    # A command moves nothing, so it does not make the scene stale. All methods have the arguments and errors of
     # ``crazysim.core.functional.state_control``.
 
     @property
@@ -506,9 +507,9 @@ class Sim:
         return records
 
     def explain(self, measure: bool = False) -> str:
-        """Return in a few lines which engine runs the step, which stages it fuses, and which it does not and why.
+        """Return in a few lines which engine runs the step, which stages it fuses, and why it does not fuse others.
 
-        A line follows on the rays of all worlds that were cast last, for images or for many movable objects.
+        A last line says how rays of all worlds were cast last, if any: for images or for many movable objects.
 
         Args:
             measure: True to measure the cost of stages that are not fused, which compiles a second step.
@@ -554,7 +555,7 @@ class Sim:
 
     @property
     def mjx_data(self) -> mjx.Data:
-        """The scene's state in every world at its last sync; made when first read, and returned as it is.
+        """The scene's state in every world at its last sync; created on first read, and returned without a sync.
 
         Assigning to it makes the scene stale. Poses of bodies other than drones, ``mocap_pos`` and ``mocap_quat``,
         must be one per world and finite, or it raises a ValueError.
@@ -568,7 +569,7 @@ class Sim:
 
     @property
     def max_geom_pairs(self) -> int:
-        """Most pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all."""
+        """Largest number of pairs that MJX checks per kind of collision, from the next ``build_mjx`` on; -1 for all."""
         return self._scene.max_geom_pairs
 
     @max_geom_pairs.setter
@@ -582,7 +583,7 @@ class Sim:
 
     @property
     def max_visual_geom(self) -> int:
-        """Most overlays of one image."""
+        """Largest number of overlays in one image."""
         return self._scene.renderer.max_visual_geom
 
     @max_visual_geom.setter
@@ -622,8 +623,8 @@ class Sim:
     def contacts(self, body: str | None = None) -> Array:
         """Return which contact slots touch, after a sync if anything has changed.
 
-        A slot is a pair of geoms that may touch; ``mj_model`` and MJX decide which pair it is. From 64 drones a world
-        on MJX keeps only ``max_geom_pairs`` pairs, the nearest; set it to -1 and call ``build_mjx`` for all.
+        A slot is a pair of geoms that may touch; ``mj_model`` and MJX decide which pair it is. With 64 or more
+        drones per world MJX keeps only the nearest ``max_geom_pairs``; set it to -1 and call ``build_mjx`` for all.
 
         Args:
             body: Name of a body, such as ``"drone:0"``, to which a slot must belong; None for all.
@@ -696,7 +697,7 @@ class Sim:
             self.plugins.draw(world)
             return self._scene.render(mode, camera, cam_config, width, height)
         except Exception:
-            self.overlays.restore(before)  # without what plugins have drawn, which draw again for the next image
+            self.overlays.restore(before)  # plugins draw again for the next image
             raise
 
     def close(self) -> None:
