@@ -18,8 +18,8 @@ from crazysim.pytree import leaf_flags, leaf_indices, scopes
 class PackCache:
     """Shared parameters concatenated to one array, which is made again only after one of them was replaced.
 
-    On a CPU the first array is made without a compiled program, which would take 20 ms for each set of shapes; most
-    simulations need no second array. Those are made by a program, in a sixth of the time.
+    On a CPU the first array is made by NumPy: compiling a program would take 20 ms for each set of shapes, and most
+    simulations need no second array. Later arrays are made by a compiled program, in a sixth of the time.
     """
 
     def __init__(self) -> None:
@@ -37,13 +37,13 @@ class PackCache:
 
 
 def _on_one_cpu(arrays: list[Any]) -> bool:
-    """Return True if all arrays are on one device, and that is a processor of the host."""
+    """Return True if all arrays are on the same device, and it is a CPU."""
     devices = {device for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
     return len(devices) <= 1 and all(device.platform == "cpu" for device in devices)
 
 
 def _pack_arrays(arrays: list[Any]) -> Array:
-    """Return arrays of one device as one there, committed if one of them is."""
+    """Concatenate arrays of one device to an array on it, which is committed if one of them is."""
     committed = next((x.sharding for x in arrays if isinstance(x, jax.Array) and x.committed), None)
     return jax.device_put(np.concatenate([np.ravel(x) for x in arrays]), committed)
 

@@ -34,7 +34,7 @@ MAX_SHARED_BYTES = 1 << 16
 class HostLeaves:
     """Leaves of a simulation at one moment: JAX arrays, commands on the host, or results of a kernel.
 
-    An index gives a leaf as an JAX array, which is made once.
+    Indexing returns a leaf as a JAX array, which is made once.
     """
 
     __slots__ = ("_made", "_sharding", "_views", "addresses", "items")
@@ -43,7 +43,7 @@ class HostLeaves:
         """Store leaves.
 
         Args:
-            items: Arrays of JAX or NumPy, and for each leaf that the last call wrote its ``CallResults``.
+            items: For each leaf a JAX or NumPy array, or the ``CallResults`` of the call that wrote it.
             addresses: Address of each leaf that kernels read.
             views: Views that keep the memory of JAX arrays.
             sharding: Device on which JAX arrays are made.
@@ -58,11 +58,11 @@ class HostLeaves:
         if i not in self._made:
             self._made.setdefault(
                 i, jaxcompat.put_host_array(self.array(i), self._sharding)
-            )  # another thread may read it too
+            )  # another thread may make the same array: the first one stays
         return self._made[i]
 
     def array(self, i: int) -> NDArray:
-        """Return a leaf as an array of NumPy, which must not be written into."""
+        """Return a leaf as a NumPy array, which must not be written to."""
         x = self.items[i]
         return x.array(i) if isinstance(x, CallResults) else np.asarray(x)
 
@@ -72,7 +72,7 @@ class HostLeaves:
         return self.replace_items(numbers, arrays, [_address(x) for x in arrays])
 
     def replace_items(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
-        """Return the leaves with some replaced."""
+        """Return the leaves with some replaced by items with known addresses."""
         new = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
         for i, x, address in zip(numbers, items, addresses, strict=True):
             new.items[i], new.addresses[i] = x, address
@@ -80,7 +80,7 @@ class HostLeaves:
 
 
 def _address(x: NDArray) -> int:
-    """Return where the numbers of an array begin; ``ctypes.data`` in a third of the time where they can be changed."""
+    """Return the address of the data of an array; for a writable array in a third of the time of ``ctypes.data``."""
     return ctypes.addressof(ctypes.c_char.from_buffer(x)) if x.flags.writeable else x.ctypes.data  # type: ignore[arg-type]
 
 
@@ -135,7 +135,7 @@ class CallResults:
 
 
 class _Launch(NamedTuple):
-    """Call of one kernel."""
+    """Call of a kernel, prepared."""
 
     kernel: Any
     """The kernel, from ``HostLaunch.on_memory``."""
@@ -146,20 +146,20 @@ class _Launch(NamedTuple):
     outputs: slice
     """Its results among the results of all kernels."""
     packed: struct.Struct
-    """Form of the addresses of both."""
+    """Format in which the addresses of inputs and outputs are packed."""
 
 
 class HostCall:
-    """Steps of a plan, by one kernel of the host for each of its programs."""
+    """Function that runs the steps of a plan: one host kernel for each of its programs."""
 
     def __init__(self, kernels: Sequence[Kernels], owned: Sequence[Any], leaves: Sequence[Any], nonfinite: int):
         """Plan the memory and the calls of some kernels.
 
         Args:
-            kernels: Kernels of the programs, all of which can be called so (``is_possible``).
-            owned: Leaves whose new values are taken from each program; None for all.
+            kernels: Kernels of the programs, for which ``is_possible`` holds.
+            owned: For each program the leaves whose new values are taken from it; None for all.
             leaves: Leaves of the data, for their shapes and types.
-            nonfinite: Leaf with the worlds that are flagged.
+            nonfinite: Index of the leaf with the flags of worlds, ``core.nonfinite``.
         """
         self.used = False
         """True once it has been called."""
@@ -180,7 +180,7 @@ class HostCall:
                 _Launch(kernel.on("cpu").on_memory(), n_worlds * n_drones, kernel.inputs, outputs, form)
             )
         self._flags = [key for key, _, _ in results if isinstance(key, tuple) and key[0] == "flags"]
-        if self._flags == [("flags", 0)] and results[-1][1][1] == 1:  # they are the leaf
+        if self._flags == [("flags", 0)] and results[-1][1][1] == 1:  # the flags are the leaf
             results[-1] = (nonfinite, *results[-1][1:])
             self._flags = []
         self._layout = _Layout(results)
@@ -203,7 +203,7 @@ class HostCall:
         return HostLeaves(items, addresses, views, sharding)
 
     def _view(self, i: int, x: Any) -> NDArray:
-        """Return a view of a JAX array once it is computed. The view of the same array is kept."""
+        """Return a NumPy view of a JAX array, after waiting for it. The last view of each leaf is cached."""
         entry = self._held.get(i)
         if entry is None or entry[0] is not x:
             numbers = jax.random.key_data(x) if jaxcompat.is_key(x) else x
@@ -229,7 +229,7 @@ class HostCall:
 def is_possible(kernels: Sequence[Kernels]) -> bool:
     """Return whether kernels can be called without XLA.
 
-    Each checks its results and writes them into memory of their own; none writes random keys.
+    Each must check its results and write them into new memory, not into rows in place. None may write random keys.
     """
     return not jaxcompat.FALLBACKS and all(
         kernel.program.check is not None

@@ -26,7 +26,7 @@ Function = Callable[..., Sequence[Array]]
 
 
 class MapKernels:
-    """Kernels of one function: one for the platform that it is made for, and others when JAX lowers it there."""
+    """Kernels of one function: one for the given platform, and others that are compiled when JAX first needs them."""
 
     def __init__(self, block: Block, platform: str):
         """Compile the kernel for a platform.
@@ -65,13 +65,13 @@ def _launch(platform: str, *tables: Array, kernels: MapKernels, n: int) -> list[
 map_p = jaxcompat.primitive_by_platform(
     "crazysim_map", _results, {"cpu": partial(_launch, "cpu"), "cuda": partial(_launch, "gpu")}
 )
-"""Call of a kernel: its tables, to its results for all indices."""
+"""Call of a kernel: from its tables to its results for all indices."""
 
 
 def map_indices(fn: Function, n: int, tables: Sequence[Array], platform: str | None) -> list[Array]:
     """Return the results of a function for the indices 0 to ``n - 1``. (n,) each
 
-    It has no derivative. Under ``vmap`` one call follows the other.
+    It has no derivative. Under ``vmap`` the kernel is called for one batch at a time.
 
     Args:
         fn: The function.
@@ -98,7 +98,7 @@ def map_indices(fn: Function, n: int, tables: Sequence[Array], platform: str | N
 
 
 def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
-    """Return the block of a function of an index and tables; its inputs are these.
+    """Return the block of a function of an index and tables; its inputs are the index and the tables.
 
     Args:
         fn: The function.
@@ -113,7 +113,7 @@ def lower_map(fn: Function, tables: Sequence[Any]) -> Block:
 
 
 def write_map(block: Block, target: str) -> Kernel:
-    """Return the source of a function of an index and tables for ``cuda`` or ``host``; each lane has an index.
+    """Return the kernel of a function of an index and tables for ``cuda`` or ``host``; each lane computes one index.
 
     Args:
         block: The function: its inputs are the index and the tables, its outputs single numbers.

@@ -1,4 +1,4 @@
-"""The passes that make of a lowered program the one that a backend runs, in order."""
+"""The passes that turn a lowered program into the program that a backend runs, in order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from crazysim.engine.passes.schedule import fuse, hoist, join_ticks
 Pass = Callable[[Program], Program]
 
 VERIFY_VARIABLE = "CRAZYSIM_VERIFY"
-"""Environment variable that, set to 1, has every program verified after every pass."""
+"""Environment variable; if it is 1, every program is verified after every pass."""
 
 
 def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = None, pack: bool = True) -> Program:
@@ -23,8 +23,9 @@ def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = N
 
     Args:
         program: The program, from ``lower_stages``.
-        rows: From the written leaves to the leaves that are stored as rows, each of one number of all drones.
-        pack: True to read shared numbers from one leaf.
+        rows: Function from the written leaves to the leaves to store as rows, each row with one number of all drones.
+            None for no rows.
+        pack: True to pack shared numbers in one leaf.
     """
     passes: list[Pass] = [fuse, join_ticks, hoist, *([pack_shared] if pack else [])]
     if rows is not None:
@@ -34,7 +35,7 @@ def optimise(program: Program, rows: Callable[[list[int]], list[int]] | None = N
 
 
 def apply(program: Program, passes: Iterable[Pass]) -> Program:
-    """Return a program after some passes, verified and dumped after each where the environment variables say so."""
+    """Apply passes to a program, and verify and dump it after each pass if the environment variables are set."""
     _inspect(program, "lowered")
     for compiler_pass in passes:
         program = compiler_pass(program)

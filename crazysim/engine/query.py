@@ -22,8 +22,8 @@ RECORD_NAME = "results"
 """Name of the results in ``data.plugins`` while the kernel runs."""
 
 Query = tuple[Literal["drone", "world"], Callable[[SimData], Any]]
-"""Scope of a function, and the function: from data of one drone to any tree of arrays, or from data of one world to a
-tree of arrays with its drones in front."""
+"""Scope of a function, and the function. It maps data of one drone to any tree of arrays, or data of one world to a
+tree of arrays with a leading axis for its drones."""
 
 
 class QueryResults(PyTree):

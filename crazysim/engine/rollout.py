@@ -19,9 +19,9 @@ from crazysim.progress import progress_bar
 from crazysim.pytree import leaf_indices
 
 Policy = Callable[[Any, SimData], Any]
-"""Parameters and data to a command for every drone. (n_worlds, n_drones, k)"""
+"""Function from parameters and data to a command for every drone, (n_worlds, n_drones, k)."""
 Keep = Callable[[SimData], Any]
-"""Data to the part of it to record: any tree of arrays."""
+"""Function from data to the arrays to record: any tree of arrays."""
 
 
 def states_of(data: SimData) -> Any:
@@ -40,10 +40,11 @@ def rollout(
     every: int = 1,
     zeros: Zeros | None = None,
 ) -> tuple[SimData, Any]:
-    """Return the data after some control steps, and the record of them.
+    """Return the data after some control steps, and the records of these steps.
 
-    A control step evaluates the policy, stages its command, and takes ``n_substeps`` physics steps. Pure: for use
-    inside jit, vmap and grad. Leaves that no step writes, parameters above all, are constants of the loop.
+    A control step evaluates the policy, stages its command, and takes ``n_substeps`` physics steps. The function is
+    pure and can be used inside jit, vmap and grad. Leaves that no step writes, mainly parameters, are constants of the
+    loop.
 
     Args:
         step: From ``sim.build_step_fn()``.
@@ -53,11 +54,11 @@ def rollout(
         n_control_steps: Number of control steps; a multiple of ``every``.
         n_substeps: Physics steps of a control step.
         keep: ``keep(data)`` returns what to record after a control step.
-        every: Control steps from one record to the next.
+        every: Number of control steps from one record to the next.
         zeros: Result of ``step.zeros(data)`` from before ``data`` was traced.
 
     Returns:
-        The data, and the records with time in front. (n_control_steps // every, ...)
+        The data, and the records with a leading time axis. (n_control_steps // every, ...)
     """
     n_control_steps = positive_integer("n_control_steps", n_control_steps)
     n_substeps, every = positive_integer("n_substeps", n_substeps), positive_integer("every", every)
@@ -98,9 +99,9 @@ def run(
     every: int = 1,
     **settings: Any,
 ) -> tuple[SimData, Any]:
-    """Return the results of ``rollout``, compiled; with ``progress`` in pieces, and a bar on the terminal.
+    """Return the results of ``rollout``, compiled; with ``progress``, run it in pieces and show a progress bar.
 
-    No buffer is taken from the caller.
+    The caller's buffers are not donated.
     """
     zeros = step.zeros(data)
     if not progress:

@@ -1,4 +1,4 @@
-"""The step of a simulation as a pure function: a pipeline, run by the engine that was chosen or by the fastest."""
+"""The step of a simulation as a pure function: a pipeline, run by the chosen engine, or by the fastest."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from crazysim.pytree import check_axes, lazy_record, replace_leaves
 
 
 class FlatData:
-    """``SimData`` as a list of arrays with the plan that steps it; steps in a row need no record between them."""
+    """``SimData`` as a list of arrays, with the plan that steps it. Successive steps need no record between them."""
 
     __slots__ = ("_record", "leaves", "plan")
 
@@ -45,7 +45,7 @@ class FlatData:
         return data is self._record
 
     def data(self) -> SimData:
-        """Return the data as a record, which is made once, and whose fields are made when they are read."""
+        """Return the data as a record, which is made once. Its fields are computed when they are read."""
         record = self._record
         if record is None:
             # Without a reference to this object, so that no cycle keeps arrays in memory.
@@ -63,11 +63,11 @@ class FlatData:
         return FlatData(replace_leaves(self.leaves, numbers, values), self.plan)
 
     def stage_command(self, reference: SimData, command: Any, feedforward: Any = None) -> FlatData:
-        """Return the data with a command that was checked, as ``crazysim.core.functional.stage_command`` does.
+        """Return the data with a checked command, as ``crazysim.core.functional.stage_command`` does.
 
         Args:
             reference: The data, or its shapes and devices.
-            command: Command, which nothing writes into any more. (n_worlds, n_drones, k)
+            command: Command, which must not be changed afterwards. (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
         """
         numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
@@ -75,7 +75,7 @@ class FlatData:
         return self.replace(numbers, [x if on_host else put_command(reference, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
-        """Return the arguments of the compiled step besides the number of steps."""
+        """Return the arguments of the compiled step other than the number of steps."""
         return [self.leaves[i] for i in self.plan.inputs]
 
 
@@ -97,8 +97,8 @@ jax.tree_util.register_pytree_node(
 class Step:
     """``step(data, n_steps=1) -> data``, pure: usable inside jit, vmap, grad and scan.
 
-    ``n_steps`` as an array: one compilation serves every number. As a Python number: the loop can be differentiated
-    in reverse.
+    If ``n_steps`` is an array, one compilation serves every number of steps. If it is a Python integer, the loop can be
+    differentiated in reverse mode.
 
     Data is stepped on the devices that hold it. Under a trace these are unknown, and the step runs on the devices that
     it was built for.
@@ -114,7 +114,7 @@ class Step:
         device: jax.Device | None = None,
         strict: bool = False,
     ):
-        """Create the step of the stages as they are now.
+        """Create the step of the stages that the pipeline has now.
 
         Args:
             pipeline: The stages.
@@ -122,7 +122,7 @@ class Step:
             platform: ``"cpu"`` or ``"gpu"``.
             mesh: Devices that the worlds are spread over.
             device: Device that it runs on; None for any of the platform.
-            strict: True to raise an error where a slower engine would be taken with an ``EngineWarning``.
+            strict: True to raise an error instead of an ``EngineWarning`` and the use of a slower engine.
 
         Raises:
             ConfigError: If the engine cannot run here.
@@ -164,7 +164,7 @@ class Step:
             data: The simulation.
             n_steps: Number of steps, an integer of at least 0, or an array of one. ()
             zeros: Result of ``zeros`` for this data before it was traced. Under a trace the values of parameters are
-                unknown, and the step computes with zeros as with any other number.
+                unknown, and no terms are left out.
         """
         _check_steps(n_steps)
         leaves, treedef = jax.tree.flatten(data)
@@ -183,9 +183,9 @@ class Step:
         Args:
             data: The simulation.
             zeros: As in ``__call__``.
-            n_steps: A number of steps of the kind that will be taken; None for an array.
-            separate: Leaves that stay arrays of their own where others that a call writes become rows, which is faster
-                in loops over calls; None for no rows.
+            n_steps: A number of steps with the type that ``advance`` will get; None for an array.
+            separate: Leaves that remain separate arrays. The other leaves that a call writes are stored as rows, which
+                is faster in loops over calls. None for no rows.
         """
         return self._flat(data, *jax.tree.flatten(data), zeros, n_steps, separate)
 
@@ -216,7 +216,7 @@ class Step:
         return FlatData(leaves, plan)
 
     def advance_on_host(self, flat: FlatData, n_steps: int) -> FlatData:
-        """Return the same without XLA, for data whose plan has a ``host_call``; it waits until the steps are taken."""
+        """Return the data some steps later, without XLA; the plan must have a ``host_call``. Wait for the steps."""
         plan, leaves = flat.plan, flat.leaves
         call: Any = plan.host_call
         if not isinstance(leaves, HostLeaves):
@@ -226,7 +226,7 @@ class Step:
         return FlatData(after, plan)
 
     def plan(self, data: SimData, zeros: Zeros | None = None) -> Plan:
-        """Return how this data is stepped."""
+        """Return the plan that steps this data."""
         leaves, treedef = jax.tree.flatten(data)
         return self._plan(data, leaves, treedef, zeros)
 
@@ -243,7 +243,7 @@ class Step:
 
     @property
     def programs(self) -> list[Program]:
-        """Programs that it has been planned with so far, for data of any structure."""
+        """Programs of all plans so far, for data of any structure."""
         return [program for plan in self._plans.values() for program in plan.programs]
 
     @property
@@ -265,7 +265,7 @@ class Step:
         return [*replace_leaves(leaves, in_rows, [None] * len(in_rows)), *packed, *rows]
 
     def _false(self, before: Any) -> Any:
-        """Return a flag that is false, on the devices of the flag before; the same array again costs no call."""
+        """Return a false flag on the devices of the previous flag; the last such flag is returned again if possible."""
         if before is self._unsynced:
             return before
         traced = isinstance(before, jax.core.Tracer)
@@ -304,7 +304,7 @@ class Step:
         return plan
 
     def _elsewhere(self, x: Any) -> Location | None:
-        """Return where an array is, if that is not where the step was built for and is known."""
+        """Return the location of an array; None if it is unknown, or the one that the step was built for."""
         sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
         if sharding is None or sharding is self._at_home:
             return None

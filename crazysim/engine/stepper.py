@@ -25,7 +25,7 @@ ANNOUNCED_AFTER = 5.0
 
 
 class Stepper:
-    """Data that advances: flattened from step to step, and as a record where it is read.
+    """Data that is advanced in place: flattened between steps, and returned as a record when it is read.
 
     ``step`` is the pure function that advances it.
     """
@@ -34,11 +34,11 @@ class Stepper:
     """The compiled step, from ``build``."""
 
     def __init__(self, device: jax.Device, mesh: Mesh | None, engine: str, strict: bool):
-        """Set where data is held, and the engine of its steps; ``assign`` and ``build`` give it data and a step.
+        """Create a stepper without data and step, which ``assign`` and ``build`` set.
 
         Args:
             device: Device of the data.
-            mesh: Devices to spread it over instead; None for the one.
+            mesh: Devices to distribute the data over instead; None to hold it on ``device``.
             engine: One of ``crazysim.engine.ENGINES``.
             strict: As for ``Step``.
         """
@@ -79,7 +79,7 @@ class Stepper:
         """Stage a command that was checked with ``data_or_shapes``; flattened data stays flattened.
 
         Args:
-            command: Command in the units of the command level, which nothing writes into any more.
+            command: Command in the units of the command level, which must not be changed afterwards.
                 (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for the default of ``crazysim.core.functional.stage_command``.
         """
@@ -95,14 +95,14 @@ class Stepper:
     def synced(self) -> bool:
         """True if the scene matches the data: a sync has set ``core.mjx_synced`` since the data last changed.
 
-        The flag is compared by identity with the one that is known to be false, which never waits for the device.
+        The flag is compared by identity with an array that is known to be false, so that it never waits for the device.
         """
         data = self._data
         flag = data.leaves[data.plan.synced] if isinstance(data, FlatData) else self.data.core.mjx_synced
         return flag is not self._unsynced
 
     def assign(self, data: SimData) -> None:
-        """Replace the data by data from outside: put it on the device, and clear ``core.mjx_synced``."""
+        """Replace the data by data of the caller: put it on the device, and clear ``core.mjx_synced``."""
         if self._data is None or data.core.steps is not self.data.core.steps:
             self._most_steps = None
         if data.core.mjx_synced is not self._unsynced:
@@ -124,7 +124,7 @@ class Stepper:
 
     def build(self, pipeline: Pipeline) -> Step:
         """Make the step of a pipeline, use it from now on, and return it."""
-        self._data = self.data  # it may be flattened for the step before
+        self._data = self.data  # it may be flattened for the previous step
         self.step = Step(pipeline, self.engine, self.device.platform, self.mesh, device=self.device, strict=self.strict)
         return self.step
 
@@ -153,7 +153,7 @@ class Stepper:
         n_steps *= times
         if self._most_steps is None or self._most_steps + n_steps > MAX_STEPS:
             steps = self.data.core.steps
-            if self._counted[0] is not steps:  # the same start may be assigned again and again
+            if self._counted[0] is not steps:  # the same data may be assigned repeatedly
                 self._counted = steps, int(np.asarray(steps).max())  # waits for the device, so not in every call
             self._most_steps = self._counted[1]
         if self._most_steps + n_steps > MAX_STEPS:
@@ -165,7 +165,7 @@ class Stepper:
         self._most_steps += n_steps
 
     def _as_array(self, n_steps: int) -> Array:
-        """Return a number of steps as an array; making one costs more than a step, so they are kept."""
+        """Return a number of steps as an array; arrays are cached, because making one takes longer than a step."""
         if n_steps not in self._counts:
             with jax.default_device(self.device):
                 self._counts[n_steps] = jnp.int32(n_steps)

@@ -1,8 +1,8 @@
 """Kernels on NVIDIA GPUs: CUDA source compiled by NVRTC, launched by XLA itself.
 
-NVRTC comes with JAX's CUDA packages. The PTX that it makes is part of the compiled step, as a custom call of XLA
-(``PTX_TARGET``), which hands it to the driver, so JAX's own cache never finds a kernel for another GPU. Kernels need no
-other package, no compiler on the machine, and no Python at run time.
+NVRTC comes with JAX's CUDA packages. Its PTX is part of the compiled step, in a custom call (``PTX_TARGET``) with which
+XLA hands it to the driver, so JAX's compilation cache never returns a kernel for another GPU. Kernels need no other
+package, no compiler on the machine, and no Python at run time.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ PTX_TARGET = "__gpu$xla.gpu.ptx"
 
 NVRTC_OPTIONS = ("--std=c++17", "--fmad=true", "--prec-div=false", "--prec-sqrt=false",
                  "--device-as-default-execution-space")  # fmt: skip
-"""Division and square root to 2 and 1 units in the last place, as XLA has them; no other shortcut."""
+"""Division and square root are accurate to 2 and 1 units in the last place, as in XLA; nothing else is approximated."""
 
 THREADS_TO_TRY = (512, 384)
-"""Numbers of threads of a multiprocessor to try, the most first: they leave 128 or 168 registers to each thread."""
+"""Threads on a multiprocessor to try, the larger number first: they leave 128 or 168 registers to each thread."""
 
 LARGE_KERNEL_THREADS = 256
 """Threads per block for kernels larger than the instruction cache, from ``RESIDENT_LANES`` lanes on. The threads of a
@@ -49,10 +49,10 @@ INSTRUCTION_CACHE_BYTES = 96 * 2**10
 """Size of a compiled kernel from which it exceeds the instruction cache of a multiprocessor; measured on an H100."""
 
 MAX_GRADIENT_MEMORY_BYTES = 2**30
-"""Most memory for the stored states of the steps that a gradient goes back through at once."""
+"""Maximum memory for the states that the kernel of a gradient stores, bytes."""
 
 RESIDENT_LANES = 2**16
-"""Most lanes that run at once, on a GPU of 132 multiprocessors; a gradient has memory for as many."""
+"""Maximum number of lanes that run at once on a GPU with 132 multiprocessors; gradients get memory for as many."""
 
 DEFAULT_ARCHITECTURE = "compute_90"
 """Architecture to compile for on a machine without a GPU."""
@@ -124,7 +124,8 @@ def _launching_handler() -> str:
 def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.ndarray, list[jax.ShapeDtypeStruct]]:
     """Return the number of blocks of a kernel that stores states, its numbers of steps, and the memory that it needs.
 
-    Where that would exceed ``MAX_GRADIENT_MEMORY_BYTES``, fewer blocks each compute several blocks of lanes in turn.
+    If the memory would exceed ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, which each process several groups
+    of lanes in turn.
     """
     here = interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.kept, MAX_GRADIENT_MEMORY_BYTES)
     n_states = here + max(-(-n_steps // here), 1)
@@ -136,7 +137,7 @@ def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.nd
 
 
 def weakest_device(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:
-    """Return the GPU of the lowest compute capability, whose code runs on all; None without a GPU.
+    """Return the GPU with the lowest compute capability, whose code runs on all of them; None without a GPU.
 
     Args:
         devices: GPUs to choose from; None for the GPUs of this machine.
@@ -157,9 +158,9 @@ def architecture(device: jax.Device | None) -> str:
 
 @functools.cache
 def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
-    """Return a kernel with as many blocks at once on a multiprocessor as its registers allow without spilling.
+    """Return a kernel with as many blocks at once on a multiprocessor as possible with almost no spilled registers.
 
-    More blocks hide more latency, until registers that no longer fit cost more than that.
+    More blocks hide more latency, but leave fewer registers to each thread. Spilled variables soon cost more time.
     """
     numbers = dict.fromkeys(n // kernel.threads for n in THREADS_TO_TRY if n > kernel.threads)
     candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
@@ -243,7 +244,7 @@ def nvrtc() -> ctypes.CDLL | None:
 
 
 def _compile(source: str, arch: str, kind: str) -> bytes:
-    """Return what NVRTC makes of a source, from the cache of kernels if it is there.
+    """Return the compiled image of a source, from the cache of kernels or from NVRTC.
 
     Args:
         source: The source.
@@ -268,7 +269,7 @@ def _compile(source: str, arch: str, kind: str) -> bytes:
 
 
 def _run(library: ctypes.CDLL, source: str, arch: str, kind: str) -> bytes:
-    """Return what NVRTC makes of a source."""
+    """Compile a source by NVRTC, and return the image."""
     program = ctypes.c_void_p()
     library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"advance.cu", 0, None, None)
     try:

@@ -54,8 +54,8 @@ class DerivativeKernels:
     def forward(self, changing: tuple[int, ...], platform: str) -> Callable[..., list[Array]] | None:
         """Return the kernel of the steps and the tangents of some leaves; None where there is none.
 
-        It takes all leaves, tangents by leaf, the number of steps, the number of batches, and shapes and types of the
-        tangents after the steps, which it returns.
+        It takes all leaves, tangents by leaf, the number of steps, the number of batches, and the shapes and types of
+        the tangents after the steps. It returns these tangents.
         """
         compiled = self._compile("jvp", add_tangents, kernel.write, changing, platform)
         return None if compiled is None else partial(_forward, self, *compiled)
@@ -64,7 +64,7 @@ class DerivativeKernels:
         """Return the kernel that computes the cotangents of some leaves; None where there is none.
 
         It takes all leaves, cotangents of the floats that are written, the number of steps and the number of batches,
-        and returns cotangents by leaf, of a leaf that drones share one for each batch.
+        and returns cotangents by leaf. The cotangent of a leaf that all drones share has one row for each batch.
         """
         compiled = self._compile("gradient", reverse.reverse_program, reverse.write, changing, platform)
         return None if compiled is None else partial(_reverse, self, *compiled)
@@ -120,7 +120,7 @@ def _forward(
     n_worlds, n_drones = lanes.batch_counts(kernels.program, list(values))
 
     def broadcast_tangent(i: int, x: Array) -> Array:
-        """Return the tangent of a leaf, of one that all drones share for each world."""
+        """Return the tangent of a leaf, repeated for each world if all drones share the leaf."""
         if kernels.is_own(i):
             return x
         return jnp.broadcast_to(x[:, None, None], (size, n_worlds // size, 1, *x.shape[1:])).reshape(
@@ -158,7 +158,7 @@ def _reverse(
     sums_of_lanes = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
 
     def sum_cotangent(i: int, x: Array) -> Array:
-        """Return the cotangent of a leaf: of one that drones share the sum over them."""
+        """Return the cotangent of a leaf, summed over the drones that share it."""
         if program.leaves[i].scope == "world":
             return jnp.sum(x, axis=1)
         return x if kernels.is_own(i) else jnp.sum(x.reshape(size, n_worlds * n_drones // size, -1), axis=1)

@@ -1,7 +1,7 @@
 """Derivatives of the steps of a kernel for JAX: primitives with rules for derivatives, transposes and vmap.
 
-The tangents after some steps are a primitive that is linear in the tangents before them, and its transpose is another
-one. Either becomes a kernel of the platform that JAX lowers it for, or the same program on lanes where it has none.
+One primitive computes the tangents after some steps, and is linear in the tangents before them. Its transpose is
+another primitive. JAX lowers each to a kernel of the platform, or to the program on lanes if there is no such kernel.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ CountedRun = Callable[[list[Any], Array], tuple[list[Any], Array]]
 
 
 def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels | None = None) -> Run:
-    """Return a function that runs a program, with its derivatives.
+    """Return a differentiable function that runs a program.
 
     Args:
-        run: The function.
-        other: The same function with derivatives: the program on lanes, taken for a number of steps that is an array.
-        kernels: Kernels of the derivatives; None for the derivatives of ``other``.
+        run: Function that runs the program.
+        other: The program on lanes, which JAX can differentiate. Used without ``kernels``, and if the number of steps
+            is an array.
+        kernels: Kernels of the derivatives; None to differentiate ``other``.
     """
 
     def steps(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -66,21 +67,21 @@ def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels 
 
             return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
-        forward.defjvp(derivative, symbolic_zeros=True)  # constant leaves have no derivative to be computed
+        forward.defjvp(derivative, symbolic_zeros=True)  # to skip the tangents of constant leaves
         return forward(leaves, jnp.asarray(n_steps, jnp.int32))
 
     return steps
 
 
 def _float0_zeros(x: Any) -> np.ndarray:
-    """Return the tangent of an array that is not of floats."""
+    """Return the tangent of an array whose type is not floating-point."""
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
 class Case(NamedTuple):
     """Derivative of a program: static parameters of the primitives.
 
-    The operands are the leaves that are given, then the tangents of ``changing``, or the cotangents of the floats that
+    The operands are the leaves in ``present``, then the tangents of ``changing``, or the cotangents of the floats that
     are written. Under ``vmap`` arrays of drones or worlds hold ``size`` batches of worlds, one after another; tangents
     and cotangents of shared leaves have a leading axis for the batches. (size, ...)
     """
@@ -112,7 +113,7 @@ class Case(NamedTuple):
 
     def over_batches(self, fn: Callable[..., list[Array]], args: Sequence[Any], linear: Sequence[int],
                      results: Sequence[int]) -> list[Array]:  # fmt: skip
-        """Return the results for all batches of a function of the leaves and the linear operands of one batch."""
+        """Apply a function of the leaves and linear operands of one batch to all batches, and return the results."""
         leaves_batched, linear_batched = self.is_own(self.present), self.is_own(linear)
 
         def split(x: Any) -> Any:
@@ -190,8 +191,8 @@ def _cotangents(platform: str, *args: Any, case: Case) -> list[Array]:
 def _transpose(fixed: Sequence[Any], seeds: Sequence[Any], case: Case, **params: Any) -> list[Array]:
     del params
     kernels = case.kernels
-    if not kernels.program.fused:  # its stages may have effects, such as printing, that a primitive has not
-        kernels.reverse(case.changing, kernels.location.platform)  # has none, and notes the reason
+    if not kernels.program.fused:  # unfused stages may have effects, such as printing, which a primitive cannot have
+        kernels.reverse(case.changing, kernels.location.platform)  # returns None, and records the reason
         return _cotangents_on_lanes(*fixed, *seeds, case=case)
     return cotangent_p.bind(*fixed, *seeds, case=case)
 
@@ -203,10 +204,10 @@ def _floats_after(case: Case, values: Sequence[Any], changed: Sequence[Any]) -> 
 
 
 def _batched(primitive: Any, n: int, args: Sequence[Any], batched: Sequence[bool], case: Case, **params: Any) -> Any:
-    """Return the results of a primitive for ``n`` batches, which are one call for more worlds."""
+    """Return the results of a primitive for ``n`` batches: one call for more worlds, if parameters do not differ."""
     n_fixed = len(case.present)
     is_own = [*case.is_own(case.present), *(True for _ in args[n_fixed:])]
-    if any(b and not o for b, o in zip(batched, is_own, strict=True)):  # parameters that differ: one after the other
+    if any(b and not o for b, o in zip(batched, is_own, strict=True)):  # parameters differ: one batch at a time
         full = [x if b else jnp.broadcast_to(x, (n, *x.shape)) for x, b in zip(args, batched, strict=True)]
         return jax.lax.map(lambda xs: list(primitive.bind(*xs, case=case, **params)), full)
 
@@ -265,4 +266,4 @@ advance_p = jaxcompat.primitive_by_platform(
     derivative=_advance_on_lanes,
     batched=jaxcompat.vmap_rule_of(_advance),
 )
-"""Steps of a kernel inside a derivative; they are differentiated as the program on lanes."""
+"""Steps of a kernel inside a derivative; higher derivatives are those of the program on lanes."""

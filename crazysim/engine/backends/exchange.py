@@ -10,13 +10,13 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir.blocks import Value
 
 Read = Callable[[str], str]
-"""From the number of a drone in its world to the expression of its published number."""
+"""Function from the index of a drone in its world to the expression of its published number."""
 
 Published = Sequence[tuple[str, str]]
-"""Types of numbers, as they are called in the source, and their expressions."""
+"""Pairs of the name of a type in the source and the expression of a number of that type."""
 
 Live = Sequence[tuple[Value, str]]
-"""Values, and their types as they are called in the source."""
+"""Pairs of a value and the name of its type in the source."""
 
 TYPE_BYTES = {"f64": 8, "f32": 4, "i32": 4, "u32": 4, "b1": 1}
 """Sizes of numbers, bytes."""
@@ -28,13 +28,13 @@ BLOCK_SIZE = 64
 """Threads of a block on a GPU, where worlds fit into a warp."""
 
 MAX_THREADS = 1024
-"""Most threads of a block on a GPU."""
+"""Maximum number of threads of a block on a GPU."""
 
 SHARED_MEMORY_BYTES = 48 * 1024
 """Memory that the threads of a block share, bytes."""
 
 MAX_IN_VECTOR = 8
-"""Most drones of a world that are lanes of one vector of the host."""
+"""Maximum number of drones of a world that are lanes of one vector on the host."""
 
 
 class LineWriter(Protocol):
@@ -48,7 +48,7 @@ class LineWriter(Protocol):
         ...
 
     def new(self, prefix: str = ...) -> str:
-        """Return a name that nothing has."""
+        """Return an unused name."""
         ...
 
     def forget(self) -> None:
@@ -60,13 +60,13 @@ class Exchange(Protocol):
     """A way in which lanes read each other's numbers."""
 
     depth: int
-    """Blocks of source around the code of a lane."""
+    """Number of loops in the source around the code of a lane."""
 
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
-        """Write what passes numbers to the other drones of a world, and return how they are read.
+        """Write the code that passes numbers to the other drones of a world, and return functions that read them.
 
         Args:
-            writer: Takes the lines.
+            writer: Writer that the lines are added to.
             values: The numbers.
             live: Values that are defined here and used later, with their types.
             depth: Depth of the lines.
@@ -91,12 +91,12 @@ class Exchange(Protocol):
 
     @property
     def declarations(self) -> list[str]:
-        """Lines in front of the kernel."""
+        """Lines before the kernel."""
         ...
 
 
 class OneLane(Exchange):
-    """Code that is written once for a lane, whose variables hold in all of it."""
+    """Base of exchanges in which the code of a lane is not split, so that its variables stay defined."""
 
     depth = 0
 
@@ -134,7 +134,7 @@ class SharedMemory(OneLane):
     """Threads of one block of a GPU, which exchange numbers through the block's memory."""
 
     def __init__(self, lanes: int):
-        """Exchange numbers between so many lanes."""
+        """Exchange numbers between the ``lanes`` threads of a block."""
         if lanes > MAX_THREADS:
             raise UnsupportedError(f"the drones of a world read each other's numbers, up to {MAX_THREADS} on a GPU")
         self.lanes = lanes
@@ -170,7 +170,7 @@ class SharedMemory(OneLane):
 class Sweeps(Exchange):
     """Several vectors of the host for a world: each part of a step is computed for all before the next part begins.
 
-    What a part passes on to the next is in memory.
+    Numbers that later parts use are kept in memory.
     """
 
     depth = 1
@@ -210,7 +210,7 @@ class Sweeps(Exchange):
 
 
 def exchange_for(target: str, group: int) -> Exchange:
-    """Return how the drones of a world read each other's numbers on a target."""
+    """Return the way in which the drones of a world read each other's numbers on a target."""
     if target == "cuda":
         return Registers() if group <= WARP_THREADS else SharedMemory(lanes_of_block(group)[1])
     return Registers() if group <= MAX_IN_VECTOR else Sweeps()
@@ -219,8 +219,8 @@ def exchange_for(target: str, group: int) -> Exchange:
 def lanes_of_block(group: int) -> tuple[int, int]:
     """Return the number of threads of a block on a GPU, and how many of them are lanes.
 
-    Worlds of up to a warp stay in one. Larger ones fill a block: of up to 256 threads, the size that leaves the fewest
-    without a drone.
+    A world of up to ``WARP_THREADS`` drones stays in one warp. For larger worlds, a block has the size of up to 256
+    threads (more only if one world needs them) that leaves the smallest share of threads without a drone.
 
     Args:
         group: Drones of a world that read each other's numbers.

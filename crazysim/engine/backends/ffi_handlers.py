@@ -1,7 +1,7 @@
 """Handlers of XLA's foreign function interface in Python, and one that launches kernels on a GPU.
 
 XLA calls a handler with a frame of C structures (``xla/ffi/api/c_api.h``, which JAX has in ``jax.ffi.include_dir()``).
-Only members that every release of the interface so far has had are read.
+Only members that all releases of the interface so far have in common are read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _METADATA_EXTENSION, _EXECUTE_STAGE, _SCALAR, _STRING, _INTERNAL_ERROR = 1, 3, 3
 """Values of XLA_FFI_Extension_Type, XLA_FFI_ExecutionStage, XLA_FFI_AttrType (two) and XLA_FFI_Error_Code."""
 
 _BASE = [("struct_size", c_size_t), ("extension_start", c_void_p)]
-"""Members with which the structures begin."""
+"""Members at the beginning of most structures."""
 
 
 def _structure(name: str, *fields: tuple[str, Any], base: Sequence[Any] = _BASE) -> Any:
@@ -107,14 +107,14 @@ def register(name: str, platform: str, run: Callable[[Call], None]) -> None:
 
     Args:
         name: Name of the target.
-        platform: Platform as JAX spells it here, ``"cpu"`` or ``"CUDA"``.
+        platform: Platform in the spelling of ``jax.ffi``, ``"cpu"`` or ``"CUDA"``.
         run: Called for each execution.
     """
 
     def handle(frame: Any) -> int | None:
         try:
             return _handle(frame.contents, run)
-        except Exception as error:  # no exception can leave a callback
+        except Exception as error:  # an exception cannot propagate out of a callback
             message = f"{type(error).__name__}: {error}".encode()
             request = _ErrorRequest(ctypes.sizeof(_ErrorRequest), None, message, _INTERNAL_ERROR)
             return _API_FUNCTION(frame.contents.api.contents.create_error)(ctypes.addressof(request))
@@ -148,8 +148,9 @@ _LOADING = threading.Lock()
 def launch_kernel(call: Call) -> None:
     """Launch the kernel of a call.
 
-    Attributes: ``kernel_data``, its PTX; ``digest``, which differs between kernels; ``name`` of its function; the sizes
-    ``grid_x`` and ``block_x``. It gets the addresses of operands and results, in this order.
+    The attributes of the call are ``kernel_data``, the PTX; ``digest``, which differs between kernels; ``name``, the
+    name of the kernel's function; ``grid_x``, the number of blocks; and ``block_x``, the threads of a block. The
+    arguments of the kernel are the addresses of operands and results, in this order.
     """
     driver, stream, context = ctypes.CDLL("libcuda.so.1"), c_void_p(call.stream()), c_void_p()
     check_driver(driver.cuStreamGetCtx(stream, ctypes.byref(context)))

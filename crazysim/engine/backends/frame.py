@@ -1,4 +1,4 @@
-"""The frame of a kernel: the types and functions of a target, and the loop over lanes around the code of one."""
+"""The frame of a kernel: the types and functions of a target, and the loop over lanes around the code of a lane."""
 
 from __future__ import annotations
 
@@ -32,19 +32,22 @@ class Kernel:
     threads: int = BLOCK_SIZE
     """Threads of a block on a GPU."""
     lanes: int = BLOCK_SIZE
-    """Threads of a block that are lanes: as many as make whole worlds, where drones read each other's numbers."""
+    """Threads of a block that are lanes. If drones read each other's numbers, they make up whole worlds."""
     group: int = 1
     """Drones of a world that read each other's numbers."""
     kept: int = 0
-    """Memory that a lane keeps for each step of an interval, bytes; 0 for a kernel that only goes forward. One that
-    goes back takes the number of steps of an interval after the number of all steps."""
+    """Memory that a lane keeps for each step of an interval, bytes; 0 for a kernel without backward pass. A kernel with
+    backward pass takes the number of steps of an interval after the number of all steps."""
 
     def aliases(self) -> dict[int, int]:
-        """Return the result that each operand in place is, by number; two numbers precede the operands."""
+        """Return the index of the result that shares memory with an operand, by the operand's index.
+
+        Two scalar operands precede the leaves.
+        """
         return {2 + self.inputs.index(i): self.outputs.index(i) for i in self.in_place}
 
     def with_blocks(self, n: int) -> Kernel:
-        """Return the kernel with registers for at least ``n`` blocks on a GPU's multiprocessor at once."""
+        """Return the kernel with few enough registers for ``n`` blocks on a multiprocessor of a GPU at once."""
         return dataclasses.replace(self, text=self.text.replace(ANY_NUMBER_OF_BLOCKS, f"{n}"))
 
     def with_threads(self, n: int) -> Kernel:
@@ -54,14 +57,14 @@ class Kernel:
 
 
 def interval(n_steps: int, size: int, memory: int) -> int:
-    """Return how many steps a gradient goes back at once: all, if there is memory for the state before each.
+    """Return the steps of an interval of the backward pass: all steps if the state before each fits in memory.
 
-    Otherwise it is the square root of their number: intervals keep their first numbers too, and this takes the least
-    memory.
+    Otherwise it is the square root of the number of steps, rounded up. The state before each interval is stored too,
+    and this choice needs the least memory.
 
     Args:
         n_steps: Number of steps.
-        size: Memory of the numbers that a step begins with, bytes.
+        size: Memory of the state before a step, bytes.
         memory: Available memory, bytes.
     """
     return max(n_steps, 1) if n_steps * size <= memory else math.isqrt(n_steps - 1) + 1
@@ -75,7 +78,7 @@ def _preamble(target: str) -> str:
 
 
 def _epilogue(target: str) -> str:
-    """Return the code through which a target calls the kernel."""
+    """Return the code by which a target calls the kernel."""
     if target == "cuda":
         return ""
     return resources.files("crazysim.engine.backends").joinpath("targets", "host_call.h").read_text()
@@ -96,7 +99,7 @@ def make_kernel(
     in_memory: bool = False,
     kept: int | None = None,
 ) -> Kernel:
-    """Return the kernel of some lines.
+    """Return the kernel with the given code.
 
     Args:
         target: ``"cuda"`` or ``"host"``.
@@ -104,13 +107,13 @@ def make_kernel(
         shared: Lines that compute what all lanes share.
         code: Lines of a lane.
         blocks: Blocks of a step, whose operations are counted.
-        declared: Lines in front of the kernel.
+        declared: Lines before the kernel.
         inputs: Leaves that it reads.
         outputs: Leaves that it writes.
         in_place: Leaves that it updates in place.
         group: Drones of a world that read each other's numbers.
-        in_memory: True where the numbers of a world are in memory, on the host.
-        kept: Numbers that a lane keeps for each step of an interval; None for a kernel that only goes forward.
+        in_memory: True if the numbers of a world are in memory, only on the host.
+        kept: Numbers that a lane keeps for each step of an interval; None for a kernel without backward pass.
     """
     threads, lanes = lanes_of_block(group)
     lines, body = "\n".join(shared), "\n".join(code)
@@ -129,15 +132,15 @@ def make_kernel(
 
 
 def _n_operations(block: Block) -> int:
-    """Return the number of operations of a block; operations for other drones of a world count once for each."""
+    """Return the number of operations of a block; operations that run for each drone of a world count for each."""
     inner = [dict(op.params).get("n_members", 1) * sum(map(_n_operations, op.blocks)) for op in block.operations]
     return len(block.operations) + sum(inner)
 
 
 def _cuda(pointers: Sequence[str], shared: str, body: str, keeps: bool) -> str:
-    """Return the kernel of a thread: it computes the numbers that all lanes share once, and the rest for its lane.
+    """Return the CUDA kernel: each thread computes the numbers that all lanes share once, and the rest for its lane.
 
-    A thread that keeps numbers of steps goes through several lanes, one after the other, to bound the memory.
+    In a kernel with backward pass, a thread may process several lanes one after the other, to bound the memory.
     """
     scalars = ["const int* __restrict__ sizes", "const int* __restrict__ count"]
     arguments = ", ".join([*scalars, *pointers, *(["Kept* __restrict__ kept"] if keeps else [])])

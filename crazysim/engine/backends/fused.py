@@ -33,7 +33,10 @@ from crazysim.pytree import replace_leaves
 
 
 class Kernels:
-    """Kernels of one program: one for the platform that it is planned for, and others when JAX lowers it there."""
+    """Kernels of one program: one for its planned platform, and one for each other platform that JAX compiles it for.
+
+    The other kernels are compiled when they are first needed.
+    """
 
     def __init__(self, program: Program, location: Location):
         """Compile the kernel for some devices.
@@ -62,7 +65,7 @@ class Kernels:
         return compile_kernel(kernel.write(self.program, TARGETS[location.platform]), location)
 
     def results(self, n_worlds: int) -> list[jax.ShapeDtypeStruct]:
-        """Return shapes and types of the outputs of the kernel: leaves, and flags of drones if it checks."""
+        """Return the shapes and types of the kernel's outputs: leaves, and flags of drones if there is a check."""
         flags = [jax.ShapeDtypeStruct((n_worlds, self.program.n_drones), np.bool_)] if self.program.check else []
         return [*(lanes.shape_of(self.program, i, n_worlds) for i in self.outputs), *flags]
 
@@ -120,8 +123,8 @@ def build(program: Program, location: Location, in_leaves: Program | None = None
     Args:
         program: The program.
         location: Devices to compile it for.
-        in_leaves: The same program before ``pack_rows``, whose derivatives it gets, since rows have no derivative in a
-            kernel; None for a program without rows.
+        in_leaves: The same program before ``pack_rows``, from which derivatives are computed, since kernels cannot
+            differentiate rows; None for a program without rows.
 
     Raises:
         UnsupportedError: If an operation or type has no source.
@@ -139,23 +142,23 @@ def build(program: Program, location: Location, in_leaves: Program | None = None
 
 
 DERIVATIVE_KERNELS: weakref.WeakKeyDictionary[Program, DerivativeKernels] = weakref.WeakKeyDictionary()
-"""Derivatives of the programs that were built."""
+"""Derivative kernels of the programs that were built."""
 
 
 def describe(program: Program, platform: str, devices: Sequence[jax.Device] | None = None) -> list[str]:
-    """Return the compiler of the kernels of a program, or on a GPU the registers that each takes, in lines."""
+    """Return a line for each kernel of a program: its compiler, or on a GPU the registers that it takes."""
     sources = [kernel.write(part, TARGETS[platform]) for part in _parts(program) if part.fused]
     return [f"kernel: {describe_kernel(source, platform, devices)}" for source in sources]
 
 
 def describe_derivatives(program: Program) -> list[str]:
-    """Return the ways in which derivatives of a program were computed so far, in lines."""
+    """Return a line for each way in which derivatives of a program were computed so far."""
     derivatives = DERIVATIVE_KERNELS.get(program)
     return [] if derivatives is None else list(derivatives.used)
 
 
 def _over_batches(program: Program, run: CountedRun) -> CountedRun:
-    """Return a kernel call with a rule for vmap: a batch of the same worlds is more worlds."""
+    """Return a kernel call with a rule for ``jax.vmap``, which treats batches as further worlds."""
 
     def batched(size: int, in_batched: Any, leaves: list[Any], count: Array) -> Any:
         of_leaves, of_count = in_batched
@@ -192,7 +195,7 @@ def _over_batches(program: Program, run: CountedRun) -> CountedRun:
 
 
 def _run_without_rows(program: Program, in_leaves: Program, location: Location) -> Run:
-    """Return the run of a program with rows by the same program without, which is compiled when it is called."""
+    """Return a function that runs a program with rows by the same program without rows, compiled at the first call."""
     built: list[Run] = []
 
     def run(leaves: list[Any], n_steps: int | Array) -> tuple[list[Any], Array]:
@@ -219,7 +222,7 @@ def _parts(program: Program) -> list[Program]:
 
 
 def _split(program: Program, location: Location) -> CountedRun:
-    """Return the same for a step that unfused stages split: a kernel for the stages between them, phase by phase."""
+    """Return the run of a step that unfused stages split: in each phase, one kernel for the stages between them."""
     parts = _parts(program)
     with native.compiling_threads() as pool:
         runs = list(pool.map(lambda part: _one_kernel(Kernels(part, location)) if part.fused else None, parts))

@@ -1,7 +1,7 @@
 """An interpreter: programs in NumPy, one operation after the other, with nothing compiled.
 
-It is the meaning of the table of operations (``ops``), and slow. Passes, rules and other engines are tested against it,
-and ``Sim(engine="interpret")`` steps with it.
+It defines what the operations of ``ops.TABLE`` mean, and it is slow. Passes, rules and other engines are tested against
+it, and ``Sim(engine="interpret")`` steps with it.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from crazysim.jaxcompat import is_key
 from crazysim.pytree import replace_leaves
 
 Observer = Callable[[Operation, Sequence[np.ndarray]], None]
-"""Gets every operation with its results."""
+"""Function that is called with every operation and its results."""
 FloatEnvironment = ctypes.c_uint32 * 8
 """``fenv_t`` of x86-64 Linux."""
 MXCSR_INDEX = 7
-"""Word of it that controls the arithmetic of vector registers."""
+"""Index of its word that controls the arithmetic of vector registers."""
 FLUSH_BITS = 0x8040
-"""Bits that take subnormal results and operands for zero: Intel 64 manual, volume 1, section 10.2.3."""
+"""Bits that flush subnormal results and operands to zero: Intel 64 manual, volume 1, section 10.2.3."""
 
 
 def run(
@@ -47,7 +47,7 @@ def run(
         block: The block.
         inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
-        observe: Gets every operation with its results.
+        observe: Called with every operation and its results.
 
     Returns:
         Its outputs, of the lanes' shape.
@@ -64,7 +64,7 @@ def run(
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a value broadcast to all lanes; NumPy's own call takes as long as an operation."""
+    """Broadcast a value to all lanes where needed; ``np.broadcast_to`` takes as long as an operation."""
     return x if np.shape(x) == shape else np.broadcast_to(x, shape)
 
 
@@ -75,9 +75,9 @@ class _Call(NamedTuple):
     fn: Callable[..., Any] | None
     """NumPy's function; None for a structured operation."""
     args: list[int]
-    """Places of the operands."""
+    """Indices of the operands."""
     results: list[int]
-    """Places of the results."""
+    """Indices of the results."""
     dtype: np.dtype
     """Type of the first result."""
     blocks: list[_Prepared]
@@ -88,7 +88,7 @@ class _Prepared(NamedTuple):
     """A block whose values have indices in a list, with the function of each operation."""
 
     inputs: list[int]
-    """Places of the inputs."""
+    """Indices of the inputs."""
     calls: list[_Call]
     """Operations in order."""
     outputs: list[int]
@@ -98,11 +98,11 @@ class _Prepared(NamedTuple):
         """Return the outputs for some inputs.
 
         Args:
-            values: Constants and values of the blocks around it, by their indices. Values of this block are added: of
-                the lanes' shape, or scalars, or tables.
+            values: Constants and values of the enclosing blocks, by their indices. The values of this block are added:
+                arrays of the lanes' shape, scalars or tables.
             inputs: Its inputs.
             shape: Shape of the lanes.
-            observe: Gets every operation with its results.
+            observe: Called with every operation and its results.
         """
         for i, x in zip(self.inputs, inputs, strict=True):
             values[i] = x
@@ -120,14 +120,14 @@ class _Prepared(NamedTuple):
 
 
 _Run = Callable[[Sequence[Any]], list[Any]]
-"""Runs a block: from its inputs to its outputs."""
+"""Function that runs a block: from its inputs to its outputs."""
 
 _PREPARED_BLOCKS: WeakKeyDictionary[Block, tuple[_Prepared, list[Any]]] = WeakKeyDictionary()
-"""Prepared blocks of earlier runs, with a list of constants by their indices, and None for other values."""
+"""Prepared blocks of earlier runs. The list has the constants at their indices, and None for all other values."""
 
 
 def _prepare(block: Block, indices: dict[Any, int], constants: list[Any]) -> _Prepared:
-    """Prepare a block, and add the indices of its values and constants to the indices of the blocks around it."""
+    """Prepare a block, and add its values to ``indices`` and its constants to ``constants``."""
 
     def index_of(x: Any) -> int:
         if isinstance(x, Value):
@@ -205,7 +205,7 @@ def _run_structured(op: Operation, args: list[Any], shape: tuple[int, ...], runs
 
 
 def _over_others(op: Operation, args: list[np.ndarray], shape: tuple[int, ...], run: _Run) -> list[np.ndarray]:
-    """Combine the results of a block for each drone of the world, one after the other."""
+    """Run a block for each drone of the world in turn, and combine the results."""
     n = op.param("n_members")
     member = np.arange(shape[0]) % n
     combine: list[Any] = [ops.TABLE[name].numpy for name in op.param("reduce")]
@@ -225,7 +225,7 @@ THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 
 def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the two integers of 32 bits that 20 rounds of Threefry make of two, under a key of two."""
+    """Encrypt two 32-bit integers with 20 rounds of Threefry, under a key of two 32-bit integers."""
     keys = (k0, k1, k0 ^ k1 ^ np.uint32(0x1BD11BDA))
     x0, x1 = x0 + keys[0], x1 + keys[1]
     for n in range(5):
@@ -238,7 +238,7 @@ def threefry2x32(k0: np.ndarray, k1: np.ndarray, x0: np.ndarray, x1: np.ndarray)
 
 
 def call(block: Block, inputs: Sequence[Any], shape: tuple[int, ...]) -> list[Array]:
-    """Return what ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
+    """Run a block as ``run`` does, inside a function that JAX traces or compiles; it has no derivative."""
     results = [jax.ShapeDtypeStruct(shape, x.dtype) for x in block.outputs]
 
     def run_arrays(*inputs: Any) -> list[np.ndarray]:
@@ -253,15 +253,15 @@ def build(program: Program, location: Location) -> Run:
 
 
 def steps(program: Program, leaves: list[Any], n_steps: int | Array, on_cpu: bool = True) -> tuple[list[Any], Any]:
-    """Return what ``lanes.steps`` does, all in NumPy: at once, or in a callback where arguments are traced.
+    """Run steps as ``lanes.steps`` does, but in NumPy: immediately, or in a callback if arguments are traced.
 
-    If stages are not fused, only blocks are interpreted, and the rest runs in XLA.
+    If the program has unfused stages, only its blocks are interpreted, and the rest runs in XLA.
 
     Args:
         program: The program.
         leaves: Leaves of all worlds.
         n_steps: Number of steps.
-        on_cpu: True to take subnormal numbers for zero, as XLA does on a CPU and not on a GPU.
+        on_cpu: True to treat subnormal numbers as zero, as XLA does on a CPU but not on a GPU.
     """
     if not program.fused:
         return lanes.steps(program, leaves, n_steps, call)
@@ -314,9 +314,9 @@ def flush_subnormals() -> Iterator[None]:
 
 @functools.cache
 def _c_library() -> ctypes.CDLL | None:
-    """Return the C library; None on other platforms, whose environments have another form."""
+    """Return the C library; None on platforms other than x86-64 Linux, where ``fenv_t`` has another layout."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return None
     for dtype in (np.float32, np.float64):
-        np.finfo(dtype)  # NumPy computes the smallest numbers once, and would find zero later
+        np.finfo(dtype)  # NumPy computes the smallest numbers at the first call, and would get zero later
     return ctypes.CDLL(None)

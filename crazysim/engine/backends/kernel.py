@@ -1,7 +1,6 @@
 """One kernel for many steps: the source of a program, from loads to stores.
 
-The numbers of one drone stay in variables, which are registers as long as there are enough, from the first step to
-the last.
+From the first step to the last, the numbers of one drone stay in variables, which are registers if there are enough.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from crazysim.engine.ir.blocks import Block
 from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
 
 MAX_REGISTERS = 255
-"""Registers of a thread of a GPU."""
+"""Maximum number of registers of a GPU thread."""
 
 
 def write(program: Program, target: str) -> Kernel:
@@ -56,15 +55,15 @@ class Body:
         self.names: dict[Slot, str] = {}
         """Expression of each number."""
         self.starts: dict[Slot, str] = {}
-        """Expression of each number that stages write, before the first of them."""
+        """Expression of the initial value of each number that stages write."""
         self._n_shared = 0
 
     def write_loads(self, registers: int | None = None) -> list[list[str]]:
         """Write loads and the stages before the steps; return the hoisted values of each segment of the loop.
 
         Args:
-            registers: Registers of a lane. If there are more numbers than that, numbers that all lanes share are read
-                where they are used. None to read all before the steps.
+            registers: Registers of a lane. If the kernel uses more numbers, it reads the numbers that all lanes share
+                where they are used. None for no limit.
         """
         program, exchange, writer, names = self.program, self.exchange, self.writer, self.names
         written, slots = self._slots()
@@ -147,7 +146,7 @@ class Body:
             outputs: Leaves that it writes.
             in_place: Leaves that it updates in place.
             blocks: Blocks of a step, whose operations are counted.
-            kept: Numbers of a lane that it keeps for each step of an interval; None for a kernel that only goes ahead.
+            kept: Numbers that each lane stores for each step of an interval; None for a kernel without backward pass.
         """
         shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
         return make_kernel(
@@ -177,7 +176,7 @@ class Body:
 
 
 def require_source(program: Program) -> None:
-    """Check that a program has source."""
+    """Raise ``UnsupportedError`` if an operation or type of a program cannot be written in the source of a kernel."""
     for segment in program.fused_segments:
         require_block_source(segment.hoisted)
         require_block_source(segment.block)
@@ -199,7 +198,7 @@ def _written_slots(program: Program) -> list[Slot]:
 
 
 def _loaded_slots(program: Program) -> set[Slot]:
-    """Return the slots whose numbers at the beginning matter: they are used before they are written for certain."""
+    """Return the slots to load: they may be used before a stage is certain to have written them."""
     loaded: set[Slot] = set()
     known: set[Slot] = set()
 
@@ -240,7 +239,7 @@ def write_segment(
         depth: Depth of the lines.
     """
     inputs = [names[slot] for slot in program.per_drone(segment, segment.reads)]
-    if segment.scope == "world":  # a drone's numbers come from its lane
+    if segment.scope == "world":  # the numbers of each drone are read from its lane
         for k, (leaf, number) in enumerate(segment.reads):
             if program.leaves[leaf].scope == "drone":
                 name = writer.new()
@@ -262,9 +261,9 @@ def write_segment(
 
 
 def _deferred_slots(program: Program) -> set[Slot]:
-    """Return the numbers that only stages below the step rate use, or only the check behind the loop.
+    """Return the numbers that only stages below the step rate use, or only the check after the loop.
 
-    If none changes them, they are loaded there, and take no register in between.
+    Unless a stage writes them, they are loaded where they are used, and take no register in between.
     """
     below_rate: set[Slot] = set()
     at_each_step: set[Slot] = set()
@@ -293,13 +292,13 @@ def _load(program: Program, slot: Slot) -> str:
 
 
 def rows(pointer: str, kind: str, size: int, drones: int = 1) -> str:
-    """Return the line that finds the rows of an input, one for each lane, before its loads.
+    """Return the line that finds the rows of an input, one for each lane; it comes before the loads.
 
     Args:
         pointer: The input.
         kind: Type of its numbers.
         size: Numbers of a row.
-        drones: Lanes that have the same row.
+        drones: Number of lanes that share a row.
     """
     return f"ROWS({kind}, {size}, {drones}, {pointer})"
 
@@ -311,7 +310,7 @@ def write_results(writer: Writer, pointer: str, kind: str, drones: int, values: 
         writer: Takes the lines.
         pointer: The output.
         kind: Type of its numbers.
-        drones: Lanes that have the same numbers.
+        drones: Number of lanes that share the same numbers.
         values: Expressions of the numbers of a lane.
         depth: Depth of the lines.
     """
@@ -323,5 +322,5 @@ def write_results(writer: Writer, pointer: str, kind: str, drones: int, values: 
 
 
 def _drones(program: Program, leaf: int) -> int:
-    """Return how many lanes have the same number of a leaf."""
+    """Return the number of lanes that share each number of a leaf."""
     return program.n_drones if program.leaves[leaf].scope == "world" else 1

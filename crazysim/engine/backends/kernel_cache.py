@@ -1,13 +1,13 @@
 """Files of compiled kernels, safe to share between the processes and machines of one user.
 
-A file is named by its key, which holds everything that the code depends on, and by the hash of its contents. A file
-that was cut short or damaged does not match its name and is not used. Two processes may write the same kernel at the
-same time: each file appears complete, by renaming.
+The name of a file consists of its key, a hash of everything that the code depends on, and the hash of its contents. A
+truncated or damaged file does not match its name and is not used. Two processes may write the same kernel at the same
+time: files are renamed when they are complete.
 
 Loading a file executes it. A folder or file that another user could have written is therefore not used.
 
-A file or folder that is not yet, or never, shared holds the name of its process, so that the next one removes what a
-process that was killed has left.
+The names of unfinished files and of temporary folders contain the name of their process, so that later processes can
+remove the remains of processes that were killed.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
 
 ABANDONED_AFTER = 86400.0
-"""Age of remains of another machine, s, at which they are removed."""
+"""Age at which remains of processes on other machines are removed, s."""
 
 
 def digest(*parts: str | bytes) -> str:
-    """Return the hash of some texts; the order and the boundaries between them count."""
+    """Return the hash of some texts, which depends on their order and on the boundaries between them."""
     state = hashlib.sha256()
     for part in parts:
         raw = part.encode() if isinstance(part, str) else part
@@ -48,7 +48,7 @@ def digest(*parts: str | bytes) -> str:
 
 
 def folder() -> Path:
-    """Return the folder of compiled kernels: in the folder of compiled programs, or one of this process alone."""
+    """Return the folder of compiled kernels: inside the folder of compiled programs, or a temporary one."""
     programs = cache.folder()
     if programs is not None:
         shared = programs / "crazysim"
@@ -79,9 +79,9 @@ def _sweep_once(shared: Path) -> None:
 
 
 def temporary() -> Path:
-    """Return a folder of this process, which is removed when it ends; a forked process has one of its own."""
+    """Return a folder of this process, which is removed when the process ends. A forked process has its own folder."""
     folder = _temporary(os.getpid())
-    make_private(folder)  # once more, if the system has removed it since
+    make_private(folder)  # again, in case the system has removed it
     return folder
 
 
@@ -100,13 +100,13 @@ def _temporary(pid: int) -> Path:
 
 
 def owner() -> str:
-    """Return the name of this process in the names of its files: machine and number."""
+    """Return the name of this process for the names of its files: machine and process ID."""
     return f"{_machine()}-{os.getpid()}"
 
 
 @functools.cache
 def _machine() -> str:
-    """Return a short name of this machine, or of the container whose processes are numbered like this one."""
+    """Return a short name of this machine and its namespace of process IDs, such as a container."""
     try:
         numbering = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -147,7 +147,7 @@ def _is_abandoned(name: str, age: float) -> bool:
         return age > ABANDONED_AFTER
     try:
         os.kill(int(pid), 0)
-    except OSError:  # there is none, or it belongs to another user
+    except OSError:  # there is no such process, or it belongs to another user
         return True
     return False
 
@@ -175,7 +175,7 @@ def store(cache_folder: Path, key: str, content: bytes, suffix: str) -> Path:
         cache_folder: The folder.
         key: The key.
         content: Contents.
-        suffix: End of the name, such as ``".so"``.
+        suffix: Suffix of the name, such as ``".so"``.
 
     Raises:
         OSError: If the folder cannot be written, or its disk is full.

@@ -1,4 +1,4 @@
-"""Kernels on the host: source compiled by the C++ compiler that is there, called by XLA."""
+"""Kernels on the host: source compiled by an installed C++ compiler, called by XLA."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from crazysim.startup import __version__
 COMPILER_FLAGS = ("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
                   "-fwrapv", "-shared", "-fPIC", "-fvisibility=hidden", "-pthread", "-nostdinc++", "-w")  # fmt: skip
 """Options of the compiler, before the options of the variable CXXFLAGS. Products and sums may be contracted; no option
-assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them without a sign."""
+assumes that there is no NaN. Integers wrap, as in XLA; NVRTC has no such option, so sources add them as unsigned."""
 
 ZIG_ARGUMENTS = ("cc", "-nostdlib", "-lc", "-lm", "-g0")
 """Arguments that make zig a compiler of kernels. As ``c++``, or without ``-nostdlib``, it would first compile libraries
@@ -49,7 +49,7 @@ COMPILE_TIMEOUT = 300.0
 """Time that the compiler may take, s, unless the variable CRAZYSIM_COMPILE_TIMEOUT says otherwise."""
 
 LINES_IN_ONE_SECOND = 10_000
-"""Lines of a kernel that is compiled in 1 s at best; the time grows with the square of their number.
+"""Lines of a kernel that takes at least 1 s to compile; the time grows with the square of the number of lines.
 
 Measured with g++ 12 on one core: 20,000 lines of matrix products take 5 s, of maxima 38 s, 40,000 of conditions 94 s.
 """
@@ -67,22 +67,22 @@ KILLING_SCRIPT = """exec 3<&0 </dev/null
 status=$?
 kill -9 $!
 exit $status"""
-"""Script that runs a command whose input is a pipe to this process. When the pipe closes, which is at the latest when
-this process ends, however it ends, it kills the command with all its children."""
+"""Script that runs a command. The script's input is a pipe from this process. When the pipe closes, at the latest when
+this process ends in any way, the script kills the command and all its children."""
 
 GRADIENT_MEMORY_BYTES = 256 * 1024
-"""Memory for the stored states of the steps that a core goes back through at once: what its nearest caches hold."""
+"""Memory for the states that a core stores for an interval of the backward pass, bytes; it fits in its caches."""
 
 VECTOR_BYTES = 64
 """Size of the widest vector, bytes."""
 
 Launch = Callable[[int, Any, Sequence[Array], Sequence[Any]], list[Array]]
-"""Number of lanes, number of steps (1,), inputs, and shapes and types of outputs, to outputs. For a kernel that keeps
-numbers the number of steps is an array of NumPy."""
+"""Function from the number of lanes, the number of steps (1,), the inputs, and the shapes and types of the outputs to
+the outputs. For a kernel with backward pass the number of steps must be a NumPy array."""
 
 
 class HostLaunch:
-    """A compiled kernel: called, it is an operation of a traced function."""
+    """A compiled kernel, which traced functions can call."""
 
     def __init__(self, kernel: Kernel):
         self._name, self._aliases, self._kept = target(kernel), kernel.aliases(), kernel.kept
@@ -97,10 +97,10 @@ class HostLaunch:
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 
     def on_memory(self) -> Callable[[int, int, Any, int], int]:
-        """Return the kernel as a function on memory, without XLA, which waits until it is done.
+        """Return the kernel as a function on memory, which does not use XLA and returns when the kernel is done.
 
         It takes the numbers of lanes and of steps, the addresses of inputs and outputs (a ``ctypes`` array), and the
-        number of inputs. It returns 0 if there was no memory for it.
+        number of inputs. It returns 0 if it could not allocate memory.
         """
         call = _LIBRARIES[self._name].crazysim_call
         call.restype = ctypes.c_int
@@ -130,7 +130,7 @@ def _zig() -> str | None:
 
 
 def compiler_command(options: bool = True) -> list[str]:
-    """Return the compiler's command up to the names of files.
+    """Return the compiler's command without the names of files.
 
     Args:
         options: False to leave out CXXFLAGS.
@@ -169,9 +169,9 @@ def time_limit() -> float:
 
 
 def target(kernel: Kernel) -> str:
-    """Compile a kernel, unless that was done before, and return the name that XLA calls it by.
+    """Compile a kernel, unless it was compiled before, and return the name by which XLA calls it.
 
-    The name holds the key, so that a program in JAX's own cache never finds a kernel for another machine.
+    The name contains the key, so that a program in JAX's compilation cache never calls a kernel for another machine.
 
     Raises:
         KernelError: If the compiler refuses it or takes too long, or the library cannot be loaded.
@@ -199,10 +199,10 @@ _LIBRARIES_LOCK = threading.Lock()
 def toolchain(words: tuple[str, ...]) -> str:
     """Return everything besides source and options that compiled code depends on.
 
-    That is the compiler's version, the instruction set that ``-march=native`` stands for here, the C library, and the
+    This is the compiler's version, the instruction set that ``-march=native`` selects here, the C library, and the
     versions of JAX and of this package.
     """
-    # Asked for its steps, a compiler prints its version and the options that -march=native is replaced by.
+    # With -###, a compiler prints its version and the options that replace -march=native.
     with tempfile.TemporaryDirectory(dir=kernel_cache.temporary(), ignore_cleanup_errors=True) as work:
         # Clang prints the working directory, too.
         steps = _run([*words, "-E", "-x", "c++", os.devnull, "-###"], Path(work), time_limit(), cwd=os.sep)
@@ -264,7 +264,7 @@ def _compile(words: Sequence[str], source: str) -> bytes:
 
 
 def _check_settings(work: Path) -> None:
-    """Raise an error if it is due to CXX or CXXFLAGS that the compiler does not compile anything.
+    """Raise an error if the compiler cannot compile an empty file because of CXX or CXXFLAGS.
 
     Args:
         work: Folder for its files.
@@ -289,7 +289,7 @@ def _check_settings(work: Path) -> None:
 
 @contextlib.contextmanager
 def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
-    """Give a block threads that compile; interrupting it ends their compilers rather than wait for them.
+    """Provide threads that compile. If the ``with`` block is interrupted, their compilers are killed.
 
     Args:
         n: Number of threads; None for the default.
@@ -305,14 +305,14 @@ def compiling_threads(n: int | None = None) -> Iterator[ThreadPoolExecutor]:
 
 
 _COMPILER_PIPES: set[IO[str]] = set()
-"""Pipes of the compilers that run; one that is closed ends its compiler."""
+"""Pipes of the running compilers; closing a pipe kills its compiler."""
 
 
 def _run(words: Sequence[str], work: Path, seconds: float, cwd: str | None = None) -> subprocess.CompletedProcess[str]:
-    """Run the compiler, which ends with all its children when its time is over or this process ends.
+    """Run the compiler; it is killed with all its children when its time is over or this process ends.
 
     Args:
-        words: Its command.
+        words: Command of the compiler.
         work: Folder of its temporary files.
         seconds: Time that it may take, s.
         cwd: Working directory; None for the directory of this process.

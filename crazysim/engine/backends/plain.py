@@ -21,16 +21,16 @@ from crazysim.pytree import leaf_flags, replace_leaves
 
 
 def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
-    """Return a loop over steps on leaves, and which of them it writes.
+    """Return a function that runs the stages and the loop over steps on leaves, and the leaves that it writes.
 
-    The loop carries only the leaves that some stage writes. The others, parameters above all, are its constants.
+    The loop carries only the leaves that a stage of the steps writes. All others, mainly parameters, are constants.
 
     Args:
         stages: The stages.
-        data: Data of the structure that is stepped.
+        data: Data with the structure, shapes and types of the data to step.
 
     Returns:
-        The loop, and the numbers of the written leaves.
+        The function, and the indices of the written leaves.
     """
     axes = Axes(data)
 
@@ -40,7 +40,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
                 after = stage(axes.treedef.unflatten(leaves))
                 written = axes.written(leaves, after, stage)
                 new = jax.tree.leaves(after)
-                # XLA's CPU backend would compute what a later stage reads again for each of its results.
+                # Without the barrier, XLA's CPU backend recomputes these values for each result of a later stage.
                 leaves = replace_leaves(leaves, written, jax.lax.optimization_barrier([new[i] for i in written]))
         return leaves
 
@@ -72,7 +72,7 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
 
 
 def _changed_leaves(jaxpr: jaxcompat.ClosedJaxpr) -> list[int]:
-    """Return the numbers of the leaves that a function of leaves does not return as they are."""
+    """Return the indices of the leaves that a function of leaves does not return unchanged."""
     pairs = zip(jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars, strict=True)
     return [i for i, (before, after) in enumerate(pairs) if before is not after]
 
@@ -101,7 +101,7 @@ class Reset:
             return self._compiled(data, default_data, mask)
 
     def plain(self, data: SimData, default_data: SimData, mask: Any = None) -> SimData:
-        """Return the same, without a compiled call."""
+        """Return the data after a reset, without a compiled call."""
         for name, fn in self._stages:
             with jax.named_scope(name):
                 data = fn.apply_in_worlds(data, mask) if isinstance(fn, Stage) else fn(data, default_data, mask)

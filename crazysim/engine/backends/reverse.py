@@ -1,9 +1,9 @@
 """Reverse mode of many steps in one kernel: from cotangents of the leaves after the steps to cotangents before them.
 
-The kernel computes the steps again, stores the state before each, and goes back from the last step to the first. For
-more steps than ``interval`` it stores the state before each interval, and computes the steps of an interval again when
-it goes back through it. Every drone has a cotangent of every number; the caller sums the cotangents of leaves that
-drones share.
+The kernel recomputes the steps, stores the state before each step, and goes back from the last step to the first. If
+there are more steps than ``interval``, it first stores only the state before each interval, and recomputes the steps of
+an interval when it goes back through it. Every drone has its own cotangent of every number; the caller sums the
+cotangents of leaves that drones share.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class ReverseProgram:
     back_hoisted: dict[Segment, Segment]
     """The same for hoisted blocks."""
     carried: tuple[Slot, ...]
-    """Numbers that a step begins with, and that steps change."""
+    """State of the loop over the steps: numbers that a step uses and that steps change."""
     read_back: frozenset[Slot]
-    """Members of ``carried`` that the way back through a step needs."""
+    """Members of ``carried`` that the backward pass through a step needs."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -102,15 +102,15 @@ def _used_slots(program: Program, s: Segment) -> list[Slot]:
 
 
 def _float_of(block: Block) -> np.dtype:
-    """Return the type of the floats of a block; a program has one."""
+    """Return the type of the floats of a block; all floats of a program have the same type."""
     return next((x.dtype for x in block.outputs if x.dtype.kind == "f"), np.dtype(np.float32))
 
 
 def _back(program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int], where: int) -> Segment:
     """Return the segment that replaces the cotangents after a segment by the cotangents before it.
 
-    In a segment of worlds, each drone has a copy of what belongs to the world, and a cotangent for it; the sum of all
-    belongs to the first drone afterwards.
+    In a segment of worlds, each drone has its own cotangents of the world's numbers. The returned segment sums the
+    cotangents of the numbers that are written over the drones, and adds its results to the copy of the first drone.
     """
     n_drones, of_world = program.n_drones, s.scope == "world"
     reads = program.per_drone(s, s.reads)
@@ -122,7 +122,10 @@ def _back(program: Program, n: int, s: Segment, changed: set[Slot], constants: S
     n_inputs = len(s.block.inputs)
 
     def copies(slot: Slot) -> list[Slot]:
-        """Return where the cotangents of a number are: one, or in a segment of worlds one for each drone."""
+        """Return the slots of the cotangents of a number.
+
+        In a segment of worlds, a number that drones share has one for each drone. Every other number has one.
+        """
         i, k = slot
         if not of_world or program.leaves[i].scope == "drone":
             return [(n + i, k)]
@@ -147,7 +150,7 @@ def _back(program: Program, n: int, s: Segment, changed: set[Slot], constants: S
     primal = [builder.input(x.dtype, x.size) for x in s.block.inputs]
     seeds = [total(s.writes[k], s.block.outputs[k].dtype) for k in outs]
     parts = inline(builder, pull, dict(zip(pull.inputs, [*primal, *seeds], strict=True)))
-    for k in outs:  # what is written is another number from here on
+    for k in outs:  # a segment overwrites these numbers, so the outputs do not depend on their old values directly
         zero = constant(0, s.block.outputs[k].dtype)
         now.update(dict.fromkeys(copies(s.writes[k]), zero))
     for k, part in zip(wanted, parts, strict=False):
@@ -192,10 +195,10 @@ def needed_leaves(reverse: ReverseProgram) -> tuple[int, ...]:
 
 
 def write(reverse: ReverseProgram, target: str) -> Kernel:
-    """Return the source of the kernel that goes back.
+    """Return the source of the reverse-mode kernel.
 
-    Its inputs are the leaves that the program needs, then the cotangents of the leaves it writes; its outputs are a
-    cotangent of each perturbed leaf for every drone.
+    Its inputs are the leaves that the program needs, then the cotangents of the floats that it writes. Its outputs are
+    the cotangents of the perturbed leaves, for every drone.
 
     Args:
         reverse: The transposed derivatives.
@@ -249,7 +252,7 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
     writer.line("}", 2)
     writer.line("for (int step = 0; step < n_here; ++step) {", 2)
     keep("step", reverse.read_back, 3)
-    if not last:  # nothing needs what comes after the last step
+    if not last:  # without stages after the steps, the result of the last step is not needed
         writer.line("if (back && step == n_here - 1) break;", 3)
     for segment, fixed in zip(step_segments, constants, strict=True):
         kernel.write_segment(writer, program, segment, names, fixed, 3)
@@ -298,14 +301,14 @@ def _write_back(
     names: dict[Slot, str],
     depth: int,
 ) -> None:
-    """Write the backward pass through the segments of a phase, after computing them again.
+    """Write the backward pass through the segments of a phase, after recomputing them up to the last.
 
     Args:
-        body: Takes the lines.
+        body: Kernel that the lines are added to.
         reverse: The transposed derivatives.
         segments: The segments.
         constants: Expressions of their hoisted numbers.
-        names: Expressions of the numbers before the first segment, which are replaced.
+        names: Expressions of the numbers before the first segment; changed in place.
         depth: Depth of the lines.
     """
     program, writer = reverse.program, body.writer

@@ -21,14 +21,14 @@ from crazysim.engine.ir.blocks import Block, Element, Operation, Value, is_const
 
 TYPE_NAMES = {np.dtype(name): short for name, short in
          {"float32": "f32", "float64": "f64", "int32": "i32", "uint32": "u32", "bool": "b1"}.items()}  # fmt: skip
-"""Types of numbers, and their names in the source."""
+"""Names of the types of numbers in the source."""
 
 
 def require_block_source(block: Block) -> None:
-    """Check that there is source for all operations and types of a block.
+    """Check that all operations and types of a block can be written as source.
 
     Raises:
-        UnsupportedError: If there is none for one; the error names the stage.
+        UnsupportedError: If an operation or type has no source; the error names the stage.
     """
     for op in block.walk():
         row = ops.TABLE[op.name]
@@ -55,7 +55,7 @@ class Writer(LineWriter):
         self.lines: list[str] = []
         self.names: dict[Value, str] = {}
         self.shared: set[Value] = set()
-        """Values that are single numbers, because all lanes share them."""
+        """Values that are scalar variables, because all lanes share them."""
         self.pairs: dict[str, str] = {}
         self.tests: dict[Value, Operation] = {}
         self.tables: list[str] = []
@@ -72,12 +72,12 @@ class Writer(LineWriter):
     def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
         """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
-        outside = dict(self.pairs), self.fours  # what is computed inside a block is not defined outside
+        outside = dict(self.pairs), self.fours  # variables of a block are not defined outside it
         self.fours = dict.fromkeys(_fours(block), "")
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
                 self._over_others(op, depth, _live_values(block, position))
-                self.shared.clear()  # what is kept for behind the loop is kept for each lane
+                self.shared.clear()  # values that are kept for later code are kept for each lane
             else:
                 self._operation(op, depth)
                 self.shared.update(shared_results(op, self.shared))
@@ -129,13 +129,13 @@ class Writer(LineWriter):
                 self.line(f"const auto {name} = {text};", depth)
 
     def _results(self, op: Operation, name: str | None = None) -> str:
-        """Name the results of an operation that has several, and return what their names begin with."""
+        """Name the results of an operation with several results, and return the prefix of their names."""
         name = name or self.new()
         self.names.update((x, f"{name}_{k}") for k, x in enumerate(op.results))
         return name
 
     def _table(self, op: Operation) -> None:
-        """Write a table of constants, in front of the kernel."""
+        """Write a table of constants, which stands before the kernel."""
         name = self.names[op.results[0]] = self.new("t")
         numbers = ", ".join(_entry(x) for x in op.param("numbers").array)
         self.tables.append(f"TABLE {type_name(op.dtype)} {name}[] = {{{numbers}}};")
@@ -153,7 +153,7 @@ class Writer(LineWriter):
         self.names[op.results[0]] = f"{self.fours[key]}.x[{offset % 4}]"
 
     def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
-        """Write sine and cosine at once: most of the work for one of the two is that for the other."""
+        """Write sine and cosine together, as they share most of their work."""
         if x not in self.pairs:
             pair = self.pairs[x] = self.new()
             kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
@@ -229,7 +229,7 @@ class Writer(LineWriter):
         return shared
 
     def _carry(self, op: Operation, start: Sequence[str], shared: Sequence[bool], depth: int) -> str:
-        """Write a variable for each result of an operation that changes them, with the numbers it starts from."""
+        """Write a variable with its initial number for each result of an operation that updates them."""
         name = self._results(op)
         for k, (x, value, same) in enumerate(zip(op.results, start, shared, strict=True)):
             kind = type_name(x.dtype)
@@ -239,7 +239,7 @@ class Writer(LineWriter):
     def _assign(
         self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
     ) -> None:
-        """Assign all results of a turn at once: one may be what another was."""
+        """Assign all results of an iteration after computing all of them, as one may be the old value of another."""
         fresh = [self.new() for _ in outs]
         for k, (f, out) in enumerate(zip(fresh, outs, strict=True)):
             text = out if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {out})"
@@ -257,7 +257,7 @@ def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
 
 
 def _four_of(op: Operation) -> tuple[Element, Element, int]:
-    """Return the table, index and number of the four entries that a lookup is one of."""
+    """Return the table, the index and the number of the group of four entries that a lookup belongs to."""
     return op.args[0], op.args[1], op.param("offset") // 4
 
 
@@ -278,9 +278,9 @@ def expression(op: Operation, args: Sequence[str]) -> str:
 
 
 def _limit(op: Operation, tests: Mapping[Value, Operation]) -> str | None:
-    """Return the function that a selection is that keeps its first case above or below its second.
+    """Return the name of the function that can replace a selection which limits a number; None for other selections.
 
-    Such is ``x < low ? low : x``, for which a target may have one instruction.
+    An example is ``x < low ? low : x``, for which a target may have an instruction.
 
     Args:
         op: The selection.
@@ -307,12 +307,12 @@ def type_name(dtype: DTypeLike) -> str:
 
 
 def _entry(x: np.generic) -> str:
-    """Return a finite constant without a call, for an initialiser."""
+    """Return a finite constant as a plain literal, for the initialiser of a table."""
     return f"{float(x).hex()}{'f' * (x.dtype == np.float32)}" if x.dtype.kind == "f" else f"{int(x)}"
 
 
 def literal(x: np.generic) -> str:
-    """Return a constant, exactly."""
+    """Return an expression that is exactly equal to a constant."""
     kind = type_name(x.dtype)
     if kind == "b1":
         return "b1(1)" if bool(x) else "b1(0)"

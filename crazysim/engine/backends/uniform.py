@@ -1,4 +1,4 @@
-"""Values that all lanes of a vector share, in blocks with loops: there a variable of one number is enough."""
+"""Values that all lanes of a vector share, in blocks with loops: a scalar variable is enough for such a value."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def is_shared(x: Element, shared: Set[Value]) -> bool:
 
 
 def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
-    """Return the results of an operation that all lanes share, given the values before it that they share."""
+    """Return the results of an operation that all lanes share, given the earlier values that they share."""
     match op.name:
         case "any_lane":
             return list(op.results)
@@ -29,13 +29,13 @@ def shared_results(op: Operation, shared: Set[Value]) -> list[Value]:
 
 
 def shared_carry(op: Operation, shared: Set[Value]) -> list[bool]:
-    """Return for each number that a loop carries whether all lanes share it, from its first turn to its last."""
+    """Return for each number that a loop carries whether all lanes share it in every iteration."""
     *tests, body = op.blocks
     is_same = [is_shared(x, shared) for x in op.args]
     while True:
         inside = _inside(body, is_same, shared)
         after = [same and is_shared(x, inside) for same, x in zip(is_same, body.outputs, strict=True)]
-        for test in tests:  # where lanes stop at different turns, they share nothing that changes
+        for test in tests:  # if lanes may stop at different iterations, they share no number that the loop carries
             if not all(is_shared(x, _inside(test, is_same, shared)) for x in test.outputs):
                 after = [False] * len(is_same)
         if after == is_same:

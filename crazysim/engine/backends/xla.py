@@ -1,4 +1,4 @@
-"""XLA operations of a block: every value is a vector over drones, a lane each."""
+"""Blocks as XLA operations: every value is an array over lanes, one for each drone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 
 Env = dict[Value, Any]
-"""Arrays by the values that they are."""
+"""Array of each value."""
 
 
 def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env | None = None) -> list[Any]:
@@ -27,7 +27,7 @@ def run(block: Block, inputs: Sequence[Array], shape: tuple[int, ...], env: Env 
         block: The block.
         inputs: Its inputs, each of the lanes' shape, or a scalar that all lanes share, or a flat table.
         shape: Shape of the lanes.
-        env: Values of the blocks around it.
+        env: Values of the enclosing blocks.
 
     Returns:
         Its outputs, of the lanes' shape or scalars.
@@ -48,7 +48,7 @@ def _get(env: Env, x: Element) -> Any:
 
 
 def _last_uses(block: Block) -> dict[Value, int]:
-    """Return where each value is used last; an output is used after the end."""
+    """Return the position of the last operation that uses each value; an output is used after the end."""
     last: dict[Value, int] = {}
     for position, op in enumerate(block.operations):
         used = {x for x in op.args if isinstance(x, Value)}.union(*(b.uses() for b in op.blocks))
@@ -58,7 +58,7 @@ def _last_uses(block: Block) -> dict[Value, int]:
 
 
 def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int]) -> None:
-    """Compute once all values that are used later: XLA's CPU backend repeats shared arithmetic for every result."""
+    """Put a barrier on all values that are used later; else XLA's CPU backend recomputes them for every result."""
     results = [x for op in block.operations[:position] for x in op.results]
     live = [x for x in results if last_use.get(x, -1) > position and not x.size and np.ndim(env[x])]
     env.update(zip(live, lax.optimization_barrier([env[x] for x in live]), strict=True))
@@ -137,7 +137,7 @@ def _custom_jvp(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env
 
 
 MAX_UNROLLED = 8
-"""Most drones of a world whose loop over the others is unrolled; the pairs of more have an axis."""
+"""Maximum number of drones per world for which the loop over other drones is unrolled; larger worlds use an axis."""
 
 
 def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
@@ -181,7 +181,7 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
 COMBINE: dict[str, Callable[..., Array]] = {
     "add": lax.add, "min": lax.min, "max": lax.max, "or": lax.bitwise_or, "and": lax.bitwise_and,
 }  # fmt: skip
-"""Operations on two numbers that reductions are made of."""
+"""Operations on two numbers by which reductions combine results."""
 
 REDUCE: dict[str, Callable[..., Array]] = {
     "add": jnp.sum,
@@ -190,10 +190,10 @@ REDUCE: dict[str, Callable[..., Array]] = {
     "or": jnp.any,
     "and": jnp.all,
 }
-"""Reductions of an axis by the names of operations."""
+"""Reductions along an axis, by the name of the operation that combines two numbers."""
 
 MAX_PAIRS = 2**24
-"""Pairs of drones of all worlds that are computed at once; the memory of a gradient grows with them."""
+"""Maximum number of pairs of drones, over all worlds, computed at once; the memory of a gradient grows with it."""
 
 
 def _table(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:

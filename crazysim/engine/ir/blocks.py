@@ -1,8 +1,8 @@
 """The intermediate representation: a block of scalar operations in single-assignment form.
 
 The engine does not compile arrays. Every element of every small array is a separate value, constants are folded,
-and a common subexpression is computed once. Blocks are immutable; a ``Builder`` makes one. What operations there are
-is in ``ops``.
+and a common subexpression is computed once. Blocks are immutable; a ``Builder`` makes one. ``ops`` lists the
+operations.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class Builder:
         params: tuple = (),
         blocks: tuple[Block, ...] = (),
     ) -> tuple[Value, ...]:
-        """Return the results of an operation that has any number of them, or runs blocks."""
+        """Return the results of an operation that may have several results, or runs blocks."""
         args, types = tuple(args), tuple(map(np.dtype, dtypes))
         return self._new(name, args, types, params, blocks) if blocks else self._add(name, args, types, params)
 
@@ -195,7 +195,7 @@ def prune(block: Block, keep_inputs: bool = True) -> Block:
 
     Args:
         block: The block.
-        keep_inputs: False to remove inputs as well that nothing uses.
+        keep_inputs: False to remove unused inputs too.
     """
     block = _prune(block, set())
     if keep_inputs:
@@ -233,7 +233,7 @@ def _drop_results(op: Operation, needed: Collection[Value]) -> Operation:
 
 
 def substitute(block: Block, new: Mapping[Value, Element]) -> Block:
-    """Return a block in which operands and outputs are replaced; what defines them stays."""
+    """Return a block in which operands and outputs are replaced; the operations that define the old ones stay."""
 
     def replaced(x: Element) -> Element:
         return new.get(x, x) if isinstance(x, Value) else x
@@ -252,9 +252,9 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
     """Add a block's operations to a builder, simplified by the constants known there, and return its outputs.
 
     Args:
-        builder: Takes the operations.
+        builder: Builder that the operations are added to.
         block: The block.
-        values: Elements that stand for the block's inputs and for values around it. The block's own values are added.
+        values: Elements for the block's inputs and for values of enclosing blocks. The block's own values are added.
     """
 
     def replaced(x: Element) -> Element:
@@ -266,7 +266,7 @@ def inline(builder: Builder, block: Block, values: dict[Value, Element]) -> list
             builder.barrier()
         elif len(op.results) == 1 and not op.blocks:
             (old,) = op.results
-            # What was simplified when it was built can be simplified further only if a value has become a constant.
+            # Operations were simplified when they were built; more is possible only if a value became a constant.
             if any([isinstance(x, np.generic) for x in args]):
                 values[old] = builder.add(op.name, args, old.dtype, op.params)
             else:

@@ -1,4 +1,4 @@
-"""Programs as text, for people."""
+"""Programs as readable text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INDENT = "  "
 
 
 def list_program(program: Program) -> str:
-    """Return a program as text: what each segment reads, computes and writes, under the names of the fields."""
+    """Return a program as text: the inputs, operations and outputs of each segment, with the names of fields."""
     lines = []
     for segment in program.segments:
         lines.append("")
@@ -31,7 +31,7 @@ def list_program(program: Program) -> str:
 
 
 def list_operation(program: Program, operation: Operation) -> str:
-    """Return the line that an operation has in the listing of a program."""
+    """Return the line of an operation in the listing of a program."""
     for segment in program.fused_segments:
         names = _Names()
         list(_list_segment(program, segment, names))
@@ -43,7 +43,7 @@ def list_operation(program: Program, operation: Operation) -> str:
 def slot_name(program: Program, segment: Segment, slot: Slot) -> str:
     """Return a slot as the field and the element, such as ``states.pos[2]``; in a segment of worlds, with the drone."""
     (i, k), leaf = slot, program.leaves[slot[0]]
-    if k < 0:  # all of it, a table
+    if k < 0:  # the whole leaf, read as a table
         return f"{leaf.name}[:]"
     drone = ""
     if segment.scope == "world" and leaf.scope == "drone":

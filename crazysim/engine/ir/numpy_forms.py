@@ -1,6 +1,6 @@
-"""NumPy's forms of operations where NumPy itself differs from XLA; the table is in ``ops``.
+"""NumPy forms of operations whose NumPy functions differ from XLA; the table of operations is in ``ops``.
 
-Operands are arrays or scalars of NumPy's types.
+Operands are NumPy arrays or scalars.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 
 
 def divide(a: Any, b: Any) -> Any:
-    """Divide; integers towards zero, by zero to all bits set, the least by -1 to itself."""
+    """Divide; integers round towards zero, x / 0 has all bits set, and the smallest integer / -1 is itself."""
     if a.dtype.kind == "f":
         return np.divide(a, b)
     if a.dtype.kind == "u":
@@ -26,7 +26,7 @@ def divide(a: Any, b: Any) -> Any:
 
 
 def remainder(a: Any, b: Any) -> Any:
-    """Return the remainder with the sign of the dividend; of a division by zero the dividend."""
+    """Return the remainder with the sign of the dividend; for integers, the remainder of x / 0 is x."""
     if a.dtype.kind == "f":
         return np.fmod(a, b)
     unsafe = (b == 0) if b.dtype.kind == "u" else (b == 0) | (b == -1)
@@ -34,7 +34,7 @@ def remainder(a: Any, b: Any) -> Any:
 
 
 def sign(x: Any) -> Any:
-    """Return the sign; of zeros, and of NaN, the operand."""
+    """Return the sign; for zeros and NaN, return the operand."""
     return np.where(x > 0, x.dtype.type(1), np.where(x < 0, x.dtype.type(-1 if x.dtype.kind != "u" else 0), x))
 
 
@@ -45,7 +45,12 @@ def round_away(x: Any) -> Any:
 
 
 def shift(shift: Callable[[Any, Any], Any], outside: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a shift that is defined for any number of bits."""
+    """Return a shift that is defined for any number of bits.
+
+    Args:
+        shift: Shift by fewer bits than the type has.
+        outside: Function of the operand that gives the result for other numbers of bits.
+    """
 
     def shifted(x: Any, n: Any) -> Any:
         bits = 8 * x.dtype.itemsize
@@ -73,11 +78,11 @@ def sign_bits(x: Any) -> Any:
 
 
 def convert(x: Any, dtype: DTypeLike) -> Any:
-    """Convert numbers as XLA does: a float to the nearest integer there is, NaN to 0."""
+    """Convert numbers as XLA does: floats are rounded towards zero and saturate as integers, and NaN becomes 0."""
     x, dtype = np.asarray(x), np.dtype(dtype)
     if x.dtype.kind == "f" and dtype.kind in "iu":
         limits = np.iinfo(dtype)
-        low, high = float(limits.min), float(limits.max) + 1  # both are exact
+        low, high = float(limits.min), float(limits.max) + 1  # both are exact, powers of two or 0
         inside = (x > low - 1) & (x < high) if dtype.itemsize < 8 else (x >= low) & (x < high)
         whole = np.where(inside, x, 0).astype(dtype)
         outside = np.where(np.isnan(x), 0, np.where(x >= high, limits.max, limits.min)).astype(dtype)
@@ -86,12 +91,12 @@ def convert(x: Any, dtype: DTypeLike) -> Any:
 
 
 def bitcast(x: Any, dtype: DTypeLike) -> Any:
-    """Return the same bits as another type."""
+    """Reinterpret the bits as another type."""
     return np.asarray(x).view(dtype)
 
 
 def power(a: Any, b: Any) -> Any:
-    """Raise to a power; for an exponent of 0.5 NumPy takes the root, which differs at -inf and -0."""
+    """Raise to a power; for an exponent of 0.5 NumPy takes the square root, which is wrong at -inf and -0."""
     root = (b == 0.5) & ((a == 0) | np.isneginf(a))
     return np.where(root, np.abs(a), np.power(a, b))
 
@@ -102,12 +107,12 @@ def integer_pow(x: Any, y: int) -> Any:
 
 
 def log_gamma(x: Any) -> Any:
-    """Return the logarithm of the absolute value of the gamma function; SciPy has -inf at -inf, XLA inf."""
+    """Return the logarithm of the absolute value of the gamma function; at -inf, XLA returns inf, SciPy -inf."""
     return np.where(np.isinf(x), np.abs(x), special("gammaln")(x))
 
 
 def special(name: str) -> Callable[..., Any]:
-    """Return a function of ``scipy.special``, which JAX depends on; it is imported when it is called."""
+    """Return a function of ``scipy.special``, which is imported at its first call. JAX depends on SciPy."""
 
     def call(*args: Any) -> Any:
         from scipy import special
@@ -118,5 +123,5 @@ def special(name: str) -> Callable[..., Any]:
 
 
 def digamma(x: Any) -> Any:
-    """Return the derivative of the logarithm of the gamma function; XLA has NaN at its poles."""
+    """Return the derivative of the logarithm of the gamma function; XLA returns NaN at its poles."""
     return np.where((x <= 0) & (x == np.floor(x)), x.dtype.type(np.nan), special("digamma")(x))

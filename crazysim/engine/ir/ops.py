@@ -1,12 +1,13 @@
 """The table of operations: meaning and name of each one in every target.
 
-A program has no operation that is not here. One row says which numbers an operation takes, how NumPy computes it (for
-constants and for the interpreter), what it is in XLA, in C++ and CUDA, and in CasADi, and what it costs. A target
-refuses a program with an operation that has no entry for it when the step is planned (``unsupported_error``).
+Programs contain no other operations. A row gives the types of numbers that an operation takes, its form in NumPy (for
+constants and for the interpreter), in XLA, in C++ and CUDA, and in CasADi, and its cost. When a step is planned, a
+target refuses programs with operations that it has no form for (``unsupported_error``).
 
-Integers and conversions follow XLA, which defines what C leaves open: a division by zero gives -1 (all bits set), its
-remainder the dividend; a shift by 32 bits or more gives 0, or the sign; a float becomes the nearest integer there is,
-NaN becomes 0. ``max``, ``min`` and ``clamp`` pass NaN on; the sign of a zero they return is not defined.
+Integers and conversions follow XLA, which defines what C leaves undefined: the quotient of a division by zero is -1
+(all bits set), its remainder the dividend; a shift by the size of the type or more gives 0, or all sign bits; a float
+is rounded towards zero and saturates at the limits of the integer type, and NaN becomes 0. ``max``, ``min`` and
+``clamp`` return NaN if an operand is NaN; the sign of a zero that they return is not defined.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from crazysim.engine.errors import UnsupportedError
 from crazysim.engine.ir import numpy_forms as forms
 
 DTYPES = frozenset(map(np.dtype, "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()))
-"""Types of numbers. In half precision XLA keeps more digits where it fuses, so that no two engines could agree."""
+"""Types of numbers. Half precision is missing: where XLA fuses, it keeps more digits, so engines could not agree."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class OperationForm:
     numpy: Callable[..., Any] | None = None
     """NumPy's form, on arrays or scalars, with static parameters as keywords."""
     exact: bool = False
-    """True where NumPy and XLA agree to the last bit, so that constants are computed at once."""
+    """True where NumPy and XLA agree to the last bit, so that operations on constants are folded."""
     xla: str | Callable[..., Any] = ""
     """Name in ``jax.lax``, or a function of the operands. By default the name of the row."""
     source: str | Mapping[str, str] = "{name}_({all})"
@@ -48,7 +49,7 @@ class OperationForm:
     casadi: str | Callable[..., Any] | None = None
     """Name in ``casadi``, or a function of that module and the operands; None where it has no form."""
     casadi_kinds: str = "fib"
-    """Kinds for which CasADi's form is right; its numbers are float64, and 32 bits without a sign are not."""
+    """Kinds for which CasADi's form is correct. It computes in float64, which does not wrap around as uint32 does."""
     cost: float = 1
     """Cost in multiply-adds."""
     structured: bool = False
@@ -86,7 +87,7 @@ def unsupported_error(name: str, dtypes: Sequence[np.dtype], result: Any = bool)
 
 
 def _casadi_erf_inv(ca: Any, x: Any) -> Any:
-    """Return the inverse of the error function; CasADi has six digits, and each step of Newton doubles them."""
+    """Return the inverse error function: CasADi's result has six correct digits, and each Newton step doubles them."""
     y = ca.erfinv(x)
     for _ in range(2):
         y = y - (ca.erf(y) - x) * (np.sqrt(np.pi) / 2) * ca.exp(y * y)
@@ -99,11 +100,11 @@ def _casadi_round_even(ca: Any, x: Any) -> Any:
 
 
 _LARGEST_FLOAT64 = float(np.finfo(np.float64).max)
-"""CasADi has no operation that tests for finite numbers."""
+"""Largest finite number, for the test for finite numbers, which CasADi lacks."""
 
 
 def _rows() -> list[OperationForm]:
-    """Return the rows, operations of a kind together."""
+    """Return the rows of the table, grouped by kind of operation."""
     any_number, integer = "fiu", "iu"
 
     def unary(name: str, numpy: Any, cost: float, casadi: Any = None, **more: Any) -> OperationForm:
@@ -157,7 +158,7 @@ def _rows() -> list[OperationForm]:
         unary("log", np.log, 8, "log"),
         unary("log1p", np.log1p, 16, "log1p"),
         unary("logistic", lambda x: 1 / (1 + np.exp(-x)), 8, lambda ca, x: 1 / (1 + ca.exp(-x))),
-        unary("sin", np.sin, 8, "sin"),  # most of the work for one of the two is that for the other:
+        unary("sin", np.sin, 8, "sin"),  # sine and cosine share most of their work:
         unary("cos", np.cos, 8, "cos"),  # the source computes them together
         unary("tan", np.tan, 16, "tan"),
         unary("asin", np.arcsin, 16, "asin"),
@@ -225,33 +226,34 @@ def _lax() -> Any:
 TABLE: Mapping[str, OperationForm] = {row.name: row for row in _rows()}
 """All operations by name.
 
-``barrier`` separates stages: what is used behind it is computed once. ``when(mask, *old)`` has the outputs of its block
-where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block that often;
-``while(*carry)`` runs its second block as long as its first is true. ``custom_jvp(*args, slope=)`` runs its block, and
-has a derivative of its own. ``over_others(*published, reduce=, n_members=)`` runs its block for each drone of the
-world: the block's inputs are what that drone published, and whether it is the drone itself; ``reduce`` names the
-operation that combines its outputs. It stands in no inner block. ``threefry2x32`` is the cipher of JAX's random
-numbers. ``again(x, part=)`` is x, which compilers of kernels may take for another number in each part: what is computed
-from it is computed once more.
-``table(numbers=)`` is a table of constants, and ``lookup(table, index, offset=, aligned=)`` the entry at the sum of an
-int32, which is a multiple of four if that is aligned, and a constant; whoever makes one ensures that there is one.
-``any_lane`` is true at least where its operand is: a target may give all lanes of a vector what is true of any.
+``barrier`` separates stages: values that are used after it are computed once, before it. ``when(mask, *old)`` returns
+the outputs of its block where the mask is true, and the old numbers elsewhere. ``loop(*carry, length=)`` runs its block
+``length`` times; ``while(*carry)`` runs its second block as long as its first returns true. ``custom_jvp(*args,
+slope=)`` runs its block, and has a custom derivative. ``over_others(*published, reduce=, n_members=)`` runs its block
+for each drone of the world: the inputs of the block are the numbers that this drone published, and whether it is the
+reading drone itself; ``reduce`` names the operation that combines each output. It never occurs in an inner block.
+``threefry2x32`` is the cipher of JAX's random numbers. ``again(x, part=)`` is x as a new value in each part, so that
+the numbers that depend on it are recomputed; compilers on the host may still merge them.
+``table(numbers=)`` is a table of constants. ``lookup(table, index, offset=, aligned=)`` is its entry at the sum of an
+int32 index (a multiple of four if ``aligned``) and a constant offset, which must be in bounds.
+``any_lane`` is true at least where its operand is; a target may return true in all lanes of a vector if any is true.
 
-Costs are counted with what decides them: comparisons with selections, signs with what takes them. Functions cost what
-hardware that approximates them and a step that refines take, or the shortest polynomial that is exact to float32;
-twenty rounds of add, rotate and xor make a random number. An operation that runs a block costs what that does.
+Comparisons cost nothing, as they are counted with selections; nor do changes of sign, as part of other operations. The
+cost of a function is that of a hardware approximation and a step that refines it, or of the shortest polynomial that is
+exact to float32. A random number takes twenty rounds of add, rotate and xor. An operation that runs a block costs as
+much as the block.
 """
 
 REDUCTIONS: Mapping[str, str] = {"sum": "add", "min": "min", "max": "max"}
 """Operations that combine the results of ``over_others``."""
 
 INDEX_REDUCTIONS: Mapping[str, str] = {"argmin": "lt", "argmax": "gt"}
-"""Reductions to the first drone with the smallest or largest number, and how a number compares that replaces it. Only
-derivatives in kernels have them."""
+"""Reductions to the index of the first drone with the smallest or largest number, and the comparison by which a number
+replaces the best so far. Only derivatives in kernels use them."""
 
 
 def neutral_number(name: str, dtype: np.dtype) -> np.generic:
-    """Return the number that an operation of ``REDUCTIONS`` begins with; ``or`` and ``and`` stand for max and min."""
+    """Return the initial number of a reduction; for bools ``or`` and ``and`` replace max and min."""
     if name in ("add", "or", "and", *INDEX_REDUCTIONS):
         return dtype.type(name == "and")
     limits = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
@@ -266,4 +268,4 @@ BOOLEAN_FORM: Mapping[str, tuple[str, int | None]] = {
     "max": ("or", None),
     "min": ("and", None),
 }
-"""Order of bools as logic, and which operand is negated for it."""
+"""Logical operations that replace operations of order on bools, and the index of the operand to negate, if any."""

@@ -1,7 +1,7 @@
 """Programs: the stages of a step as operations on the numbers of one drone or one world.
 
-A program is immutable. Stages are lowered to one (``lower_stages``), and passes make another of it (``passes``,
-``layout``). ``listing.list_program`` shows it.
+A program is immutable. ``lower_stages`` makes a program from stages, and each pass (``engine.passes``) returns a new
+one. ``listing.list_program`` prints it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Slot = tuple[int, int]
 """Index of a number: of its leaf, and of the element in the part of the leaf that belongs to one drone (or world)."""
 
 TABLE_INDEX = -1
-"""Element of a slot that means the whole leaf, a table: only shared leaves are tables."""
+"""Element index of a slot that stands for a whole leaf, read as a table. Only shared leaves are tables."""
 
 PACKED_LEAF_NAME = "packed"
-"""Name of the leaf of shared numbers."""
+"""Name of the leaf that holds the packed shared leaves."""
 
 Zeros = tuple[tuple[int, frozenset[int]], ...]
 """Leaves with the elements of them that are known to be zero."""
@@ -45,7 +45,7 @@ class Leaf:
     dtype: Any
     """Type."""
     rows_of: tuple[int, ...] = ()
-    """Leaves whose numbers are the rows of this one, (n_rows, n_lanes), from the first row on; empty if it is none."""
+    """Leaves whose numbers are the rows of this leaf in order, (n_rows, n_lanes); empty for a leaf without rows."""
 
     @functools.cached_property
     def size(self) -> int:
@@ -66,7 +66,7 @@ class Segment:
     """Stages that run together, as a block of scalar operations."""
 
     scope: Literal["drone", "world"]
-    """Whose numbers the block computes on."""
+    """Whether the block computes on the numbers of one drone or of one world."""
     stages: tuple[str, ...]
     """Names of the stages."""
     phase: Phase
@@ -74,13 +74,13 @@ class Segment:
     block: Block
     """The block. Its inputs are ``reads``, then the outputs of ``hoisted``; its outputs are ``writes``."""
     reads: tuple[Slot, ...]
-    """Places of its inputs. In a segment of worlds, a leaf of drones has its numbers drone after drone."""
+    """Slots of its inputs. In a segment of worlds, the elements of a drone leaf are numbered drone after drone."""
     writes: tuple[Slot, ...]
-    """Places of its outputs."""
+    """Slots of its outputs."""
     hoisted: Block = dataclasses.field(default_factory=Block)
     """Computations hoisted out of the steps, run once before the first step."""
     hoisted_reads: tuple[Slot, ...] = ()
-    """Places of the inputs of ``hoisted``."""
+    """Slots of the inputs of ``hoisted``."""
 
     @property
     def written(self) -> list[int]:
@@ -118,7 +118,7 @@ class UnfusedStage:
     written: tuple[int, ...]
     """Leaves that it writes."""
     error: UnsupportedError
-    """Reason for which the stage is not fused."""
+    """Reason why the stage is not fused."""
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -151,9 +151,9 @@ class Program:
     scratch: frozenset[int] = frozenset()
     """Leaves that only carry numbers from one stage to another; their values are not kept."""
     packed: tuple[int, ...] = ()
-    """Shared leaves that one further leaf holds one after the other."""
+    """Shared leaves that are concatenated in one additional leaf."""
     population: str = "drone"
-    """Population whose members it computes side by side; here they are called drones, with scope ``drone``."""
+    """Population whose members are computed side by side. Here they are called drones and have the scope ``drone``."""
     views: frozenset[int] = frozenset()
     """Leaves of other populations, viewed as leaves of the world (``relative``)."""
 
@@ -174,17 +174,17 @@ class Program:
 
     @functools.cached_property
     def written(self) -> list[int]:
-        """Numbers of the leaves that are written."""
+        """Indices of the leaves that are written, without scratch."""
         return sorted({i for s in self.segments for i in s.written} - self.scratch)
 
     @functools.cached_property
     def read(self) -> list[int]:
-        """Numbers of the leaves that are read."""
+        """Indices of the leaves that are read."""
         return sorted({i for s in self.segments for i in s.read})
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
-        """Ranks of the leaves that take part, by which kernels name them; equal steps have equal ranks."""
+        """Rank of each leaf that is used, which kernels use in names; equal steps have equal ranks."""
         checked = [leaf for leaf, _ in self.check.reads] if self.check is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read, *s.written))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}
@@ -210,7 +210,7 @@ class Program:
         return [segment for segment in self.segments if segment.phase == phase]
 
     def per_drone(self, segment: Segment, slots: Sequence[Slot]) -> list[Slot]:
-        """Return the slots of a segment as slots of one drone. In a segment of worlds they count all of its drones."""
+        """Return the slots of a segment as slots of one drone; a segment of worlds has slots for each of its drones."""
         if segment.scope == "drone":
             return list(slots)
         return [(i, k if k == TABLE_INDEX else k % self.leaves[i].size) for i, k in slots]

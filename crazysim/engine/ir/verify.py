@@ -1,4 +1,4 @@
-"""Checks that a program is well formed, for tests of passes and for whoever writes one."""
+"""Checks that a program is well formed, for tests of passes and for authors of passes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from crazysim.engine.ir.program import TABLE_INDEX, Program, Segment, Slot
 
 
 class VerificationError(AssertionError):
-    """A program that a defect of the engine has made."""
+    """Error of a program that is not well formed, because of a defect of the engine."""
 
 
 def verify(program: Program) -> Program:
     """Return a program unchanged, or raise an error that says what is wrong with it.
 
-    Values are defined once, before they are used; operands and results have the types that the table says; inputs and
-    outputs fit the numbers they are; no slot is read or written twice; nothing hoisted depends on a step.
+    Values are defined once, before they are used; operands and results have the types of the table of operations;
+    inputs and outputs have the types of their slots; no slot is read or written twice; hoisted blocks read no number
+    that steps change.
 
     Raises:
         VerificationError: If it is not well formed.
@@ -78,7 +79,7 @@ def _slots(
 
 
 def _verify_block(block: Block, defined: set[Value]) -> None:
-    """Check a block; ``defined`` are all values seen so far, to which its own are added."""
+    """Check a block; ``defined`` holds all values so far, and the block's values are added to it."""
     visible = set(defined)
 
     def define(values: tuple[Value, ...]) -> None:

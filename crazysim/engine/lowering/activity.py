@@ -16,7 +16,7 @@ from crazysim.engine.ir.program import Program, Segment, Slot
 
 
 def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program, tuple[int, ...]]:
-    """Return a program without its check, and the perturbed leaves that are floats and are used by it."""
+    """Return a program without its check, and the perturbed leaves that are floats and that it uses."""
     if not program.fused:
         raise LimitError(f"{program.unfused_stages[0].name!r} is not fused")
     if program.rows:
@@ -30,7 +30,10 @@ def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program
 
 
 def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot], dict[Segment, tuple[int, ...]]]:
-    """Return the numbers that depend differentiably on the perturbed leaves, and such hoisted outputs by segment."""
+    """Return the numbers that depend differentiably on the perturbed leaves.
+
+    Also return, by segment, the indices of the outputs of its hoisted block that do.
+    """
     changed = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     constants: dict[Segment, tuple[int, ...]] = {}
 
@@ -49,7 +52,7 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
         run(s)
     for s in program.phase_segments("each"):
         constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
-    while True:  # a number that one step changes may change more in the next
+    while True:  # numbers that depend on the leaves after one step may affect others in the next
         before = len(changed)
         for s in program.phase_segments("each"):
             run(s)
@@ -72,7 +75,7 @@ def _propagate(block: Block, active: set[Value]) -> None:
         if op.name == "over_others":
             (body,) = op.blocks
             active.update(x for x, arg in zip(body.inputs, op.args, strict=False) if arg in active)
-        if op.name in ("loop", "while"):  # what changes in one turn may change all that the next one computes
+        if op.name in ("loop", "while"):  # an active number of one iteration may affect all floats of the next
             has_active = any(x in active for x in (*op.args, *op.blocks[-1].uses()))
             if has_active:
                 active.update(x for x in op.blocks[-1].inputs if x.dtype.kind == "f")
@@ -88,7 +91,7 @@ def _propagate(block: Block, active: set[Value]) -> None:
 
 
 def apply_operation(name: str, args: Sequence[Any], dtype: np.dtype, params: tuple) -> Any:
-    """Return the result of an operation as JAX computes it, which can be differentiated."""
+    """Return the result of an operation, computed by JAX, which can differentiate it."""
     if name in ("convert_element_type", "bitcast_convert_type"):
         return getattr(lax, name)(args[0], dtype)
     fn = ops.TABLE[name].xla or name

@@ -37,10 +37,10 @@ class _Access(NamedTuple):
 
 
 def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> list[Group]:
-    """Return the groups of populations that do not depend on each other, first the group of the drones.
+    """Return the groups of populations that do not depend on each other. The group of the drones comes first.
 
-    Two stages depend on each other if one reads or writes what the other writes. Stages of worlds alone, such as the
-    clock, are repeated in every group that reads their results.
+    Two stages depend on each other if one reads or writes a leaf that the other writes. Stages that only use leaves of
+    worlds, such as the clock, are repeated in every group that reads their results.
 
     Args:
         stages: Stages of a step, in order.
@@ -59,7 +59,7 @@ def independent_groups(stages: Sequence[Stage], data: Any, tracer: Tracer) -> li
     if not parts or "drone" not in parts[0][1]:
         parts.insert(0, (set(), frozenset({"drone"})))
     parts = [(_with_clocks(indices, clocks, access), populations) for indices, populations in parts]
-    parts[0] = (parts[0][0] | clocks, parts[0][1])  # the drones' program is what it is without other populations
+    parts[0] = (parts[0][0] | clocks, parts[0][1])  # the drones run all clocks, as without other populations
     groups, taken = [], frozenset()
     for indices, populations in parts:
         written = frozenset().union(*(access[k].written for k in indices))
@@ -76,7 +76,7 @@ def _access(traced: TracedStage, stage: Stage, axes: Axes) -> _Access:
 
 
 def _clocks(access: Sequence[_Access], axes: Axes) -> set[int]:
-    """Return the stages that read and write leaves of worlds alone, which no other stage writes."""
+    """Return the stages that use no leaf of a population, and no leaf that a stage outside this set writes."""
     clocks = {k for k, a in enumerate(access) if not any(has_members(axes.scopes[i]) for i in a.touched)}
     while True:
         others = frozenset().union(*(a.written for k, a in enumerate(access) if k not in clocks))
@@ -101,7 +101,7 @@ def _components(stages: Iterable[int], access: Sequence[_Access]) -> list[set[in
 
 
 def _depend(a: _Access, b: _Access) -> bool:
-    # Stages of worlds that write no population's leaf go with the drones, if nothing joins them to others.
+    # A stage without a population counts as a stage of the drones.
     populations = (a.populations or {"drone"}) & (b.populations or {"drone"})
     return bool(populations or a.written & b.touched or b.written & a.touched)
 

@@ -1,8 +1,8 @@
-"""From a jaxpr to a block of scalar operations.
+"""Lowering of a jaxpr to a block of scalar operations.
 
-A function that is written for one drone is traced by JAX, and its jaxpr lowered equation by equation. An array is a
-NumPy object array of elements (``ir``). A rule says what a primitive means for elements; there are four kinds, and
-most primitives need no rule of their own:
+JAX traces a function that is written for one drone, and its jaxpr is lowered equation by equation. An array becomes a
+NumPy object array of elements (``ir``). A rule defines a primitive on elements. There are four kinds of rules, and most
+primitives need no rule of their own:
 
 - element-wise: the same operation for every element;
 - movement: nothing is computed, so the primitive is run once on the indices of the elements;
@@ -64,12 +64,12 @@ class Lowering:
     def __init__(
         self, builder: Builder | None = None, entries: dict[Value, TableEntry] | None = None, n_members: int = 0
     ):
-        """Add operations to a block, to a new one if none is given.
+        """Create a lowering that adds operations to a block.
 
         Args:
-            builder: Builder of the block.
-            entries: Numbers that can also be looked up in tables, to which others are added.
-            n_members: Number of drones of a world, for a function of one drone; 0 where it has no others.
+            builder: Builder of the block; None for a new one.
+            entries: Table entries of numbers that can also be looked up; more are added. None for no entries.
+            n_members: Number of drones of a world, for a function of one drone; 0 if it cannot read other drones.
         """
         self.builder = Builder() if builder is None else builder
         self.entries = {} if entries is None else entries
@@ -107,7 +107,7 @@ class Lowering:
             raise error.located(name) from None
 
     def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
-        """Return an operation on every element; scalars stand for arrays of any shape."""
+        """Return the results of an operation on every element; operands are broadcast."""
         shapes = {x.shape for x in args}
         shape = args[0].shape if len(shapes) == 1 else np.broadcast_shapes(*shapes)
         rows = [(x if x.shape == shape else np.broadcast_to(x, shape)).reshape(-1) for x in args]
@@ -128,7 +128,7 @@ class Lowering:
         return as_elements([self.builder.add(op, column, dtype, params) for column in zip(*rows, strict=True)], shape)
 
     def scalar(self, op: str, *args: Element, dtype: Any = None) -> Element:
-        """Return an operation on single elements; of the last operand's type, unless another is given."""
+        """Return the result of an operation on single elements; its default type is that of the last operand."""
         return self.builder.add(op, args, args[-1].dtype if dtype is None else dtype)
 
     def inner(self) -> Lowering:
@@ -136,7 +136,7 @@ class Lowering:
         return Lowering(Builder(self.builder), self.entries, self.n_members)
 
     def lookup(self, table: Value, base: Element, offset: int, aligned: bool) -> Element:
-        """Return a number of a table, whose base is a multiple of four if it is aligned."""
+        """Return the entry of a table at ``base + offset``; ``aligned`` says that the base is a multiple of four."""
         number = self.builder.add("lookup", (table, base), table.dtype, (("offset", offset), ("aligned", aligned)))
         self.entries[number] = TableEntry(table, base, offset, aligned)
         return number
@@ -147,20 +147,20 @@ class Lowering:
 
 
 class TableRows:
-    """A table in memory with any number of rows, which a function reads by whole rows (``table_row``)."""
+    """A table in memory with any number of rows, from which a function reads whole rows (``table_row``)."""
 
     def __init__(self, builder: Builder, aval: Any):
         """Add the table as an input of a block.
 
         Args:
-            builder: Takes the input.
-            aval: Shape and type of the table: two axes.
+            builder: Builder that the input is added to.
+            aval: Shape and type of the table, (n_rows, row_size).
         """
         self._size = int(aval.shape[1])
         self._table = builder.input(aval.dtype, self._size)
 
     def row(self, ctx: Lowering, index: Element, sizes: Sequence[int]) -> Elements:
-        """Return the row at an index, which is in range. (1, k)"""
+        """Return the row at an index, which must be in range. (1, row_size)"""
         if tuple(sizes) != (1, self._size):
             raise UnsupportedError(f"a part of shape {tuple(sizes)} of a table; only whole rows are read")
         base = ctx.scalar("mul", index, constant(self._size, np.int32))
@@ -195,9 +195,9 @@ def inputs(builder: Builder, aval: Any, zeros: frozenset[int] = frozenset()) -> 
     """Return an array as new inputs of a block.
 
     Args:
-        builder: Takes the inputs.
+        builder: Builder that the inputs are added to.
         aval: Shape and type of the array.
-        zeros: Flat indices of elements that are known to be zero: they are no inputs.
+        zeros: Flat indices of elements that are known to be zero; they become constants instead of inputs.
     """
     size = int(np.prod(aval.shape, dtype=int))
     if is_key(aval):
@@ -213,7 +213,7 @@ def lower_function(fn: Callable[..., Any], *avals: Any) -> Block:
     """Return the block of a function of small arrays.
 
     Args:
-        fn: From arrays to an array, or to any tree of arrays.
+        fn: Function from arrays to any tree of arrays.
         avals: Shapes and types of the arguments.
 
     Raises:

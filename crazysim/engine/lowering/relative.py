@@ -1,7 +1,7 @@
 """Stages and data as seen from one population, whose members an engine computes side by side.
 
-For the engine the members of that population are what drones are otherwise. Leaves of other populations are viewed as
-leaves of the world, (n_worlds, 1, n_members, ...), and their stages as stages of the world.
+The engine treats the members of that population as drones. Leaves of other populations are viewed as leaves of the
+world, (n_worlds, 1, n_members, ...), and their stages as stages of the world.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class RelativeAxes(Axes):
-    """Batch axes of all leaves with one population in the role of the drones: its scope is ``drone``.
+    """Batch axes of all leaves if the members of one population are treated as drones, with scope ``drone``.
 
-    Leaves of other populations become leaves of the world, in the data as ``view_leaves`` returns it.
+    Leaves of other populations have scope ``world``, with the shapes that ``view_leaves`` returns.
     """
 
     def __init__(self, data: Any, population: str):
@@ -61,7 +61,7 @@ class RelativeStage(Stage):
         restored = restore_leaves(views, before)
         after, after_treedef = jax.tree.flatten(self.original(treedef.unflatten(restored)))
         if after_treedef != treedef:
-            return after_treedef.unflatten(after)  # the caller refuses it
+            return after_treedef.unflatten(after)  # the caller raises an error
         new = view_leaves(views, after)
         unchanged = [x is y for x, y in zip(after, restored, strict=True)]
         return treedef.unflatten([old if same else x for old, x, same in zip(before, new, unchanged, strict=True)])
@@ -84,7 +84,7 @@ def _reshape(x: Any, shape: tuple[int, ...]) -> Any:
 
 
 def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of the leaves of the data, from one of leaves from ``view_leaves``."""
+    """Wrap a function of leaves from ``view_leaves`` as a function of the leaves of the data."""
     views, written = program.views, program.written
     if not views:
         return run

@@ -1,8 +1,8 @@
 """The smallest or largest number over other drones, in a form that has derivatives.
 
-Its derivative is the derivative of the number of the first drone that has it, as ``crazysim.core.others`` defines it.
-The drone is found by its index, not by equality with the smallest number, since numbers computed twice may be rounded
-differently.
+Its derivative is the derivative of the number of the first drone that has the smallest or largest number, as
+``crazysim.core.others`` defines it. That drone is identified by its index, not by comparing numbers, since numbers that
+are computed twice may be rounded differently.
 """
 
 from __future__ import annotations
@@ -10,11 +10,14 @@ from __future__ import annotations
 from crazysim.engine.ir.blocks import Block, Builder, Element, Operation, Value, constant, inline, prune
 
 INDEX_REDUCTION_OF = {"min": "argmin", "max": "argmax"}
-"""Reductions, see ``ops.INDEX_REDUCTIONS``, that find the drone with the smallest or largest number."""
+"""Reduction that finds the drone with the smallest or largest number (``ops.INDEX_REDUCTIONS``)."""
 
 
 def add_selections(block: Block) -> Block:
-    """Return a block with two loops for each such number: one finds the drone that has it, one adds its number."""
+    """Return a block with two further loops for each operation with minima or maxima over other drones.
+
+    The first finds the drones that have them. The second selects the numbers of these drones.
+    """
     if not any(map(_selecting_results, block.operations)):
         return block
     builder = Builder()
@@ -29,7 +32,7 @@ def add_selections(block: Block) -> Block:
 
 
 def _selecting_results(op: Operation) -> list[int]:
-    """Return the results of an operation that are the smallest or largest of floats."""
+    """Return the indices of the results of an operation that are a minimum or maximum of floats."""
     if op.name != "over_others":
         return []
     pairs = zip(op.param("reduce"), op.results, strict=True)
@@ -42,7 +45,7 @@ def _select_own(builder: Builder, op: Operation, indices: list[int], values: dic
     dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))
 
     def of_pair(n_more: int) -> tuple[Builder, list[Value], list[Element]]:
-        """Return the body once more with further published integers, which follow the others."""
+        """Return a copy of the body with further published integers, which follow the other inputs."""
         inner = Builder(builder)
         fresh = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_more)]
         is_self = inner.input(bool)
@@ -52,7 +55,7 @@ def _select_own(builder: Builder, op: Operation, indices: list[int], values: dic
 
     inner, (is_self,), candidates = of_pair(0)
     one, zero = (constant(x, dtypes[0]) for x in (1, 0))
-    is_largest = inner.add("select_n", (is_self, zero, one), dtypes[0])  # the drone itself has the largest
+    is_largest = inner.add("select_n", (is_self, zero, one), dtypes[0])  # its argmax is the index of the drone itself
     names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
     block = prune(inner.finish([*candidates, is_largest]))
     *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),

@@ -1,4 +1,4 @@
-"""From the stages of a pipeline to a program: a segment for each."""
+"""Lowering of the stages of a pipeline to a program, with one segment for each stage."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from crazysim.jaxcompat import equations, is_key
 from crazysim.pytree import leaf_flags
 
 MAX_UNROLLED_DRONES = 8
-"""Most drones of a world for which a stage of one world is lowered; its block grows with their square."""
+"""Maximum number of drones per world for which stages of scope ``world`` are lowered; blocks grow as its square."""
 
 
 def lower_stages(
@@ -35,15 +35,16 @@ def lower_stages(
 ) -> Program:
     """Return the program of a step, with one segment per stage.
 
-    A stage that cannot be lowered becomes an ``UnfusedStage``, which says why.
+    A stage that cannot be lowered becomes an ``UnfusedStage``, which holds the reason.
 
     Args:
         stages: Stages of a step, in order within their phases.
         data: Data of the simulation, or its shapes and types.
-        zeros: Leaves with the elements that are known to be zero: their terms are left out, unless a stage writes the
-            leaf.
-        watched: Picks the leaves that are checked for NaN and infinity after the last step; called with a tree of the
-            structure of the data. None for no check; there is none either where a stage writes the flag itself.
+        zeros: Leaves with the elements that are known to be zero. Terms with them are left out, unless a stage writes
+            the leaf.
+        watched: Function that selects the leaves to check for NaN and infinity after the last step, from a tree of
+            leaf indices with the structure of the data. None for no check. There is no check either if a stage writes
+            the flag itself.
         population: Population whose members are computed side by side; below they are called drones.
         tracer: Cache of traced stages; None for a new one.
     """
@@ -80,8 +81,8 @@ def _before_the_steps(
 ) -> list[Segment | UnfusedStage]:
     """Return the segments of a step. Leading segments that begin an episode run before the first step of a call.
 
-    An episode begins nowhere else as long as one stage alone writes the ``clock``, the leaf of step counts. What such
-    a stage writes is fixed in the steps, so that what follows from it can be computed once.
+    An episode cannot begin during a call as long as at most one stage writes the ``clock``, the leaf of step counts.
+    Numbers that only the moved segments write are then constant during the steps, and can be hoisted.
     """
     if sum(clock in s.written for s in segments) > 1:
         return list(segments)
@@ -104,7 +105,7 @@ def _lower_stage(
         if stage.scope == "batch":
             raise LimitError(stage.why)
         traced = tracer(stage, axes, leaves)
-        # Where no leaf of a drone takes part, every drone can do it for its world.
+        # If a stage of a world uses no leaf of drones, every drone can run it for its world.
         of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
         scope: Literal["drone", "world"] = "world" if stage.scope == "world" and of_drones else "drone"
         if scope == "world" and n_drones > MAX_UNROLLED_DRONES:
@@ -158,7 +159,7 @@ def _segment(
 
 
 def _table(lowering: Lowering, elements: Elements) -> Value:
-    """Return a table of the numbers of a shared array, which can also be looked up there."""
+    """Return a table of the elements of a shared array, and register the entry of each element in it."""
     items = elements.reshape(-1)
     table = lowering.builder.input(items[0].dtype, len(items))
     zero = constant(0, np.int32)
@@ -171,8 +172,8 @@ def _lower_guarded(
 ) -> list[Elements]:
     """Return the written leaves after a stage that acts where a mask is true.
 
-    Drones whose stages act at different steps still publish values for each other, so that such a stage is computed
-    at every step, and selected.
+    A stage that reduces over other drones is computed at every step, and its results are selected by the mask, because
+    drones need each other's values even if their stages act at different steps.
     """
     together = any(eqn.primitive is reduce_over_others_p for eqn in equations(traced.fn))
     inner = lowering if together else lowering.inner()
@@ -190,16 +191,17 @@ def _lower_guarded(
 
 
 def _replace_scalars(template: Elements, items: Sequence[Element]) -> Elements:
-    """Return elements of the same shape; of a key, two integers."""
+    """Return the scalars as elements with the shape of the template; a key consists of two integers."""
     row = iter(items)
     pairs = [(next(row), next(row)) if isinstance(x, tuple) else next(row) for x in template.reshape(-1)]
     return as_elements(pairs, template.shape)
 
 
 def _finite_check(axes: Axes, leaves: Sequence[Any], flag: int, steps: int, watched: Sequence[int]) -> Segment:
-    """Return a segment that flags a drone: its world was flagged, or a watched number is not finite.
+    """Return a segment that flags a drone whose world was flagged, or of which a watched number is not finite.
 
-    Or the world has taken more than ``MAX_STEPS``: as a call takes at most that many, its count is then negative.
+    It also flags drones of worlds that took more than ``MAX_STEPS`` steps. A call takes at most that many steps, so the
+    count has overflowed and is negative.
     """
     builder = Builder(stage="finite_check")
     reads: list[Slot] = []

@@ -1,7 +1,7 @@
 """Forward mode: the tangents of a program's numbers, computed along with the numbers.
 
-The result is a program like any other. Its tangents are further leaves, and the derivative of each operation follows
-the operation, in the same loops and conditions.
+The result is an ordinary program. Its tangents are additional leaves, and the derivative of each operation follows the
+operation, in the same loops and conditions.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Values = dict[Value, Element]
 
 
 def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
-    """Return the program that computes the tangents of a program's numbers besides the numbers.
+    """Return a program that computes the tangents of a program's numbers in addition to the numbers.
 
     Leaf ``len(program.leaves) + i`` is the tangent of leaf ``i``; each world has its own tangent of a leaf that all
     drones share. The program reads the tangents of the perturbed leaves and writes the tangents of leaves that depend
@@ -101,8 +101,8 @@ def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
         wanted: Inputs whose tangents are given, floats.
 
     Returns:
-        The block from the inputs of ``block``, and behind them the tangents of ``wanted``, to the outputs of ``block``,
-        and behind them a tangent of each that is a float.
+        The extended block. Its inputs are the inputs of ``block``, followed by the tangents of ``wanted``. Its outputs
+        are the outputs of ``block``, followed by a tangent for each output that is a float.
     """
     indices = [block.inputs.index(x) for x in wanted]
     block = add_selections(block)
@@ -115,7 +115,7 @@ def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
 
 
 def _tangents_of(elements: Sequence[Element], tangents: Values) -> list[Element]:
-    """Return the tangents of the floats among some elements, with zeros where there is none."""
+    """Return the tangents of the floats among some elements; a missing tangent is zero."""
     return [_tangent(x, tangents) for x in elements if x.dtype.kind == "f"]
 
 
@@ -128,9 +128,9 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
     """Add a block's operations with their derivatives to a builder, and return its outputs.
 
     Args:
-        builder: Takes the operations.
+        builder: Builder that the operations are added to.
         block: The block.
-        values: Elements of the builder for the block's inputs and the values around it. Its results are added.
+        values: Elements of the builder for the block's inputs and for values of enclosing blocks. Results are added.
         tangents: Tangents of these values that are not zero. The tangents of its results are added.
     """
     for op in block.operations:
@@ -155,13 +155,13 @@ def _map_element(x: Element, values: Values) -> Element:
 
 
 def _record(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
-    """Note the tangents of some results, unless they are zero."""
+    """Record the tangents of some results, unless they are zero."""
     tangents.update((x, t) for x, t in zip(results, elements, strict=True) if isinstance(t, Value) or t != 0)
 
 
 @functools.lru_cache(maxsize=1024)
 def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block from operands, and the tangents of floats among them, to the tangent of an operation."""
+    """Return the block from the operands of an operation and the tangents of its float operands to its tangent."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def push(*args: Any) -> Any:
@@ -206,7 +206,7 @@ def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Value
 
 
 def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Carry a tangent for each float: what changes in one turn may change all that the next one computes."""
+    """Carry a tangent for each float: any float may depend on a perturbed number after further iterations."""
     *test, body = op.blocks
     if not any(isinstance(x, Value) and x in tangents for x in (*op.args, *body.uses())):
         inline(builder, Block((), (op,), ()), values)
@@ -229,7 +229,7 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
 
 
 def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
-    """Publish tangents with the numbers that a drone publishes, and add up the tangents of sums."""
+    """Publish the tangents of published numbers too, and sum the tangents of outputs that are summed."""
     (body,) = op.blocks
     *others, is_self = body.inputs
     inner = Builder(builder)

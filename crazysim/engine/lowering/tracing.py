@@ -48,7 +48,7 @@ class TracedStage:
         self.fn = jaxcompat.select_inputs(fn, self.used)
         self.when = jaxcompat.select_inputs(when, self.used) if when is not None else None
         self.segments: dict[Any, Any] = {}
-        """Segments that it was lowered to, by what they depend on besides."""
+        """Segments that it was lowered to, by all else that they depend on."""
 
     def dump(self, name: str) -> None:
         """Write the jaxprs to the folder of dumps, if there is one."""
@@ -63,7 +63,7 @@ class Tracer:
         self._found: dict[Any, tuple[Stage, TracedStage]] = {}  # the stage keeps its functions, whose ids are keys
 
     def __call__(self, stage: Stage, axes: Axes, leaves: Sequence[Any]) -> TracedStage:
-        """Return ``TracedStage(stage, axes, leaves)``, traced now or before."""
+        """Return ``TracedStage(stage, axes, leaves)``, from the cache if possible."""
         shapes = tuple([(x.shape, x.dtype) for x in axes.shapes_of_one(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._found:
@@ -77,13 +77,16 @@ class Tracer:
 
 
 _TRACED_STAGES: dict[Any, TracedStage] = {}
-"""Traced stages that always do the same, for all simulations of this process."""
+"""Traced fixed stages, for all simulations of this process."""
 MAX_TRACED_STAGES = 256
-"""Largest number of them."""
+"""Maximum number of traced stages that are kept."""
 
 
 def _trace_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
-    """Return a fixed stage, traced now or before in this process. It must not read the numbers of worlds and drones."""
+    """Return a traced fixed stage, from the cache of this process if possible.
+
+    The stage must not read the numbers of worlds and drones.
+    """
     data = axes.treedef.unflatten(leaves)
     kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))
     key = (stage.fn, stage.when, kind, tuple(axes.scopes), shapes, jax.config.jax_enable_x64)

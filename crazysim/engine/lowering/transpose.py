@@ -1,8 +1,8 @@
 """Reverse mode on blocks: from the cotangents of a block's outputs to the cotangents of its inputs.
 
-An operation has the derivative that JAX gives it: its rule is traced once for each operation and types, and lowered
-like any other function. What the derivative needs of the block's own results is computed in the same block again: the
-block is computed once, from its beginning to its end, and then part by part on the way back.
+Operations have their JAX derivatives: the VJP of each operation is traced once for each combination of types, and
+lowered like any other function. The returned block first computes the whole block forward. The backward pass then goes
+through it part by part, and recomputes the results of each part that the derivatives need.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from crazysim.engine.lowering.selections import add_selections
 from crazysim.pytree import replace_leaves
 
 MAX_UNROLLED = 4096
-"""Most operations of a loop that is unrolled for its derivative."""
+"""Maximum number of operations, over all iterations, of a loop that is unrolled for its derivative."""
 
 Cotangents = dict[Value, Element]
 """Cotangents by the values of the block that is differentiated."""
@@ -37,8 +37,8 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
         wanted: Inputs whose cotangents are computed, floats.
 
     Returns:
-        The block from the inputs of ``block``, and behind them a cotangent for each output that is a float, to the
-        cotangents of ``wanted``.
+        The block that computes the cotangents of ``wanted``. Its inputs are the inputs of ``block``, followed by a
+        cotangent for each output that is a float.
     """
     indices = [block.inputs.index(x) for x in wanted]
     block = _unroll_loops(add_selections(block))
@@ -62,7 +62,7 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
 
 
 OPERATIONS_PER_PART = 60
-"""Operations of a part of a block. Of 60, 100, 150, 250 and all, 60 and 100 left the most numbers in registers."""
+"""Operations in a part of a block. Of 60, 100, 150, 250 and all, 60 and 100 left the most numbers in registers."""
 
 
 def _parts(block: Block) -> list[Block]:
@@ -77,10 +77,10 @@ def _parts(block: Block) -> list[Block]:
 def _recompute(
     builder: Builder, part: Block, number: int, values: dict[Value, Element], on_path: set[Value]
 ) -> dict[Value, Element]:
-    """Compute a part of a block again from the values that it uses, and return the new elements by value.
+    """Recompute a part of a block from the values that it uses, and return the new elements by value.
 
-    Otherwise all that is computed on the way ahead would take registers until the way back needs it. Reductions over
-    other drones and loops are not computed again.
+    Otherwise all results of the forward pass would take registers until the backward pass needs them. Reductions over
+    other drones and loops are not recomputed.
     """
     repeated = [op for op in part.operations if op.name not in ("over_others", "loop", "while")]
     recomputed, used = {x for op in repeated for x in op.results}, part.uses()
@@ -95,11 +95,11 @@ def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path:
     """Go through a block backwards, from the cotangents of its results to the cotangents of the values that it uses.
 
     Args:
-        builder: Takes the operations.
+        builder: Builder that the operations are added to.
         block: The block.
-        values: Elements that its values are there.
+        values: Elements of the builder that stand for its values.
         on_path: Values whose cotangents are computed.
-        cts: Cotangents found so far, which are replaced.
+        cts: Cotangents so far; changed in place.
     """
 
     def replaced(x: Element) -> Element:
@@ -131,7 +131,7 @@ def _accumulate(builder: Builder, cts: Cotangents, x: Value, part: Element) -> N
 
 @functools.lru_cache(maxsize=1024)
 def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
-    """Return the block from operands and the cotangent of an operation to the cotangents of its operands, floats."""
+    """Return the block from the operands of an operation and its cotangent to the cotangents of its float operands."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
     def pull(*args: Any) -> list[Any]:
@@ -198,7 +198,7 @@ def _transpose_slope(slope: Block) -> Block:
 def _over_others(
     builder: Builder, op: Operation, values: dict, on_path: set[Value], result_cts: ResultCotangents, cts: Cotangents
 ) -> None:
-    """Cotangents go to the drone that reads, and, from all drones that read them, to the numbers it published."""
+    """Add cotangents to the drone's own numbers that the block uses, and to its published numbers from all readers."""
     used = [ct for ct in result_cts if ct is not None]
     names = [name for name, ct in zip(op.param("reduce"), result_cts, strict=True) if ct is not None]
     if any(name != "add" for name in names):  # see ``selections``
@@ -252,9 +252,9 @@ STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_ot
 
 
 def _unroll_loops(block: Block) -> Block:
-    """Return a block whose loops of a fixed length are unrolled; the carries of their turns are needed backwards.
+    """Return a block whose loops of fixed length are unrolled: the backward pass needs the carry of every iteration.
 
-    Loops of integers and bools alone have no derivative, and stay.
+    Loops that carry no float have no derivative, and stay.
     """
     if not any(_is_reversed(op) for inner in block.blocks() for op in inner.operations):
         return block

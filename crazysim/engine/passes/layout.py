@@ -14,10 +14,10 @@ from crazysim.jaxcompat import is_key
 
 
 def pack_shared(program: Program) -> Program:
-    """Read the numbers that all drones share from one leaf, behind the others, in which they follow each other.
+    """Read the numbers that all drones share from one additional leaf, which concatenates the shared leaves.
 
-    A call of a compiled step costs by the number of its arrays. A leaf that an unfused stage reads, or that is
-    a table, stays one.
+    The time of a call of a compiled step grows with the number of its arrays. Leaves that unfused stages read, and
+    leaves that are read as tables, stay separate.
     """
     leaves = program.leaves
     direct = {leaf for stage in program.unfused_stages for leaf in stage.used} | program.tables
@@ -35,17 +35,17 @@ def pack_shared(program: Program) -> Program:
 
 
 def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Program:
-    """Store leaves of drones and worlds as rows of one leaf for each type, behind the others.
+    """Store leaves of drones and worlds as rows of additional leaves, one for each scope and type.
 
-    A row is one number of all drones, which follow each other there as a kernel's lanes do.
+    A row holds one number of all drones, in the order of a kernel's lanes.
 
     Args:
         program: The program.
-        select: From the written leaves to the leaves that become rows; random keys stay as they are.
+        select: Function from the written leaves to the leaves that become rows; random keys are never moved.
     """
     leaves = list(program.leaves)
     chosen = [i for i in sorted(select(program.written)) if not is_key(leaves[i])]
-    # The only drone of a world is all that the world has.
+    # If a world has one drone, leaves of the world can be stored with the leaves of drones.
     kinds = {i: ("drone" if program.n_drones == 1 else leaves[i].scope, leaves[i].dtype) for i in chosen}
     positions: dict[int, tuple[int, int, int]] = {}
     for kind in dict.fromkeys(kinds.values()):
@@ -70,16 +70,16 @@ def pack_rows(program: Program, select: Callable[[list[int]], list[int]]) -> Pro
 
 
 class PackedRows(NamedTuple):
-    """A leaf of rows, and the leaves whose numbers are its rows; arrays are as the program takes them."""
+    """A leaf of rows, and the leaves whose numbers are its rows; arrays have the shapes of the program's leaves."""
 
     program: Program
     """The program, after ``pack_rows``."""
     leaf: int
-    """Number of the leaf of rows."""
+    """Index of the leaf of rows."""
 
     @property
     def members(self) -> tuple[int, ...]:
-        """Leaves whose numbers are the rows, from the first row on."""
+        """Leaves whose numbers are the rows, in order."""
         return self.program.leaves[self.leaf].rows_of
 
     def pack(self, leaves: Sequence[Any]) -> Array:
@@ -93,7 +93,7 @@ class PackedRows(NamedTuple):
         return jnp.concatenate([of_leaf(leaves[i]) for i in self.members])
 
     def unpack(self, rows: Array, leaf: int) -> Array:
-        """Return one of the members."""
+        """Return the array of one of ``members``."""
         sizes = {i: self.program.leaves[i].size for i in self.members}
         first, member = sum(sizes[i] for i in self.members[: self.members.index(leaf)]), self.program.leaves[leaf]
         x = rows[first : first + member.size].T.reshape(-1, self.program.n_drones, *member.shape[2:])
@@ -106,7 +106,7 @@ def packed_rows(program: Program) -> list[PackedRows]:
 
 
 def _move_slots(program: Program, move: Callable[[Slot], Slot]) -> Program:
-    """Return a program whose numbers are elsewhere."""
+    """Return a program in which all slots are replaced."""
 
     def segment(s: Segment) -> Segment:
         reads, writes, hoisted = ([move(slot) for slot in x] for x in (s.reads, s.writes, s.hoisted_reads))

@@ -1,4 +1,4 @@
-"""Passes that change when numbers are computed, and with which others: joined segments and ticks, hoists, barriers."""
+"""Passes that change when numbers are computed: they join segments and ticks, hoist values, and add barriers."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from crazysim.engine.ir.program import Program, Segment, Slot, UnfusedStage
 
 
 def fuse(program: Program) -> Program:
-    """Join neighbouring segments that run at the same time on the same numbers.
+    """Join neighbouring segments with the same phase and scope.
 
-    What one stage writes and the next reads is a value then, and what both compute is computed once.
+    A number that one stage writes and the next reads then becomes a value, and common subexpressions are computed once.
     """
     segments: list[Segment | UnfusedStage] = []
     kinds = itertools.groupby(program.segments, lambda s: (s.scope, s.phase) if isinstance(s, Segment) else id(s))
@@ -62,7 +62,8 @@ def _join_segments(segments: list[Segment]) -> Segment:
 def join_ticks(program: Program) -> Program:
     """Join neighbouring stages that run at the same ticks.
 
-    What one stage writes and the next reads is then not selected between old and new first, and a constant stays one.
+    A number that one stage writes and the next reads is then passed on without a selection between its old and its new
+    value, and a constant remains a constant.
     """
     segments = [
         dataclasses.replace(s, block=_join_block_ticks(s.block)) if isinstance(s, Segment) else s
@@ -83,7 +84,7 @@ def _join_block_ticks(block: Block) -> Block:
 
 
 def _join_two_ticks(first: Operation, second: Operation) -> Operation:
-    """Return one ``when`` that does what two under the same condition do."""
+    """Merge two ``when`` operations with the same condition."""
     builder = Builder(stage=first.stage)
     new = inline(builder, first.blocks[0], {})
     builder.barrier()
@@ -101,10 +102,10 @@ on two cores with jax 0.11.2; smaller numbers take longer to compile."""
 
 
 def separate(program: Program) -> Program:
-    """Put a barrier behind every ``BARRIER_INTERVAL`` operations, for lanes on a CPU.
+    """Put a barrier after every ``BARRIER_INTERVAL`` operations, for lanes on a CPU.
 
-    XLA's CPU backend computes a value again in everything that it is fused into, on the way back of a gradient too. A
-    barrier makes it compute the values that are needed further on once. Kernels ignore barriers.
+    XLA's CPU backend recomputes a value in every fusion that uses it, also in the backward pass of a gradient. With a
+    barrier, it computes the values that later operations need only once. Kernels ignore barriers.
     """
     return dataclasses.replace(
         program,
@@ -127,7 +128,7 @@ def _separate_block(block: Block) -> Block:
 def hoist(program: Program) -> Program:
     """Move expensive values that no step changes out of the loop over steps.
 
-    A division by such a number becomes a product with its inverse, which is one rounding less exact.
+    A division by such a value becomes a product with its inverse, which adds one rounding error.
     """
     changing = program.changing()
     return dataclasses.replace(
@@ -155,7 +156,7 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
     moved = [x for op in operations for x in op.results if x in worth and x in used]
     if not moved:
         return segment
-    # What is cheap stays in both blocks: it depends on nothing that has moved.
+    # Cheap operations that depend on no hoisted value stay in the step; the hoisted block repeats them if needed.
     fixed_operations = [op for op in operations if op.results and fixed.issuperset(op.results)]
     once = prune(Block(block.inputs, tuple(fixed_operations), tuple(moved)), keep_inputs=False)
     further = {x: Value(x.dtype) for x in moved}
@@ -170,7 +171,10 @@ def _hoist_segment(segment: Segment, changing: set[Slot]) -> Segment:
 
 
 def _replace_divisions(block: Block, fixed: set[Value]) -> Iterable[Operation]:
-    """Yield the operations of a block, divisions by fixed numbers as products. ``fixed`` grows as they are taken."""
+    """Yield the operations of a block, with divisions by fixed numbers replaced by products.
+
+    The caller adds to ``fixed`` while it iterates.
+    """
     inverses: dict[Any, Element] = {}
     for op in block.operations:
         if op.name != "div" or op.dtype.kind != "f":

@@ -1,7 +1,7 @@
 """The first stage after which two engines differ.
 
 ``first_difference(sim.step_pipeline, sim.data, engines=("plain", "fused"))`` finds the stage, the field and the world,
-and between engines that run programs the operation.
+and, if an engine runs programs, the operation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from crazysim.engine.lowering.stages import lower_stages
 from crazysim.engine.passes.schedule import fuse
 
 TOLERANCE = 1e-5
-"""Largest difference that passes for rounding, relative to the largest component of a drone's vector."""
+"""Largest difference that counts as rounding, relative to the largest component of a drone's vector."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Difference:
     engines: tuple[str, str]
     """Names of the engines."""
     operation: str = ""
-    """First operation of the stage whose result is not the interpreter's; empty if none, or if neither engine runs
-    operations of a program."""
+    """First operation of the stage whose result differs from the interpreter's; empty if there is none, or if neither
+    engine runs operations of a program."""
 
     def __str__(self) -> str:
         (a, b), (x, y) = self.engines, self.values
@@ -60,14 +60,14 @@ def first_difference(
 ) -> Difference | None:
     """Return the first difference between two engines in one step, or None.
 
-    Both run each stage from the data of the first engine before it, so a difference belongs to that stage alone.
-    Between engines of programs the stage is then run with every value as a result, to find the operation.
+    Both engines run each stage on the data that the first engine computed so far, so a difference is due to that stage
+    alone. To find the operation, an engine that runs programs then runs the stage with every value as a result.
 
     Args:
         pipeline: Stages of a step.
         data: Data to begin from.
         engines: Two of ``ENGINES``.
-        tolerance: Largest difference that passes for rounding, relative to the largest component of a vector. NaN is
+        tolerance: Largest difference that counts as rounding, relative to the largest component of a vector. NaN is
             equal to NaN.
     """
     from crazysim.engine.step import Step
@@ -106,7 +106,7 @@ def _differs(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
 
 
 def _operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
-    """Return the first operation of a stage at which an engine of programs leaves the interpreter."""
+    """Return the first operation of a stage whose result in an engine of programs differs from the interpreter's."""
     program = fuse(lower_stages(as_stages({name: stage}), data))
     builds: dict[str, Build] = {"lanes": lanes.build, "fused": fused.build, "auto": fused.build}
     for engine in engines:
@@ -123,7 +123,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
     Args:
         program: A program of one segment.
         leaves: Its leaves, for all worlds.
-        build: Builds what runs the program.
+        build: Function that builds the run of a program.
         tolerance: As in ``first_difference``.
     """
     exposed, operations = expose_values(program)
@@ -143,9 +143,9 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
 
 
 def expose_values(program: Program) -> tuple[Program, list[Operation]]:
-    """Return a program of one segment with a further leaf for every result in it, and the operations of these results.
+    """Return a program of one segment with a new leaf for every result in it, and the operations of these results.
 
-    Results inside blocks of operations are left out: their block may not have run.
+    Results inside blocks of operations are left out, because their block may not run.
     """
     (segment,) = program.fused_segments
     operations = [op for op in segment.block.operations for _ in op.results]

@@ -14,14 +14,14 @@ from crazysim.engine.step import Step
 
 
 def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | None = None) -> str:
-    """Return in a few lines which engine runs the step, which stages it fuses, and which it does not and why.
+    """Return a few lines about a step: its engine, the stages that are fused, and the others with the reasons.
 
     Args:
         step: The step.
         data: Data to step.
         measure: True to measure the cost of stages that are not fused, which compiles the step once more without them
             and takes 256 steps.
-        zeros: As for ``Step``; with it, shapes and types of the data are enough.
+        zeros: As for ``Step``; with it, ``data`` may be shapes and types.
     """
     plan = step.plan(data, zeros)
     lines = [f"engine: {plan.engine}" + (f" ({plan.why})" if plan.why else "")]

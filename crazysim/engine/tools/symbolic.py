@@ -1,7 +1,7 @@
 """CasADi expressions of a block: every value is an expression of single numbers.
 
-CasADi computes in float64 whatever the program's types are. Integers are whole numbers without overflow. A number is
-never NaN, so that tests for NaN are false.
+CasADi computes in float64, whatever types the program has. Integers are whole numbers in float64; of the arithmetic,
+only unsigned sums and differences wrap around. Numbers are assumed not to be NaN, so tests for NaN are false.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Expression = Any
 """A ``casadi.SX`` of one number."""
 
 MAX_ITERATIONS = 256
-"""Most iterations of a loop that is unrolled."""
+"""Maximum number of iterations of a loop that is unrolled."""
 
 
 def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, Expression]:
@@ -30,7 +30,7 @@ def step(segment: Segment, number: Callable[[Slot], Expression]) -> dict[Slot, E
 
     Args:
         segment: A segment of one drone.
-        number: Returns the number in a slot before the step.
+        number: Function that returns the number in a slot before the step.
 
     Raises:
         UnsupportedError: If CasADi has no form for an operation; the error names the stage.
@@ -46,7 +46,7 @@ def require_casadi(block: Block) -> None:
     """Check that CasADi has a form for all operations of a block."""
     refused = [(op.stage, why) for op in block.walk() if (why := _refusal(op)) is not None]
     if refused:
-        drawn = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # says most
+        drawn = [(stage, why) for stage, why in refused if why == RANDOM_REASON]  # the most informative reason
         stage, why = (drawn or refused)[0]
         raise UnsupportedError(why, stage=stage)
 
@@ -71,12 +71,12 @@ def _refusal(op: Operation) -> str | None:
 
 
 def run(block: Block, inputs: Sequence[Expression]) -> list[Expression]:
-    """Return the outputs of a block whose operations all have a form."""
+    """Return the outputs of a block whose operations all have a form in CasADi."""
     return _Interpreter().run(block, inputs)
 
 
 class _Interpreter:
-    """Expressions of values."""
+    """Interpreter that computes the expressions of values."""
 
     def __init__(self) -> None:
         import casadi  # an extra
@@ -138,16 +138,16 @@ class _Interpreter:
         return x if fits else self._wrap(x, float(limits.min), 2.0 ** (8 * after.itemsize))
 
     def _wrap(self, x: Expression, low: float = 0.0, length: float = 2.0**32) -> Expression:
-        """Return a whole number as one of ``length`` from ``low`` on, as integers of limited size hold it."""
+        """Wrap a whole number around to the range from ``low`` to ``low + length - 1``, as integer types do."""
         return x - length * self.casadi.floor((x - low) / length)
 
     def _towards_zero(self, x: Expression) -> Expression:
         return self.casadi.if_else(x < 0, self.casadi.ceil(x), self.casadi.floor(x))
 
     def _guarded_sqrt(self, x: Expression) -> Expression:
-        """Return a root whose slope at zero is zero.
+        """Return a square root whose derivative at zero is zero.
 
-        Functions such as a norm have a custom derivative because the derivative of their arithmetic is infinite at
+        It is used in functions with a custom derivative, such as norms, whose arithmetic has an infinite derivative at
         zero.
         """
         ca = self.casadi

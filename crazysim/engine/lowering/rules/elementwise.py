@@ -1,4 +1,4 @@
-"""Rules for primitives that do the same to every element."""
+"""Rules for element-wise primitives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from crazysim.jaxcompat import JaxprEqn
 PRIMITIVES_WITH_RULES = frozenset(
     "convert_element_type bitcast_convert_type select_n integer_pow pow round_even round_away digamma".split()
 )
-"""Operations that no primitive maps to one to one."""
+"""Operations whose primitives have rules of their own, or that have no primitive of the same name."""
 
 
 @rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in PRIMITIVES_WITH_RULES))
@@ -24,7 +24,7 @@ def _each(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 
 @rule("pow")
 def _pow(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Raise to a power; JAX converts one that is an integer."""
+    """Raise to a power; an integer exponent is first converted to the type of the result, as in JAX."""
     dtype = eqn.outvars[0].aval.dtype
     return [ctx.elementwise("pow", [args[0], ctx.elementwise("convert_element_type", [args[1]], dtype)], dtype)]
 
@@ -146,7 +146,7 @@ class _Bits:
         return self.ctx.elementwise(op, [a, b], self.dtype)
 
     def count(self, x: Elements) -> Elements:
-        """Return how many bits are set: sums of pairs, of fours, and of eights, which a product adds up."""
+        """Count the bits that are set: add them up in pairs, fours and bytes, and sum the bytes by a product."""
         pairs, fours, eights, ones = (self.mask(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
         x = self.do("sub", x, self.do("and", self.do("shift_right_logical", x, 1), pairs))
         x = self.do("add", self.do("and", x, fours), self.do("and", self.do("shift_right_logical", x, 2), fours))
@@ -166,7 +166,7 @@ def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
 
 @rule("clz")
 def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Set all bits behind the first one, and count the bits that are left."""
+    """Set all bits below the highest set bit, and count the bits that are still zero."""
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
     x, shift = bits.of(args[0]), 1

@@ -1,4 +1,4 @@
-"""Rules for indexing: a known index moves elements, a computed one selects among all elements that it may mean."""
+"""Rules for indexing: a known index moves elements; a computed one looks up a table or selects among elements."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _dynamic_slice(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
 
 
 def _take(ctx: Lowering, x: Elements, start: Element, size: int, axis: int) -> Elements:
-    """Return ``size`` elements along an axis from a start that is clamped to the array."""
+    """Return ``size`` elements along an axis, beginning at a start that is clamped to the array."""
     last = x.shape[axis] - size
     if is_constant(start) or last == 0:
         k = int(np.clip(start, 0, last)) if last else 0
@@ -113,7 +113,7 @@ def _gather(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
     n_places = int(np.prod([limit + 1 for limit in limits]))
     rows = indices.reshape(-1, indices.shape[-1])
     out = eqn.outvars[0].aval
-    # Which row of indices an element of the result belongs to: the axes of the result that are no offsets.
+    # Row of indices that each element of the result belongs to, from the axes of the result that are not offsets.
     row_shape = indices.shape[:-1]
     batch_axes = [axis for axis in range(len(out.shape)) if axis not in dims.offset_dims]
     shape = [1] * len(out.shape)
@@ -147,7 +147,7 @@ def _select_windows(
     row_of: np.ndarray,
     limits: Sequence[int],
 ) -> list[Element]:
-    """Return the elements of a gather, selected among all elements that the indices may mean."""
+    """Return the elements of a gather, selected among all windows that the indices may refer to."""
     _check_range(int(np.prod([limit + 1 for limit in limits])))
     result: list[Element] = []
     for corner in itertools.product(*(range(limit + 1) for limit in limits)):
@@ -168,7 +168,7 @@ def _select_windows(
 
 
 def _gather_filled(eqn: JaxprEqn, x: Elements, indices: np.ndarray) -> Elements:
-    """Gather at known indices; indices outside of the array are filled."""
+    """Gather at known indices; elements at indices outside the array have the fill value."""
     numbers = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     (positions,) = run_now(eqn, [numbers, indices], fill_value=-1)
     fill = eqn.params["fill_value"]
@@ -249,7 +249,7 @@ def _options(index: Element, limit: int, clip: bool) -> Sequence[int]:
 
 
 def _combine(ctx: Lowering, eqn: JaxprEqn, old: Elements, new: Elements) -> Elements:
-    """Return the numbers that a scatter writes over ``old``: ``new``, their sum and the like, or a function of both."""
+    """Return the numbers that a scatter writes over ``old``: ``new``, or a combination of both such as their sum."""
     combination = eqn.params["update_jaxpr"]
     if combination is None:
         return new

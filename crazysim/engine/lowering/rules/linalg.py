@@ -11,7 +11,7 @@ from crazysim.engine.lowering.jaxprs import Elements, Lowering, UnsupportedError
 from crazysim.jaxcompat import JaxprEqn
 
 MAX_SYSTEM_SIZE = 6
-"""Largest matrix that is factorised; beyond it the unrolled arithmetic is longer than the rest of a step."""
+"""Maximum number of rows of a matrix; for larger ones the unrolled arithmetic is longer than the rest of a step."""
 
 
 def _check_size(eqn: JaxprEqn, n: int) -> None:
@@ -25,7 +25,7 @@ def _matrices(x: Elements) -> list[Elements]:
 
 @rule("cholesky")
 def _cholesky(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Return the lower factor; all of it is NaN if the matrix is not positive definite, as in LAPACK."""
+    """Return the lower factor; its lower triangle is NaN if the matrix is not positive definite."""
     n, dtype = args[0].shape[-1], eqn.outvars[0].aval.dtype
     _check_size(eqn, n)
     zero = constant(0, dtype)
@@ -75,7 +75,7 @@ def _substitute(ctx: Lowering, a: Elements, b: Elements, lower: bool, unit: bool
 
 @rule("lu")
 def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Eliminate with the largest pivot of each column; rows are exchanged by selection."""
+    """Factorise with partial pivoting; rows are exchanged by selection."""
     n, m = args[0].shape[-2:]
     if n != m:
         raise UnsupportedError("primitive 'lu' of a matrix that is not square")
@@ -96,7 +96,7 @@ def _lu(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
             pivots.append(pivot)
             for i in range(j + 1, n):
                 is_pivot = ctx.scalar("eq", pivot, constant(i, np.int32), dtype=bool)
-                for x in (*a.T, rows):  # every column, and the list of rows
+                for x in (*a.T, rows):  # every column, and the row numbers
                     x[i], x[j] = (
                         ctx.scalar("select_n", is_pivot, x[i], x[j]),
                         ctx.scalar("select_n", is_pivot, x[j], x[i]),

@@ -52,8 +52,8 @@ def move_many(eqn: JaxprEqn, args: list[Elements], fixed: Sequence[Any] = ()) ->
 
     Args:
         eqn: The operation.
-        args: The arrays that are moved.
-        fixed: Known indices, the operands behind them.
+        args: The arrays whose elements are moved.
+        fixed: Further operands that are known, such as indices.
     """
     numbers, elements = [], []
     for x in args:
@@ -64,7 +64,7 @@ def move_many(eqn: JaxprEqn, args: list[Elements], fixed: Sequence[Any] = ()) ->
 
 
 def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
-    """Return, for each result, the indices of the elements that it takes; what NumPy can do needs no compilation."""
+    """Return, for each result, the indices of the elements that it takes; NumPy avoids a compilation where possible."""
     p, x = eqn.params, args[0]
     match eqn.primitive.name:
         case "split":
@@ -76,12 +76,12 @@ def _sources(eqn: JaxprEqn, args: list[Any]) -> list[np.ndarray]:
         case "pad":
             return [_pad(x, args[1], p["padding_config"])]
         case "gather":
-            return run_now(eqn, args, fill_value=0)  # never used: all places are inside
+            return run_now(eqn, args, fill_value=0)  # never used: all indices are in bounds
     return run_now(eqn, args)
 
 
 def _pad(x: np.ndarray, value: np.ndarray, config: Sequence[tuple[int, int, int]]) -> np.ndarray:
-    """Return an array padded before, behind and between its elements; a negative number removes some."""
+    """Return an array padded before, after and between its elements; negative padding removes elements."""
     for axis, (low, high, interior) in enumerate(config):
         n = x.shape[axis]
         length = max(low + n + max(n - 1, 0) * interior + high, 0)

@@ -13,7 +13,7 @@ from crazysim.jaxcompat import JaxprEqn
 
 @rule("reduce_over_others")
 def _over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Make a loop over the drones of the world; a number that all drones share is not published."""
+    """Add a loop over the drones of the world; numbers that all drones share are not published."""
     n_own, n = eqn.params["n_own"], ctx.n_members
     if not n:
         raise UnsupportedError("it needs a stage of one drone")
@@ -29,7 +29,7 @@ def _over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
     other = [_replace_elements(x, others) for x in args[n_own:]]
     results = inner.lower(eqn.params["jaxpr"], [*args[:n_own], *other, as_elements([is_self], ())])
     block = inner.finish(results)
-    used = block.uses()  # what is published and not used is not published
+    used = block.uses()  # numbers that the block does not use are not published
     pairs = [(x, y) for x, y in others.items() if y in used]
     block = dataclasses.replace(block, inputs=(*(y for _, y in pairs), is_self))
     types = [x.dtype for x in block.outputs]
@@ -57,7 +57,7 @@ def _replace_elements(x: Elements, new: dict[Value, Value]) -> Elements:
 
 
 def _shared_numbers(ctx: Lowering) -> set[Value]:
-    """Return the numbers known so far that are the same for all drones: computed from shared ones alone."""
+    """Return the numbers so far that are the same for all drones, because they depend only on shared numbers."""
     shared = set(ctx.shared)
     for op in ctx.builder.operations:
         if op.results and not op.blocks and all([is_constant(x) or x in shared for x in op.args]):

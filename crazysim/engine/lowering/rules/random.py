@@ -1,4 +1,4 @@
-"""Rules for random numbers: JAX's default generator as integer arithmetic, equal to the last bit."""
+"""Rules for random numbers: JAX's default generator as integer arithmetic, with identical bits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _check_generator(impl: Any) -> None:
 
 @rule("random_fold_in", "random_split", "random_bits", "random_seed")
 def _random(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Lower what JAX's own generator does with the two halves of a key: integer arithmetic around one cipher."""
+    """Lower the functions of JAX's generator, which are integer arithmetic and a cipher on the two halves of a key."""
     name, p, impl = eqn.primitive.name, eqn.params, threefry_prng_impl
     keys = name != "random_seed"
     if keys:

@@ -44,7 +44,7 @@ def _reduce(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements
 
 @rule("reduce")
 def _reduce_by(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Reduce by a function of accumulated and new operands, beginning with initial values."""
+    """Reduce by a function of accumulated and new operands, starting from the initial values."""
     axes, n = eqn.params["dimensions"], len(args) // 2
     arrays = [np.moveaxis(x, axes, range(len(axes))) for x in args[:n]]
     rest = arrays[0].shape[len(axes) :]
@@ -94,7 +94,7 @@ def _sort(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
 
 @rule("top_k")
 def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
-    """Return the largest in descending order, of equal ones the first.
+    """Return the k largest elements in descending order, and their indices. Of equal elements the first comes first.
 
     XLA orders floats by their bits: -NaN, -inf, ..., -0, 0, ..., inf, NaN.
     """
@@ -102,8 +102,8 @@ def _top_k(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]
     numbers = np.arange(x.shape[axis]).reshape([-1 if i == axis else 1 for i in range(x.ndim)])
     positions = constants(np.broadcast_to(numbers, x.shape), np.int32)
     key = x
-    if dtype.kind == "f":  # the bits are in order but for negative numbers, of which the larger have the larger bits
-        ctx.builder.barrier()  # the sign of a NaN that XLA computes again, for another exchange, may be another
+    if dtype.kind == "f":  # as integers, the bits have the order of the floats, but for negative floats the reverse
+        ctx.builder.barrier()  # without it, XLA may recompute a NaN for another exchange, with the other sign
         integer = np.dtype(f"i{dtype.itemsize}")
         key = ctx.elementwise("bitcast_convert_type", [x], integer)
         turned = ctx.elementwise("xor", [key, constants(np.iinfo(integer).max, integer)], integer)
@@ -119,8 +119,8 @@ def _sort_rows(
     """Sort by odd-even transposition: it only exchanges neighbours, so it is stable. NaN goes last.
 
     Args:
-        ctx: Lowering that takes the operations.
-        eqn: Equation, for messages.
+        ctx: Lowering that the operations are added to.
+        eqn: Equation, for error messages.
         args: Keys, then the other operands, which are permuted with them.
         axis: Axis to sort along.
         n_keys: Number of operands that are keys.

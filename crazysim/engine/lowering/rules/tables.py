@@ -10,9 +10,9 @@ from crazysim.engine.ir.blocks import Element, TableEntries, Value, constant, is
 from crazysim.engine.lowering.jaxprs import MAX_UNROLL, Elements, Lowering, TableEntry, as_elements
 
 MAX_SELECTED = 4
-"""Most elements from which an entry of a shared array is selected: its numbers are in registers already."""
+"""Maximum number of elements from which an entry of a shared array is selected: they are already in registers."""
 MAX_SELECTED_CONSTANTS = 8
-"""The same for constants, which are parts of instructions."""
+"""Maximum number of constants from which an entry is selected: they are parts of instructions."""
 
 ZERO = constant(0, np.int32)
 
@@ -26,8 +26,8 @@ class TableView:
         Args:
             ctx: The lowering.
             entry: First element, with its table and base.
-            offsets: Index of each element in the table, less the base.
-            strides: Growth of the index along each axis that is indexed.
+            offsets: Index of each element in the table, minus the base.
+            strides: Increment of the index along each axis that is indexed.
         """
         self.ctx, self.table, self.base, self.offsets, self.strides = ctx, entry.table, entry.base, offsets, strides
         self.aligned = entry.aligned and all(stride % 4 == 0 for stride in strides.values())
@@ -35,7 +35,7 @@ class TableView:
         """Constants that are equal along the indexed axes, by the offset of the first; they are not looked up."""
 
     def base_at(self, index: Sequence[Element], limits: Sequence[int]) -> Element:
-        """Return the base of the elements at an index along the axes, each clamped to 0 and its limit."""
+        """Return the base of the elements at an index along the axes; each part is clamped to 0 and its limit."""
         base = self.base
         for i, limit, stride in zip(index, limits, self.strides.values(), strict=True):
             if limit == 0:
@@ -48,7 +48,7 @@ class TableView:
         return base
 
     def look_up(self, offsets: np.ndarray, bases: Sequence[Element]) -> Elements:
-        """Return the entries with these offsets, each from its base."""
+        """Return the entries at some offsets, each relative to its base."""
         flat = [int(k) for k in offsets.reshape(-1)]
         numbers = [
             self.same[k] if k in self.same else self.ctx.lookup(self.table, base, k, self.aligned)
@@ -58,13 +58,15 @@ class TableView:
 
 
 def find_table(ctx: Lowering, x: Elements, axes: Sequence[int], n_indices: int) -> TableView | None:
-    """Return an array as a table in which an index along some axes moves all entries alike, or None.
+    """Return an array as a table in which an index along some axes shifts all entries alike.
+
+    Return None if it is not one, or if it has so few elements that selecting among them is better.
 
     Args:
         ctx: The lowering.
         x: The array.
         axes: The axes along which it is indexed.
-        n_indices: Number of elements that an index may mean.
+        n_indices: Number of positions that an index may take.
     """
     items = x.reshape(-1)
     if not len(items) or isinstance(items[0], tuple):
@@ -98,7 +100,7 @@ def _table_of_constants(ctx: Lowering, x: Elements, axes: Sequence[int]) -> Tabl
 
 
 def _strides(offsets: np.ndarray, axes: Sequence[int]) -> dict[int, int] | None:
-    """Return by how much an offset grows along each axis, or None where it does not do so evenly."""
+    """Return the constant increment of the offsets along each axis, or None if an increment is not constant."""
     strides = {}
     for axis in axes:
         steps = np.diff(offsets, axis=axis)
