@@ -14,7 +14,7 @@ NUMBERS = (
 )  # fmt: skip
 """Options of ``new`` that are arguments of ``estimate_airframe``."""
 SPINS = {"ccw": 1, "cw": -1}
-"""Senses of rotation."""
+"""Sign of each sense of rotation, seen from above."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:

@@ -30,14 +30,15 @@ QUARTER_TURN = np.pi / 2
 MIN_THRUST_TO_WEIGHT = 1.5
 """Thrust over weight below which a warning is given, 1."""
 MIN_AUTHORITY = {"roll": 4.0, "pitch": 4.0, "yaw": 0.2}
-"""Angular acceleration in hover below which a warning is given, rad/s^2: the least of the airframes of the tests."""
+"""Angular acceleration in hover below which a warning is given, rad/s^2: the least of the airframes in the tests."""
 MAX_PRECESSION_RATIO = 2.5
-"""Precession over the bandwidth of the attitude loop above which ``auto`` may be unstable: of 1,960 random airframes
-with an odd number of rotors all up to 2.45 fly, and the one with 4.3 does not."""
+"""Ratio of the precession rate to the bandwidth of the attitude loop above which ``auto`` may be unstable, 1. Of 1,960
+random airframes with an odd number of rotors, all with ratios up to 2.45 fly, and the one with 4.3 does not."""
 MAX_PRECESSION_SHARE = 0.25
-"""Part of the authority that the net momentum of the rotors takes at 1 rad/s, above which a warning is given, 1."""
+"""Share of the angular acceleration in hover that the net angular momentum of the rotors takes up at 1 rad/s, above
+which a warning is given, 1."""
 MAX_TIME_CONSTANT = 0.2
-"""Time constant of rotors above which a warning is given, s: the longest of the airframes of the tests."""
+"""Time constant of rotors above which a warning is given, s: the longest of the airframes in the tests."""
 FREQ = 500
 """Default rate of the physics, Hz."""
 
@@ -55,7 +56,7 @@ def describe_airframe(airframe: Airframe) -> str:
 
 
 def draw_airframe(airframe: Airframe, path: Path) -> None:
-    """Write a picture of the body, seen from ahead and above.
+    """Write a picture of the body, seen from the front and above.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -82,7 +83,7 @@ def draw_airframe(airframe: Airframe, path: Path) -> None:
 
 
 def _ratio(airframe: Airframe) -> float:
-    """Return the largest thrust without a torque over the weight, 1."""
+    """Return the ratio of the largest thrust at zero torque to the weight, 1."""
     return level_thrust(airframe) / float(airframe.value("rigid_body.mass") * GRAVITY_MAGNITUDE)
 
 
@@ -167,7 +168,7 @@ def _levels(lacks: Mapping[str, str]) -> str:
 
 
 def _missing_parameters(create: Callable[[], Any]) -> str:
-    """Return the reason for which parameters cannot be made; empty if they can."""
+    """Return the reason why parameters cannot be created; empty if they can."""
     try:
         create()
     except ConfigError as error:
@@ -192,7 +193,7 @@ def _warnings(airframe: Airframe, dynamics: tuple[str, ...]) -> Iterator[str]:
 
 
 def _agility_warnings(airframe: Airframe) -> Iterator[str]:
-    """Yield warnings about slow flights, and about steps of the default rate that diverge."""
+    """Yield warnings about slow turns, precession and slow rotors, and about divergence at the default rate."""
     for (axis, minimum), acc in zip(MIN_AUTHORITY.items(), max_ang_acc(airframe), strict=True):
         if acc < minimum:
             seconds = 2 * np.sqrt(QUARTER_TURN / acc)

@@ -156,7 +156,7 @@ def figure_eight_setpoints(time: Array, n_drones: int) -> Array:
 
 @jit_unless_traced("n_drones")
 def jerk_feedforward(time: Array, n_drones: int) -> Array:
-    """Return the jerk of every drone's setpoint, with zero snap and yaw rates, without which a turn lags behind.
+    """Return the jerk of every drone's setpoint, with zero snap and yaw rates. Without it, drones lag in turns.
 
     Args:
         time: Time of every world, s. (n_worlds, 1)

@@ -34,9 +34,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print versions, devices, compiler, cache and rendering of this installation, a line each.
+    """Print versions, devices, compiler, cache and rendering of this installation, one per line.
 
-    A part that is missing or broken is a line with the reason.
+    For a part that is missing or broken, its line gives the reason.
     """
     del options
     text = "\n".join(f"{name + ':':<14}{_or_reason(value)}" for name, value in _parts())
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _parts() -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yield the name of every line, and the function that returns the rest."""
+    """Yield the name of each line and a function that returns the rest of it."""
     yield "crazysim", lambda: f"{crazysim.__version__}, {Path(crazysim.__file__).parent}"
     yield "Python", lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}"
     yield "system", lambda: f"{platform.platform()}, {_cores()} CPU cores"
@@ -129,13 +129,13 @@ def _cache() -> str:
 
 
 def _size(folder: Path) -> str:
-    """Return the size of the files in a folder, for reading."""
+    """Return the total size and the number of the files in a folder, as text."""
     sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
     return f"{sum(sizes) / 1e6:.1f} MB in {len(sizes)} files"
 
 
 def _rendering() -> str:
-    """Return the backend of OpenGL, and whether it draws, tried in another process, which a crash may end."""
+    """Return the OpenGL backend and whether it renders; the attempt runs in a subprocess because it may crash."""
     code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
     environment = os.environ | startup.refused
     backend = environment.get("MUJOCO_GL") or "MUJOCO_GL is not set"

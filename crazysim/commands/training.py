@@ -62,7 +62,7 @@ def _of_run(commands: argparse._SubParsersAction, name: str, text: str, run: Any
 
 
 def _add_place(add: Any) -> None:
-    """Add the options of a command that makes the environment of a run again."""
+    """Add the options of a command that rebuilds the environment of a run."""
     place = "FILE.py:CLASS of your task, if it has moved since training"
     add("--task", metavar="FILE.py:CLASS", help=place)
     add("--device", help="device: cpu, gpu; by default the training's")
@@ -111,13 +111,13 @@ def train(options: argparse.Namespace) -> None:
 
 
 def _exit(*_: object) -> NoReturn:
-    """End the process as a signal that terminates it does, after a training has written its checkpoint."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent again, it would interrupt the writing
+    """Raise ``SystemExit`` on SIGTERM, so that training writes its checkpoint before the process ends."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second signal would interrupt the writing
     raise SystemExit(128 + signal.SIGTERM)
 
 
 def evaluate(options: argparse.Namespace) -> None:
-    """Print the figures of a policy."""
+    """Evaluate a policy, and print and plot the results."""
     import jax
 
     from crazysim.train.evaluation import TERM_PREFIX, evaluate, outcome

@@ -87,7 +87,7 @@ def _provenance(selected: Sequence[Section]) -> str:
 
 
 def _processor() -> str:
-    """Return the name of the processor, or its kind where the system has none."""
+    """Return the name of the processor, or the architecture if the system gives no name."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -83,7 +83,7 @@ class Actions:
 
 
 def actions_of(airframe: Airframes, params: SimParams, control: Control, tilt: float = MAX_TILT) -> Actions:
-    """Return the usual map of a command level; see ``Actions``.
+    """Return the default map of a command level; see ``Actions``.
 
     Args:
         airframe: Airframe of all drones, or of each, for the limits of the rotors.

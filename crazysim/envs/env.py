@@ -35,7 +35,7 @@ from crazysim.sim.sim import Sim
 
 
 class Env(ABC):
-    """An environment of all worlds, wrapped or not. Its functions are pure, for jit, scan, vmap and grad.
+    """A batched environment of many worlds, wrapped or not. Its functions are pure, for jit, scan, vmap and grad.
 
     A step has four phases: ``act`` stages the command of an action, the physics advances the simulation, ``observe``
     evaluates the task, and, inside ``AutoReset``, ``reset_episode`` starts a new episode where one is over.
@@ -53,7 +53,7 @@ class Env(ABC):
 
     @property
     def sim(self) -> Sim:
-        """The simulation it was made from; it is used for drawing, and does not advance."""
+        """The simulation from which the environment was made. It is used for drawing; ``step`` does not advance it."""
         return self.base.sim
 
     @property
@@ -98,7 +98,7 @@ class Env(ABC):
 
     @functools.cached_property
     def step_fn(self) -> Step:
-        """The step of the engine that ``step`` calls: the physics between the phases."""
+        """The engine's step that ``step`` calls: the stages of the physics and of the phases."""
         batched = [f"wrapper {wrapper.name!r}" for wrapper in self.wrappers if wrapper.batched]
         batched += [f"task {self.task.name!r}"] if self.task.batched else []
         why = f"{', '.join(batched)} is declared to need all worlds at once" if batched else None
@@ -115,7 +115,7 @@ class Env(ABC):
 
         Raises:
             ConfigError: If the task begins in a state that is not finite. A compiled reset, such as
-                ``jax.jit(env.reset)``, cannot raise: there such a world ends at its first step, with
+                ``jax.jit(env.reset)``, cannot raise: the episode of such a world ends at its first step, with
                 ``info["nonfinite"]``.
         """
         key = put_on_device(key, self.sim.device) if self.sim.mesh is None else key
@@ -144,18 +144,18 @@ class Env(ABC):
             return select_states(mask, new, state)
 
     def set_goal(self, state: EnvState, pos: ArrayLike) -> EnvState:
-        """Return the state with other goals, from the next step on; the episode goes on, and a new one draws its own.
+        """Return the state with new goals, which apply from the next step until the end of the episode.
 
-        The observations of the state stay: those of the next step are of the new goals.
+        The observations in the returned state are unchanged; the next step observes the new goals.
 
         Args:
             state: The state of all worlds.
-            pos: Goals, world frame, m: one of all drones (3,), one of each world (n_worlds, 3), or one of each drone
+            pos: Goals, world frame, m: one for all drones (3,), one per world (n_worlds, 3), or one per drone
                 (n_worlds, n_drones, 3); an axis of worlds or drones may have length 1.
 
         Raises:
-            ConfigError: If the goals of the task are not positions, or ``pos`` has another shape or, given as host
-                numbers, is not finite.
+            ConfigError: If the goals of the task are not positions, if ``pos`` has another shape, or if it contains
+                host numbers that are not finite.
         """
         with default_device_of(state.full_data.core.steps):
             pos = validate_goals(pos, state)
@@ -163,7 +163,7 @@ class Env(ABC):
         return state if self.sim.mesh is None else EnvState(shard(state.full_data, self.sim.mesh))
 
     def step(self, state: EnvState, action: Array) -> EnvState:
-        """Return the state one environment step later; with ``AutoReset``, with new episodes where one is over.
+        """Return the state one environment step later. With ``AutoReset``, worlds that are done begin a new episode.
 
         A world that becomes non-finite terminates, sets ``info["nonfinite"]``, and is observed as zeros.
 
@@ -189,7 +189,7 @@ class Env(ABC):
 
         Args:
             flat: Result of ``flatten`` or ``advance``.
-            action: Action of every drone, in the type of the state's, which is not checked. (n_worlds, n_drones, k)
+            action: Action of every drone, with the dtype of the state's action; not checked. (n_worlds, n_drones, k)
         """
         flat = flat.replace([flat.plan.numbers.plugins[NAME].next_action], [action])
         return self.step_fn.advance(flat, self.n_substeps)
@@ -211,7 +211,7 @@ class Env(ABC):
         return EnvState(full_data if self.sim.mesh is None else shard(full_data, self.sim.mesh))
 
     def _add_step_results(self, state: EnvState) -> EnvState:
-        """Return the state at the start of the first episode with everything that a step adds, as zeros."""
+        """Return the state at the start of the first episode, with the fields that a step adds set to zero."""
         state = state if self.reset_policy is None else self.reset_policy.after_step(state)
         state = state.replace(next_action=jnp.zeros_like(state.action), must_reset=jnp.zeros_like(state.terminated))
         leaves, treedef = jax.tree.flatten(state)
@@ -226,7 +226,7 @@ class Env(ABC):
 
     @functools.cached_property
     def _stepped_shapes(self) -> dict[Any, EnvState]:
-        """Shapes and types of the state after a step, by those at the start of an episode."""
+        """Cache of the shapes and dtypes of a state after a step, by structure and shapes of the state before it."""
         return {}
 
     def explain(self) -> str:
@@ -235,7 +235,7 @@ class Env(ABC):
         return explain(self.step_fn, state.full_data, zeros=())
 
     def target(self, state: EnvState) -> Array | None:
-        """Return the place where each drone should be, or several marks, for images, m; None if the task has none.
+        """Return the target position of each drone, or several marks per drone, to draw in images, m; None without one.
 
         Returns:
             (n_worlds, n_drones, 3) or (n_worlds, n_drones, n_marks, 3)
@@ -243,7 +243,7 @@ class Env(ABC):
         return self._evaluate_task(self.task.target, state)
 
     def subjects(self, state: EnvState) -> Array | None:
-        """Return points that films hold in view besides drones and marks, m; None if the task has none.
+        """Return points that films keep in view besides drones and marks, m; None if the task has none.
 
         Returns:
             (n_worlds, n_points, 3)
@@ -251,7 +251,7 @@ class Env(ABC):
         return self._evaluate_task(self.task.subjects, state)
 
     def succeeded(self, state: EnvState) -> Array | None:
-        """Return true where a drone has succeeded; None if success is an error that stays small.
+        """Return true where a drone has succeeded; None if the task defines success by an error that stays small.
 
         Returns:
             (n_worlds, n_drones)
@@ -263,7 +263,7 @@ class Env(ABC):
 
 
 class DroneEnv(Env):
-    """Many worlds of one task. Episodes that are over continue; ``AutoReset`` begins new ones."""
+    """Environment of many worlds with one task. Without ``AutoReset``, an episode that is over continues."""
 
     def __init__(self, sim: Sim, task: Task, freq: int = 50, actions: Actions | None = None, measured: bool = False):
         """Create an environment of a simulation in which the task is installed.
@@ -271,10 +271,10 @@ class DroneEnv(Env):
         Args:
             sim: The simulation, after ``task.install(sim)``; episodes begin from ``sim.default_data``.
             task: The task.
-            freq: Environment steps per second, Hz; divides the simulation's.
+            freq: Environment steps per second, Hz; must divide the simulation's frequency.
             actions: Meaning of an action; None for ``actions_of``.
-            measured: True for observations of the states as the sensors of the simulation measure them. Rewards and
-                ends of episodes are of the true states.
+            measured: True to observe the states as the sensors of the simulation measure them. Rewards and the ends of
+                episodes always depend on the true states.
         """
         freq = positive_integer("freq", freq)
         require_installed(sim, task)
@@ -371,6 +371,6 @@ class DroneEnv(Env):
 
 
 def _default_arrays(sim: Sim) -> list[Any]:
-    """Return the arrays that episodes begin from, without the scene's, which change when it is compiled."""
+    """Return the arrays from which episodes begin, except the scene's, which change when the scene is compiled."""
     data = sim.default_data
     return jax.tree.leaves((data.states, data.controls, data.params, data.plugins))

@@ -19,7 +19,7 @@ from crazysim.sim.sim import Sim
 
 
 class EpisodeReset:
-    """Resets of data at the start of an episode, by the default data and the pipeline that a simulation has now."""
+    """Resets of data at the start of an episode, with the present default data and reset pipeline of a simulation."""
 
     def __init__(self, sim: Sim):
         self._default = default = deduplicate(sim.default_data)
@@ -27,11 +27,11 @@ class EpisodeReset:
         names = [name for name, fn in others if not isinstance(fn, Stage)]
         names += [] if first[1] is reset else [first[0]]
         self.has_foreign_record = "batched" in jax.tree.leaves(scopes(sim.default_data))
-        """True if a record in ``data.plugins`` is of another library, which is not divided among worlds."""
+        """True if a record in ``data.plugins`` is of another library. Such a record is not divided among worlds."""
         self.takes_all_worlds = bool(names) or self.has_foreign_record
         """True if ``reset_data`` takes all worlds at once."""
         self.why_batched: str | None = None
-        """Reason why new episodes are computed in all worlds and then selected; None where each world begins alone."""
+        """Reason why resets are computed in all worlds and then selected; None if each world is reset on its own."""
         rows = zip(*map(jax.tree.leaves, (scopes(default), default, leaf_indices(default))), strict=True)
         world_id = leaf_indices(default).core.world_id
         if names:
@@ -42,12 +42,12 @@ class EpisodeReset:
         """``reset_data(data, default)``: data of one world after a reset, or of all worlds if ``takes_all_worlds``."""
 
     def default_for(self, data: SimData) -> SimData:
-        """Return the data of all worlds that an episode begins from, with the seed and the numbers of ``data``."""
+        """Return the data of all worlds from which an episode begins, with the seed and the ids of ``data``."""
         n_worlds, n_drones = data.states.pos.shape[:2]
         return copy_seed_and_ids(self.broadcast_default(n_worlds, n_drones), data)
 
     def default_for_world(self, data: SimData) -> SimData:
-        """Return the data of one world that an episode begins from, if it is the same in all worlds."""
+        """Return the data of one world from which an episode begins; the default data must be equal in all worlds."""
 
         def first_world(scope: str, x: Array) -> Array:
             return x[(0,) * n_world_axes(scope)] if n_batch_axes(scope) == 2 else x
@@ -55,7 +55,7 @@ class EpisodeReset:
         return copy_seed_and_ids(jax.tree.map(first_world, scopes(self._default), self._default), data)
 
     def broadcast_default(self, n_worlds: int, n_drones: int) -> SimData:
-        """Return the default data with all worlds and drones."""
+        """Return the default data broadcast to all worlds and drones."""
         shapes = {"drone": (n_worlds, n_drones), "world": (n_worlds, 1)}
 
         def repeat(scope: str, x: Array) -> Array:
@@ -75,7 +75,7 @@ def _reset_world(stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]
 
     def reset_one(data: SimData, default: SimData) -> SimData:
         data = reset_world(data, default)
-        axes = Axes(data)  # a wrapper may have made parameters one per drone
+        axes = Axes(data)  # a wrapper may have given each drone its own parameters
         for stage in stages:
             data = world_function(stage, axes)(data)
         return data
@@ -84,11 +84,11 @@ def _reset_world(stages: Sequence[Any]) -> Callable[[SimData, SimData], SimData]
 
 
 _AXES = {"drone": (0, 1), "world": (0,)}
-"""Axes of worlds and drones by scope; members of other populations are stored one by one."""
+"""Axes of worlds and drones by scope. The axis of members of other populations is never deduplicated."""
 
 
 def deduplicate(data: SimData) -> SimData:
-    """Return the data as host arrays, with one world and drone where all are equal."""
+    """Return the data as host arrays; an axis of worlds or drones has length 1 where all its entries are equal."""
 
     def deduplicate_leaf(scope: str, x: Array) -> Array | np.ndarray:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -104,7 +104,7 @@ def deduplicate(data: SimData) -> SimData:
 
 
 def copy_seed_and_ids(default: SimData, data: SimData) -> SimData:
-    """Return the default data with the seed, numbers of worlds, drones and members of the data."""
+    """Return the default data with the seed of ``data`` and its ids of worlds, drones and members."""
     core_fields = {name: getattr(data.core, name) for name in ("rng_key", "world_id", "drone_id", "n_worlds")}
     members = {
         name: default.plugins[name].replace(member_id=record.member_id)
@@ -115,7 +115,7 @@ def copy_seed_and_ids(default: SimData, data: SimData) -> SimData:
 
 
 def reset_world(data: SimData, default: SimData) -> SimData:
-    """Return the data of one world reset to its default; what worlds share stays. See ``core.stages.reset``."""
+    """Return the data of one world reset to its default; shared leaves are unchanged. See ``core.stages.reset``."""
     plugins = {name: default.plugins.get(name, plugin) for name, plugin in data.plugins.items()}
     new = map_batched(lambda x, value: jnp.broadcast_to(value, x.shape), data, default.replace(plugins=plugins))
     return new.replace(core=new.core.replace(episode=data.core.episode + 1))

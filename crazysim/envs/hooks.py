@@ -17,21 +17,21 @@ class Hooks:
     | --- | --- |
     | ``prepare(data)`` | once in ``reset``, with the data of all worlds |
     | ``after_spawn(data)`` | at the start of an episode, after the task has placed drones and goals |
-    | ``after_reset(state)`` | at the start of an episode, after it was observed |
+    | ``after_reset(state)`` | at the start of an episode, after the task has been observed |
     | ``before_step(state, action)`` | before the physics; the outermost wrapper is called first |
     | ``after_step(state)`` | after observations and reward; the innermost wrapper is called first |
 
-    A hook receives the state without the axis of worlds: (n_drones, k). What a wrapper remembers is in
-    ``state.memory[self.name]``; see ``remember`` and ``recall``. Memory belongs to the world, unless a record declares
-    it with ``leaf("drone")``; then a fused step divides it among the drones.
+    A hook receives the state without the axis of worlds: (n_drones, k). The memory of a wrapper is
+    ``state.memory[self.name]``; see ``remember`` and ``recall``. It is stored per world, except fields that a record
+    declares with ``leaf("drone")``, which a fused step divides among the drones.
     """
 
     name: str = ""
-    """Key of its memory in ``state.memory``; the name of the class if empty. A second wrapper of that name around an
-    environment gets a number behind it."""
+    """Key of the wrapper's memory in ``state.memory``; the name of the class if empty. A second wrapper of that name
+    around an environment gets a number appended."""
     batched: bool = False
-    """True for a wrapper that needs all worlds at once: its hooks then receive them with their axis, and steps are not
-    fused. Leaves of its memory without that axis are declared ``leaf("shared")``."""
+    """True for a wrapper that needs all worlds at once: its hooks then receive the axis of worlds, and steps are not
+    fused. Leaves of its memory without that axis must be declared ``leaf("shared")``."""
 
     def prepare(self, data: SimData) -> SimData:
         """Return the data of all worlds before their first episode."""
@@ -42,11 +42,11 @@ class Hooks:
         return data
 
     def after_reset(self, state: EnvState) -> EnvState:
-        """Return the state at the start of an episode, with what the wrapper observes and remembers."""
+        """Return the state at the start of an episode, with the wrapper's observations and initial memory."""
         return state
 
     def before_step(self, state: EnvState, action: Array) -> tuple[EnvState, Array]:
-        """Return state and action as they are passed on inwards. (n_drones, k)"""
+        """Return the state and the action to pass to the next inner wrapper or the task. (n_drones, k)"""
         return state, action
 
     def after_step(self, state: EnvState) -> EnvState:
@@ -58,5 +58,5 @@ class Hooks:
         return state.memory[self.name]
 
     def remember(self, state: EnvState, memory: Any, **changes: Any) -> EnvState:
-        """Return the state with another memory of this wrapper, and other changes."""
+        """Return the state with new memory of this wrapper, and with other changed fields."""
         return state.replace(memory=state.memory | {self.name: memory}, **changes)

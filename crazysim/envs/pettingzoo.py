@@ -62,7 +62,7 @@ class DroneParallelEnv(ParallelEnv):
         self.env_state: EnvState | None = None
         self._reset, self._step = jax.jit(env.reset), jax.jit(self._advance)
         self._generator, _ = gymnasium.utils.seeding.np_random()
-        shapes = self._reset.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
+        shapes = self._reset.eval_shape(jax.random.key(0))  # ``reset`` reuses this trace
         self.observation_spaces = {
             agent: gymnasium.spaces.Dict({k: _box(x.shape[2:], np.inf, x.dtype) for k, x in shapes.obs.items()})
             for agent in self.possible_agents
@@ -86,8 +86,8 @@ class DroneParallelEnv(ParallelEnv):
         """Start an episode.
 
         Args:
-            seed: Seed of all random numbers; None to continue those before, which first come from the system.
-            options: Options of PettingZoo; there are none here, and they are ignored.
+            seed: Seed of all random numbers; None to continue the earlier sequence, or start from the system's entropy.
+            options: Ignored; there are no options.
         """
         del options
         seed = as_seed(seed)
@@ -121,7 +121,7 @@ class DroneParallelEnv(ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """Return the observations of all drones as one vector: drone after drone, sorted by name for each."""
+        """Return the observations of all drones as one vector: drone after drone, each sorted by name."""
         if self.env_state is None:
             raise ConfigError("there is no state before the first reset(): call it first")
         return np.array(flatten(self.env_state.obs)).ravel()
@@ -148,7 +148,7 @@ class DroneParallelEnv(ParallelEnv):
         return state, (state.obs, state.reward[0], state.terminated[0], state.truncated[0], state.info)
 
     def _stack_actions(self, actions: Mapping[str, Any]) -> np.ndarray:
-        """Return the actions of all agents as one array, checked. (n_drones, k)"""
+        """Return the validated actions of all agents as one array. (n_drones, k)"""
         if unknown := set(actions) - set(self.agents):
             raise UnknownNameError(
                 f"expected actions of {', '.join(self.agents)}, got one of {', '.join(sorted(unknown))}"
@@ -168,7 +168,7 @@ class DroneParallelEnv(ParallelEnv):
         """Return each agent's entries of arrays (1, n_drones, ...); arrays of the world, (1,), go to all agents."""
 
         def agent_entry(x: Any, i: int) -> Any:
-            # A copy: what comes from JAX cannot be written to.
+            # A copy, because arrays from JAX are read-only.
             return (x[0, i] if x.ndim > 1 else x[0]).copy()
 
         return {

@@ -32,8 +32,8 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import map_batched, select_worlds
 
 Vectorize = Callable[[Callable[..., Any], bool], Callable[..., Any]]
-"""``vectorize(fn, batched)``: a function of one world as a phase calls it: unchanged in one world, or over all worlds.
-``batched`` is True for a function that takes all worlds already."""
+"""``vectorize(fn, batched)``: the function that a phase calls: ``fn`` itself if the phase runs in one world, or ``fn``
+mapped over all worlds. ``batched`` is True if ``fn`` already takes all worlds."""
 
 
 def skip_vectorization(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
@@ -43,7 +43,7 @@ def skip_vectorization(fn: Callable[..., Any], batched: bool) -> Callable[..., A
 
 
 def vectorize_over_worlds(fn: Callable[..., Any], batched: bool) -> Callable[..., Any]:
-    """Return a function of all worlds."""
+    """Return the function mapped over all worlds, or unchanged if it already takes all worlds."""
     return fn if batched else vmap_worlds(fn)
 
 
@@ -74,7 +74,7 @@ class Phases:
 
         Args:
             physics: Stages of a physics step.
-            batched: Reason why all phases need all worlds at once; None if each is of one world.
+            batched: Reason why all phases need all worlds at once; None if each runs in one world.
         """
 
         def stage(name: str, fn: Callable[..., SimData], phase: Phase, why: str | None, when: Any = None) -> Stage:
@@ -87,7 +87,7 @@ class Phases:
         def must_reset(data: SimData) -> Array:
             return data.plugins[NAME].must_reset
 
-        # Flagged first, so that the task can read it, and a new episode clears it.
+        # The flag is set first, so that the task can read it and a new episode clears it.
         stages = [
             stage("act", self._act, "before", batched),
             *physics,
@@ -126,7 +126,7 @@ class Phases:
         return self.after_physics(state, action, vectorize_over_worlds)
 
     def after_physics(self, state: EnvState, action: Array, vectorize: Vectorize) -> EnvState:
-        """Return the result of ``observe``, noting where a new episode begins."""
+        """Return the result of ``observe``, with ``must_reset`` set where a new episode begins."""
         was_done = state.done
         state = self.observe(state, action, vectorize)
         if self.reset_policy is None:
@@ -134,7 +134,7 @@ class Phases:
         return self.reset_policy.after_step(state).replace(must_reset=self.reset_policy.must_reset(was_done, state))
 
     def act(self, state: EnvState, action: Array, vectorize: Vectorize) -> tuple[EnvState, Array]:
-        """Return the state with the action's command staged, and the action as the wrappers pass it on.
+        """Return the state with the action's command staged, and the action as changed by the wrappers.
 
         Args:
             state: The state before the step.
@@ -179,7 +179,7 @@ class Phases:
         return state
 
     def reset_episode(self, state: EnvState, default: SimData, vectorize: Vectorize) -> EnvState:
-        """Return the state at the start of an episode; of the state before, only data, info and memory are read.
+        """Return the state at the start of an episode. Only data, info and memory of the state before are read.
 
         Args:
             state: The state before.
@@ -213,20 +213,20 @@ class Phases:
         return state
 
     def _observe_task(self, data: SimData) -> Obs:
-        """Return the observations of the task, of measured states if it is to get these."""
+        """Return the observations of the task, from measured states if ``measure_states`` is set."""
         return self.task.observe(data if self.measure_states is None else self.measure_states(data))
 
 
 def _flag_nonfinite(data: SimData, vectorize: Vectorize) -> SimData:
-    """Return the data with worlds flagged that are not finite, which holds for one world and for all."""
+    """Return the data with the flags of non-finite worlds set. Takes one world or all."""
     del vectorize
     return data.replace(core=data.core.replace(nonfinite=nonfinite_worlds(data)))
 
 
 def _restore_types(data: SimData, state: EnvState) -> SimData:
-    """Return the data of a state with the types of the data before."""
+    """Return the data of a state, cast to the dtypes of the data before."""
     if jax.tree.structure(state.full_data) != jax.tree.structure(data):
-        return state.full_data  # the engine refuses it, and says what has changed
+        return state.full_data  # the engine raises an error that names the change
 
     def cast(new: Any, old: Array) -> Array:
         return new if getattr(new, "dtype", None) == old.dtype else jnp.asarray(new, old.dtype)
@@ -235,7 +235,7 @@ def _restore_types(data: SimData, state: EnvState) -> SimData:
 
 
 def select_states(mask: Array | None, new: EnvState, old: EnvState) -> EnvState:
-    """Return one state in the worlds of a mask, and another elsewhere; leaves that worlds share are the new ones.
+    """Return one state in the worlds of a mask, and another elsewhere. Shared leaves are those of the new state.
 
     Args:
         mask: True where the new state is taken; None for all. (n_worlds,)
@@ -250,7 +250,7 @@ def _step_info(task: Task, data: SimData) -> dict[str, Array]:
 
 
 def _check_spawn(task: Task, old: SimData, new: Any) -> SimData:
-    """Return the data of a start with the shapes and types of before: of another type, a step would compile again."""
+    """Return the data from ``spawn`` with the shapes and dtypes of before, so that no step is compiled again."""
     if jax.tree.structure(new) != jax.tree.structure(old):
         had, has = ({keystr(path) for path, _ in tree_leaves_with_path(data)} for data in (old, new))
         what = ", ".join([f"without {x}" for x in sorted(had - has)] + [f"with {x}" for x in sorted(has - had)])

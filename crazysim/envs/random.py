@@ -1,8 +1,9 @@
-"""Random numbers of episodes: as repeatable as ``crazysim.core.random``, with a twentieth of the arithmetic.
+"""Random numbers of episodes: as reproducible as ``crazysim.core.random``, with a twentieth of the arithmetic.
 
-A million worlds draw twenty numbers each in every step, for the few episodes that start, and that must cost less than
-the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an integer hash with avalanche (Wellons
-2018, "Prospecting for hash functions", with the later constants 21f0aaad, d35a2d97) mix seed, world and episode.
+All worlds draw the numbers of a new episode in every step, although few begin one, and a million worlds with twenty
+numbers each must cost less than the physics. JAX's generator is a cipher of twenty rounds; here two rounds of an
+integer hash with good avalanche (Wellons 2018, "Prospecting for hash functions", with the later constants 21f0aaad,
+d35a2d97) mix seed, world and episode.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from crazysim.core.data import SimData
 from crazysim.errors import ConfigError, short_repr
 
 STRIDE = np.uint32(0x9E3779B9)
-"""2^32 divided by the golden ratio: its multiples are spread evenly."""
+"""2^32 divided by the golden ratio: its multiples modulo 2^32 are evenly distributed."""
 
 
 def as_seed(seed: object) -> int | None:
-    """Return a seed of the random numbers of all worlds; None stays None."""
+    """Return a validated seed of the random numbers of all worlds; None stays None."""
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**63:
@@ -38,8 +39,8 @@ def episode_key(data: SimData, name: str) -> Array:
     """Return the random key of a world's episode.
 
     Args:
-        data: The data of one world; seed, world and episode are taken from it.
-        name: Name of the stream; another name gives other numbers.
+        data: The data of one world, which gives the seed, the world and the episode.
+        name: Name of the stream; streams of different names are independent.
 
     Returns:
         Typed key, for ``draw``, ``uniform`` or ``jax.random``. ()
@@ -76,14 +77,14 @@ def uniform(key: Array, *shape: int, low: Any = 0.0, high: Any = 1.0) -> Array:
 
 
 def draw(key: Array, *batch: int, **sizes: int | tuple[int, ...]) -> dict[str, Array]:
-    """Return random numbers in [0, 1) by name: one draw, divided among the names in their order.
+    """Return random numbers in [0, 1) by name, from one draw that is split in the order of the names.
 
-    ``draw(key, n_drones, start=3, yaw=1)`` gives ``start`` (n_drones, 3) and ``yaw`` (n_drones, 1). A name added at the
-    end leaves the others' numbers as they are only without a batch shape.
+    ``draw(key, n_drones, start=3, yaw=1)`` gives ``start`` (n_drones, 3) and ``yaw`` (n_drones, 1). Without
+    leading axes, a name appended at the end does not change the numbers of the others; with leading axes it does.
 
     Args:
         key: Random key. ()
-        batch: Leading axes, usually the number of drones; none for numbers of the world.
+        batch: Leading axes, usually the number of drones; none for numbers per world.
         sizes: Size of the last axis by name, or the shape of several last axes.
 
     Returns:

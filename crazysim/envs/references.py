@@ -1,8 +1,8 @@
-"""Tasks in files of users: ``FILE.py:NAME`` or ``MODULE:NAME``, and the list of those that this user has named.
+"""References to tasks of users, ``FILE.py:NAME`` or ``MODULE:NAME``, and the list of those that this user has named.
 
-A file that is loaded is executed. Files of a training run hold the reference of their task, and may come from others.
-Therefore a reference that was read from them is only followed if this user has named it before, in a call or on the
-command line: each such reference is noted in the user's folder of caches.
+Loading a file executes it. The files of a training run contain the reference of their task, and may come from other
+people. Therefore a reference that was read from them is only loaded if this user has named it before, in a call or on
+the command line. The references that the user names are kept in a list in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from crazysim.storage import distrust, make_private
 
 GUIDE = "docs/guides/tasks.md"
 _CLASSES: dict[str, type[Task]] = {}
-"""Classes that this process has made tasks from, by their references."""
+"""Classes for which this process has made references, by reference."""
 _LOADED: set[str] = set()
 """References that were named in this process."""
 
@@ -43,13 +43,13 @@ def split_reference(reference: str) -> tuple[str, str]:
 
 
 def absolute_reference(reference: str) -> str:
-    """Return a reference with the absolute path of its file; one of a module as it is."""
+    """Return a reference with the absolute path of its file; a reference to a module is unchanged."""
     place, name = split_reference(reference)
     return f"{Path(place).expanduser().resolve()}:{name}" if place.endswith(".py") else reference
 
 
 def reference_of(task: type[Task]) -> str:
-    """Return the reference of a class; other processes can use it if the class is in a file, and then it is noted."""
+    """Return the reference of a class. If other processes can load it from a file, add it to the list."""
     module, name = sys.modules.get(task.__module__), task.__qualname__
     file = getattr(module, "__file__", None)
     is_in_file = file is not None and file.endswith(".py") and getattr(module, name, None) is task
@@ -63,7 +63,7 @@ def reference_of(task: type[Task]) -> str:
 
 
 def load_task(reference: str, names: Container[str]) -> type[Task] | str:
-    """Execute the file or module of a reference that a user has written, and note the reference.
+    """Execute the file or module of a reference that the user has named, and add the reference to the list.
 
     Args:
         reference: ``FILE.py:NAME``, ``MODULE:NAME``, or ``FILE.py`` for the only task in it.
@@ -96,7 +96,7 @@ def load_task(reference: str, names: Container[str]) -> type[Task] | str:
 
 
 def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
-    """Return what ``load_task`` does, for a reference that was read from the files of a run.
+    """Load a task as ``load_task`` does, by a reference that was read from the files of a run.
 
     Raises:
         ConfigError: If this user has not named it before, others could have changed its file, or ``load_task`` fails.
@@ -131,7 +131,7 @@ def _is_task(x: object) -> bool:
 
 
 def _from_file(path: Path) -> ModuleType:
-    """Return the module of a file, executed once for each version of the file, with its folder on the path."""
+    """Return the module of a file. Each version of the file is executed once, with its folder on ``sys.path``."""
     try:
         source = path.read_bytes()
     except OSError as error:
@@ -168,7 +168,7 @@ def _from_module(name: str) -> ModuleType:
 
 
 def _list_path() -> Path:
-    """Return the file with the references that this user has named, a line each.
+    """Return the path of the file with the references that this user has named, one per line.
 
     Raises:
         ConfigError: If the user has no home folder.
@@ -185,7 +185,7 @@ def _read_list() -> list[str]:
 
 
 def _add_to_list(reference: str) -> None:
-    """Add a reference to the list; where that is impossible, it is to be named again in another process."""
+    """Add a reference to the list. If that is impossible, the user must name it again in another process."""
     with contextlib.suppress(OSError, ConfigError):
         path = _list_path()
         make_private(path.parent)

@@ -1,4 +1,4 @@
-"""Tasks by name, registered with Gymnasium too, and environments made from them in one call."""
+"""Registry of tasks by name, also for Gymnasium, and ``make``, which creates their environments."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ TASKS: dict[str, Entry] = {
 BUILT_IN = frozenset(TASKS)
 """Names of the tasks of this package."""
 ENTRY_POINTS = "crazysim.tasks"
-"""Group of entry points in which an installed package lists its classes of tasks by name."""
+"""Group of entry points in which an installed package lists its task classes by name."""
 
 RANDOMIZATIONS = {"crazyflie": Randomize.crazyflie, "generic": Randomize.generic}
 """Ready-made ranges of randomisation, by name."""
@@ -95,14 +95,14 @@ def make(
     """Return an environment of many worlds of a task, with a simulation of its own.
 
     Args:
-        task: One of ``TASKS``, the place of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
+        task: One of ``TASKS``, the reference of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
         n_worlds: Number of worlds.
         freq: Environment steps per second, Hz.
         actions: Meaning of an action; None for the usual one of the command level.
-        sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Empty for the
-            true states, or for those that ``estimator``, a setting of ``Sim``, estimates.
-        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. Those that ``env.sim.add``
-            adds later are an error in ``reset``.
+        sensors: Sensors, such as ``MotionCapture``; the task observes the states as they measure them. Without
+            sensors, it observes the true states, or the estimated ones with the setting ``estimator`` of ``Sim``.
+        effects: Other plugins of the simulation, such as ``Wind`` and ``Randomize``. If others are added later
+            by ``env.sim.add``, ``reset`` raises an error.
         randomize: Name of ready-made ranges of ``Randomize`` from which the drones of every episode are drawn:
             ``"crazyflie"`` or ``"generic"``. None for the airframe's numbers.
         options: Settings of ``crazysim.Sim``, such as ``n_drones``, ``control``, ``drone``, ``dynamics``, ``device``,
@@ -146,7 +146,7 @@ def make(
 def register(name: str, task: type[Task], control: str = "attitude", n_drones: int = 1) -> str:
     """Register a task of your own by a name, for ``make``, training and Gymnasium, and return its id there.
 
-    A name that is registered again, as when a cell of a notebook is executed again, gets the new class.
+    Registering a name again, such as by executing a notebook cell again, replaces its class.
 
     Args:
         name: Name, such as ``"two_hoops"``: lower case letters, digits and underscores.
@@ -173,9 +173,9 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
     """Return the registered entry of a task, or one with the usual command level for a class of your own.
 
     Args:
-        task: One of ``TASKS``, a name of the entry points of an installed package, the place of a class of your own,
-            or a task.
-        named: False for a place that was read from the files of a run; see ``crazysim.envs.references``.
+        task: One of ``TASKS``, a name from the entry points of an installed package, the reference of a class of your
+            own, or a task.
+        named: False for a reference that was read from the files of a run; see ``crazysim.envs.references``.
 
     Raises:
         ConfigError: If there is no such file, module or class, or it may not be executed.
@@ -201,7 +201,7 @@ def entry_of(task: str | Task, named: bool = True) -> Entry:
 
 
 def _check_class(task: object) -> type[Task]:
-    """Return a class of tasks."""
+    """Return a task class, after checking that its settings are dataclass fields."""
     if not inspect.isclass(task) or not issubclass(task, Task) or task is Task:
         raise ConfigError(f"expected a subclass of Task, got {task!r}. docs/guides/tasks.md has an example.")
     fields = {f.name for f in dataclasses.fields(task)}
@@ -219,7 +219,7 @@ def _gymnasium_id(name: str) -> str:
 
 
 def _register_with_gymnasium(name: str, entry: Entry) -> None:
-    """Register a task with Gymnasium, where it is made by name."""
+    """Register a task with Gymnasium, unless its id is already registered."""
     if entry.id not in gymnasium.registry:
         gymnasium.register(
             entry.id,

@@ -15,7 +15,7 @@ class AutoresetMode(StrEnum):
     """When a new episode begins; the names are Gymnasium's."""
 
     next_step = "NextStep"
-    """In the step after the last, which ignores its action and gives no reward."""
+    """In the step after the last one of an episode. That step ignores its action and gives no reward."""
     same_step = "SameStep"
     """At the end of the last step itself: ``obs`` belongs to the new episode, reward and ``info`` to that step, and the
     last observation is in ``info["final_obs"]``."""
@@ -34,7 +34,7 @@ class ResetPolicy:
     keeps_final_obs: bool
     """True if ``after_step`` adds ``info["final_obs"]``."""
     after_reset: Callable[[EnvState, EnvState], EnvState]
-    """``after_reset(ended, new)``: the state where a new episode begins, from those before and after its reset."""
+    """``after_reset(ended, new)``: the state that begins a new episode, from those before and after the reset."""
 
 
 def _with_final_obs(state: EnvState) -> EnvState:

@@ -14,9 +14,9 @@ from crazysim.envs.state import EnvState, Obs, validate_action
 from crazysim.pytree import PyTree, select_worlds
 
 Policy = Callable[[Obs, Any, Array], tuple[Array, Any, Any]]
-"""``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once: observations, what the policy
-remembers and a random key, to the actions of all drones, (n_worlds, n_drones, k), what it remembers next, and any tree
-of arrays for ``Transition.extras``. Memory has worlds in front, (n_worlds, ...); ``()`` for none."""
+"""``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once. ``memory`` is the state that the
+policy keeps between steps, (n_worlds, ...) each, or ``()``; ``key`` is a random key; ``action`` has the actions of all
+drones, (n_worlds, n_drones, k); ``extras`` is any tree of arrays, for ``Transition.extras``."""
 
 
 class Transition(PyTree):
@@ -58,7 +58,7 @@ class Transition(PyTree):
 
 
 Keep = Callable[[Transition], Any]
-"""Transition to the part of it that is kept: any tree of arrays."""
+"""``keep(transition)``: the part of a transition to store, any tree of arrays."""
 
 
 def rollout(
@@ -71,7 +71,7 @@ def rollout(
     initial_memory: Any = (),
     memory: Any = None,
 ) -> tuple[EnvState, Any, Any]:
-    """Return the state some steps later, the policy's memory, and what was kept on the way; pure, for jit and grad.
+    """Run a policy for some steps in one ``jax.lax.scan``. The function is pure, for jit and grad.
 
     Args:
         env: The environment, usually inside ``AutoReset``.
@@ -79,12 +79,12 @@ def rollout(
         policy: The policy, for all worlds at once.
         key: Random key; each step receives one of its own.
         n_steps: Number of steps, a positive integer.
-        keep: ``keep(transition)``: the part of each transition to return; rewards and ends by default.
+        keep: ``keep(transition)``: the part of each transition to return; reward and ``done`` by default.
         initial_memory: Memory of the policy at the start of an episode; ``()`` for none. (n_worlds, ...) each
-        memory: Its memory before the first step, as another rollout returned it; None for ``initial_memory``.
+        memory: Memory of the policy before the first step, as another rollout returned it; None for ``initial_memory``.
 
     Returns:
-        The state, the memory, and what was kept, with time in front, (n_steps, ...).
+        The state and the memory after the last step, and the results of ``keep``, stacked over time, (n_steps, ...).
     """
     n_steps = positive_integer("n_steps", n_steps)
     memory = initial_memory if memory is None else memory

@@ -63,7 +63,7 @@ class DroneVecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         self._started = time.time()
         self.state: EnvState | None = None
-        _, obs = self._reset_fn.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
+        _, obs = self._reset_fn.eval_shape(jax.random.key(0))  # ``reset`` reuses this trace
         spaces: dict[str, gymnasium.Space] = {
             name: gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32) for name, x in obs.items()
         }
@@ -88,13 +88,13 @@ class DroneVecEnv(VecEnv):
         return self._to_numpy(jax.device_get(obs))
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Take the actions of the next step, (num_envs, k)."""
+        """Store the actions for the next step, (num_envs, k)."""
         if self.state is None:
             raise ConfigError("expected a reset before the first step, got none. Call reset().")
         self._actions = check_actions(actions, (self.num_envs, *(self.action_space.shape or ())))
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Return observations, rewards, which episodes ended, and infos."""
+        """Advance all worlds; return observations, rewards, True where an episode ended, and infos."""
         if self._actions is None:
             raise ConfigError("expected actions before step_wait(), got none. Call step(actions).")
         self.state, out = self._step_fn(self.state, self._actions)
@@ -122,12 +122,12 @@ class DroneVecEnv(VecEnv):
         return [value] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: ArrayLike | None = None) -> None:
-        """Refuse: all worlds are one compiled program."""
+        """Raise an error, because all worlds are one compiled program."""
         del value, indices
         raise ConfigError(f"cannot set {attr_name!r}: all worlds are one compiled program. Make another environment.")
 
     def env_method(self, method_name: str, *args: Any, indices: ArrayLike | None = None, **kwargs: Any) -> list[Any]:
-        """Render, the only method of a single world."""
+        """Call ``render``, the only method that is supported."""
         del indices
         if method_name != "render" or args or kwargs:
             raise ConfigError(
@@ -136,7 +136,7 @@ class DroneVecEnv(VecEnv):
         return list(self.get_images())
 
     def env_is_wrapped(self, wrapper_class: type, indices: ArrayLike | None = None) -> list[bool]:
-        """Return true for ``Monitor``, whose infos are there; false for other wrappers of Stable-Baselines3."""
+        """Return true for ``Monitor``, whose infos are provided; false for other wrappers of Stable-Baselines3."""
         return [wrapper_class.__name__ == "Monitor"] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[np.ndarray | None]:

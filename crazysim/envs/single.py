@@ -19,10 +19,10 @@ from crazysim.errors import ConfigError
 
 
 class DroneSingleEnv(gymnasium.Env):
-    """Environment of Gymnasium over one world of a functional environment.
+    """Gymnasium environment over a functional environment of one world.
 
-    It is for programs that take nothing else, and for looking at one drone: a step costs nearly the time of a step of
-    thousands of worlds. Observations and rewards are NumPy arrays that belong to the caller.
+    Use it for programs that support no other interface, and to look at one drone: a step takes nearly as long as a step
+    of thousands of worlds. Observations and rewards are NumPy arrays that belong to the caller.
     """
 
     def __init__(self, env: DroneEnv, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)):
@@ -46,7 +46,7 @@ class DroneSingleEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start a new episode.
 
-        Without a seed the random numbers continue those before; the first ones come from the system.
+        Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
         if options:
             raise ConfigError(f"expected no options of reset, got {', '.join(options)}")

@@ -32,7 +32,7 @@ def flying(
         ang_vel=ang_vel,
         rotor_vel=jnp.broadcast_to(hover_rotors(data.params), s.rotor_vel.shape),
     )
-    # Otherwise the controllers' derivative terms would see a jump of the angular velocity at their first tick.
+    # Otherwise the angular velocity would jump for the derivative terms of the controllers at their first tick.
     for level_name in ("attitude", "body_rate"):
         ctrl = getattr(controls, level_name)
         if ctrl is not None and ctrl.prev_ang_vel is not None:

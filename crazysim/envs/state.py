@@ -1,4 +1,4 @@
-"""State of an environment, of all worlds or of one, and checks of actions."""
+"""State of an environment, of all worlds or of one, and checks of actions and goals."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class EnvRecord(PyTree):
     drone_info: dict[str, Any] = leaf("drone", None)
     """Entries of ``info`` with a row for each drone. (n_worlds, n_drones, ...) each"""
     world_info: dict[str, Array] = leaf("world")
-    """Entries of ``info`` with a number for each world. (n_worlds, 1) each"""
+    """Entries of ``info`` with one number per world. (n_worlds, 1) each"""
     memory: dict[str, Any] = leaf("world", None)
     """Memory of the wrappers, by name of the wrapper. (n_worlds, 1, ...) each; records within declare their own axes"""
     next_action: Array = leaf("drone", 1, scratch=True)
-    """Action that a step is given, and as the wrappers pass it on. (n_worlds, n_drones, k)"""
+    """Action passed to ``step``; within a step, as changed by the wrappers. (n_worlds, n_drones, k)"""
     must_reset: Array = leaf("world", scratch=True)
     """True where a new episode begins within the step. (n_worlds, 1)"""
 
@@ -124,7 +124,7 @@ class EnvState(PyTree):
         return self.record.drone_info.get("final_obs", self.obs)
 
     def replace(self, **changes: Any) -> EnvState:
-        """Return the state with other values of some properties."""
+        """Return the state with new values of some properties."""
         full_data = changes.pop("full_data", self.full_data)
         record = full_data.plugins[NAME]
         if "data" in changes:
@@ -157,12 +157,12 @@ class EnvState(PyTree):
         return {"drone_info": of_drones, "world_info": of_worlds}
 
     def _squeeze_axis(self, x: Any) -> Any:
-        """Return an array of worlds without the axis of length 1; in one world it has none."""
+        """Return a per-world array without its axis of length 1, which the array of a single world does not have."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*x.shape[:axis], *x.shape[axis + 1 :]))
 
     def _add_axis(self, x: Any) -> Any:
-        """Return an array of worlds with the axis of length 1; in one world it has none."""
+        """Return a per-world array with an axis of length 1, which the array of a single world does not get."""
         axis = self.full_data.core.steps.ndim - 1
         return x if axis < 0 else _reshape(x, (*jnp.shape(x)[:axis], 1, *jnp.shape(x)[axis:]))
 
@@ -181,7 +181,7 @@ def _map_undeclared(fn: Any, memory: dict[str, Any]) -> dict[str, Any]:
 
 
 def state_of_data(data: SimData) -> EnvState:
-    """Return a state that has data only, from which an episode begins."""
+    """Return a state with an empty record, from which an episode begins."""
     nothing: Any = None
     record = EnvRecord({}, nothing, nothing, nothing, nothing, {}, {}, {}, nothing, nothing)
     return EnvState(data.replace(plugins=data.plugins | {NAME: record}))
@@ -193,7 +193,7 @@ def flatten(obs: Obs) -> Array:
 
 
 def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return actions of the host for all worlds, checked. (n_worlds, ...)"""
+    """Return actions for all worlds as a float32 host array, after checking shape and values. (n_worlds, ...)"""
     actions = np.asarray(actions, np.float32)
     if actions.shape != shape:
         raise ValueError(f"expected actions of shape {shape}, got {actions.shape}")
@@ -204,7 +204,7 @@ def check_actions(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def validate_action(action: Array, state: EnvState, actions: Actions) -> Array:
-    """Return an action in the type of the state's."""
+    """Return an action with the dtype of the state's action, after checking its shape. (n_worlds, n_drones, k)"""
     if jnp.shape(action) != state.action.shape:
         raise ValueError(
             f"expected an action of shape {state.action.shape} = (n_worlds, n_drones, {actions.size}), got "
@@ -214,10 +214,10 @@ def validate_action(action: Array, state: EnvState, actions: Actions) -> Array:
 
 
 def validate_goals(pos: ArrayLike | Array, state: EnvState) -> Array:
-    """Return goals of every drone, in the type of its position. (n_worlds, n_drones, 3)
+    """Return the goal of each drone, with the dtype of its position. (n_worlds, n_drones, 3)
 
     Args:
-        pos: One of all drones (3,), one of each world (n_worlds, 3), or one of each drone (n_worlds, n_drones, 3); an
+        pos: One goal for all drones (3,), one per world (n_worlds, 3), or one per drone (n_worlds, n_drones, 3); an
             axis of worlds or drones may have length 1.
         state: The state of all worlds.
     """

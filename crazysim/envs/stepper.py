@@ -1,4 +1,4 @@
-"""Environment steps one call at a time, with few arrays: each array of a call costs more than the arithmetic on it."""
+"""Environment steps in separate calls with few arrays: passing an array costs more than the arithmetic on it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import replace_leaves
 
 Output = Callable[[EnvState], Any]
-"""State after a step to the tree of arrays that a call returns."""
+"""``output(state)``: the tree of arrays that a call returns, from the state after a step."""
 
 
 class EnvStepper:
     """An environment state that is stored flattened and advanced in place.
 
-    Its compiled step returns what ``output`` selects, which is all that a user reads after each call.
+    Its compiled step returns only what ``output`` selects, and the ends of episodes.
     """
 
     def __init__(self, env: Env, output: Output):
@@ -41,11 +41,11 @@ class EnvStepper:
         self._carried: list[int] = []
         self._fixed: list[int] = []
         self.compiled: Any = None
-        """The compiled step; None before there is one."""
+        """The compiled step; None before a state is assigned."""
 
     @property
     def state(self) -> EnvState | None:
-        """The state, with observations, reward and info as they were assigned; None before there is one."""
+        """The state; None before one is assigned. Results of a step may still be those of the assigned state."""
         return None if self._flat is None else self._unflatten(self._flat, *self._ends)
 
     @state.setter
@@ -63,7 +63,7 @@ class EnvStepper:
         """Advance the state by one step, and return the output, ``terminated`` and ``truncated``. (n_worlds,) each
 
         Args:
-            actions: Actions of all drones, for each world in any shape. (n_worlds, ...)
+            actions: Actions of all drones; the axes after the first may be flattened. (n_worlds, ...)
         """
         flat = self._flat
         if flat is None:
@@ -92,4 +92,4 @@ class EnvStepper:
             state = EnvState(after.data())
             return [after.leaves[i] for i in carried], self._output(state), (state.terminated, state.truncated)
 
-        self.compiled = jaxcompat.jit_donating(step)  # no caller has what is carried
+        self.compiled = jaxcompat.jit_donating(step)  # no caller holds the carried arrays

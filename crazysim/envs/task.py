@@ -17,7 +17,7 @@ from crazysim.pytree import PyTree
 from crazysim.sim.sim import Sim
 
 MAX_SECONDS = 1e5
-"""Longest episode, s: its steps are counted in 32 bits, at any rate of physics up to 10,000 Hz."""
+"""Longest episode, s. A 32-bit counter of its physics steps does not overflow at up to 10,000 Hz."""
 NAME = "task"
 """Name of a task's record in ``data.plugins``."""
 
@@ -27,8 +27,9 @@ class Task:
     """A task: a frozen record of settings whose methods are pure functions of one world.
 
     Subclasses are frozen dataclasses. They define ``name``, ``spawn``, ``observe``, ``rewards``, ``terminated`` and
-    ``error``, and whatever else they need. Leaves of drones are (n_drones, ...); leaves of worlds have no batch axes.
-    What must be remembered from step to step is a record in ``data.plugins["task"]``, which ``install`` puts there.
+    ``error``, and whatever else they need. In the data, leaves of drones are (n_drones, ...), and leaves of worlds have
+    no batch axes. State that the task keeps between steps is a record in ``data.plugins["task"]``, which ``install``
+    adds.
     """
 
     name: ClassVar[str] = ""
@@ -54,7 +55,7 @@ class Task:
         check_settings(self)
 
     def install(self, sim: Sim) -> None:
-        """Put into a simulation what the task needs: objects, a record, stages. Call it once, before ``DroneEnv``."""
+        """Add the objects, the record and the stages of the task to a simulation. Call it once, before ``DroneEnv``."""
 
     def add_record(self, sim: Sim, record: PyTree, placements: Sequence[StagePlacement] = ()) -> None:
         """Add the task's record, for all worlds, and stages that update it; for use in ``install``.
@@ -76,7 +77,7 @@ class Task:
         raise NotImplementedError(self._undefined("spawn(data, key)"))
 
     def set_goal(self, data: SimData, pos: Array) -> SimData:
-        """Return the data with other goals, for ``env.set_goal``; tasks whose goals are positions define it.
+        """Return the data with new goals, for ``env.set_goal``. Tasks whose goals are positions define this method.
 
         Args:
             data: The world.
@@ -89,7 +90,7 @@ class Task:
         )
 
     def before_step(self, data: SimData) -> SimData:
-        """Return the data before an environment step; for rewards of differences, note here what they start from."""
+        """Return the data before an environment step. Store here the initial values of rewards that are differences."""
         return data
 
     def observe(self, data: SimData) -> Obs:
@@ -120,7 +121,7 @@ class Task:
         return {}
 
     def target(self, data: SimData) -> Array | None:
-        """Return the place where each drone should be, or several marks, for images, m; None to draw none.
+        """Return the target position of each drone, or several marks per drone, to draw in images, m; None for none.
 
         Returns:
             (n_drones, 3) or (n_drones, n_marks, 3)
@@ -129,7 +130,7 @@ class Task:
         return None
 
     def subjects(self, data: SimData) -> Array | None:
-        """Return points that films hold in view besides drones and marks, such as a pad's rim, m; None for none.
+        """Return points that films keep in view besides drones and marks, such as a pad's rim, m; None for none.
 
         Returns:
             (n_points, 3)
@@ -138,12 +139,12 @@ class Task:
         return None
 
     def camera(self, n_drones: int) -> Mapping[str, Any] | None:
-        """Return the camera of images and films, lookat, distance, azimuth and elevation; None to frame all starts."""
+        """Return the camera's lookat, distance, azimuth and elevation in images and films; None to frame all starts."""
         del n_drones
         return None
 
     def succeeded(self, data: SimData) -> Array | None:
-        """Return true where a drone has succeeded; None if success is an error that stays small. (n_drones,)"""
+        """Return true where a drone has succeeded; None if success means that ``error`` stays small. (n_drones,)"""
         del data
         return None
 

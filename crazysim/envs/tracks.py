@@ -17,11 +17,11 @@ CELL = (1.0, 1.2)
 MARGIN = (0.5, 0.3)
 """Distance of the cells from the limits of the arena, m."""
 CELL_JITTER = 0.05
-"""Most of each component of a gate's distance from the middle of its cell, m."""
+"""Largest component of a gate's offset from the middle of its cell, m."""
 MAX_TURN = 1.0
-"""Most that a gate of a random course is turned from the way that leads to it, rad."""
+"""Largest angle between a gate of a random course and the way that leads to it, rad."""
 START_SPACING = 0.4
-"""Distance of the starts of one world, m."""
+"""Distance between neighbouring starts in one world, m."""
 START_HEIGHT = 0.4
 """Height of the starts of a random course, m."""
 
@@ -57,19 +57,19 @@ class Track:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Cells along x and y that a random course has room for."""
+        """Numbers of cells of a random course along x and y."""
         room = (np.asarray(self.high) - np.asarray(self.low))[:2] - 2 * np.array(MARGIN)
         n_x, n_y = np.floor(room / CELL + 1e-6).astype(int)
         return int(n_x), int(n_y)
 
 
 def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Track:
-    """Return a track that can be flown from its starts.
+    """Check that a track can be flown from its starts, and return it.
 
     Args:
         track: The track.
         n_drones: Drones in a world.
-        jitter: Farthest that drones, gates and obstacles together are moved from their places in the plane, m.
+        jitter: Largest sum of the horizontal displacements of a drone and of a gate or obstacle, m.
         random: True if gates and obstacles are placed at random.
     """
     shapes = {"gates_pos": (-1, 3), "gates_rpy": (len(track.gates_pos), 3), "obstacles_pos": (-1, 3)}
@@ -111,7 +111,7 @@ def check_track(track: Track, n_drones: int, jitter: float, random: bool) -> Tra
 
 
 def start_offsets(n_drones: int) -> np.ndarray:
-    """Return where drones begin around the start: in layers of two by two, a single drone in the middle, m.
+    """Return the offsets of drones from the start, m: in layers of two by two, or in the middle for a single drone.
 
     Returns:
         (n_drones, 3)
@@ -123,7 +123,7 @@ def start_offsets(n_drones: int) -> np.ndarray:
 
 
 def random_count(track: Track) -> int:
-    """Return how many random numbers a random course takes."""
+    """Return the number of random numbers that ``random_course`` takes."""
     n_x, n_y = track.grid
     return n_x * n_y + (n_x + 1) * (n_y + 1) + 3 * track.n_gates
 
@@ -131,11 +131,11 @@ def random_count(track: Track) -> int:
 def random_course(track: Track, x: Array) -> tuple[Array, Array, Array, Array]:
     """Return a course drawn at random: start and gates in cells of their own, obstacles in corners of cells.
 
-    So none stands in another's way, whatever is drawn. Heights are the track's. A gate faces the way that leads to it
-    from the one before, give or take a radian.
+    Hence no object is in the way of another in any draw. Heights are the track's. A gate faces along the way from the
+    gate before it, with a deviation of up to 1 rad.
 
     Args:
-        track: Heights, numbers and limits.
+        track: Track with the heights and numbers of gates and obstacles, and the limits of the arena.
         x: Random numbers in [0, 1). (..., random_count)
 
     Returns:
@@ -173,7 +173,7 @@ def ranks(x: Array, n: int) -> Array:
     Returns:
         Different whole numbers from 0 to m - 1. (..., n)
     """
-    # Numbers of equal value count by their place, so that no two get one rank.
+    # Equal numbers are ranked by position, so that no two have the same rank.
     earlier = np.arange(x.shape[-1])[None] < np.arange(n)[:, None]
     mine, others = x[..., :n, None], x[..., None, :]
     return jnp.sum((others < mine) | ((others == mine) & earlier), axis=-1, dtype=jnp.int32)

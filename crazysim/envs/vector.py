@@ -29,8 +29,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     Observations are named, (num_envs, k) with one drone per world and (num_envs, n_drones, k) with several, and actions
     likewise; with several drones the reward is their mean. All are JAX arrays on the simulation's device, which
-    Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert without a copy, or with ``numpy=True`` NumPy arrays
-    that the caller may write to, as Gymnasium's own wrappers of rewards do.
+    Gymnasium's wrappers ``JaxToNumpy`` and ``JaxToTorch`` convert without a copy. With ``numpy=True`` they are NumPy
+    arrays that the caller may write to, as Gymnasium's own reward wrappers do.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self._restart_fn = jax.jit(self.env.restart)
         self._stepper = EnvStepper(self.env, self._output)
         self._outputs: Any = None
-        shapes = self._reset_fn.eval_shape(jax.random.key(0))  # the trace serves ``reset`` too
+        shapes = self._reset_fn.eval_shape(jax.random.key(0))  # ``reset`` reuses this trace
         self._drone_entries = {k for k, v in shapes.info.items() if k != "final_obs" and v.ndim > 1}
         self.single_observation_space = gymnasium.spaces.Dict(
             {name: self._box(x, np.inf) for name, x in shapes.obs.items()}
@@ -80,7 +80,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start new episodes in all worlds, or where ``options["reset_mask"]`` is True, (num_envs,) of type bool.
 
-        Without a seed the random numbers continue those before; the first ones come from the system.
+        Without a seed, the random numbers continue the earlier sequence, or start from the system's entropy.
         """
         options = dict(options or {})
         mask = as_mask(options.pop("reset_mask", None), (self.num_envs,))
@@ -107,7 +107,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def state(self) -> EnvState | None:
-        """State of the functional environment, each drone with the reward of its world; None before the first reset."""
+        """State of the functional environment; each drone has the reward of its world. None before the first reset."""
         state = self._stepper.state
         if state is None:
             return None
@@ -148,7 +148,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return info | {"final_info": final | {f"_{k}": over for k in final}, "_final_info": over}
 
     def _convert(self, results: Any) -> Any:
-        """Return results as the caller gets them."""
+        """Return results as NumPy copies if the caller asked for them, and unchanged otherwise."""
         return jax.tree.map(np.array, results) if self._numpy else results
 
     def _output(self, state: EnvState) -> tuple[Any, Array, dict[str, Any]]:
@@ -157,7 +157,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return self._squeeze_drones(state.obs), reward, self._info(state)
 
     def _squeeze_drones(self, tree: Any) -> Any:
-        """Return arrays of drones, without the axis of drones if there is one drone."""
+        """Return per-drone arrays, without the axis of drones if there is only one drone."""
         return jax.tree.map(lambda x: x[:, 0], tree) if self._single else tree
 
     def _info(self, state: EnvState) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Access to pages: an address with a token, and servers of viser that check every request."""
+"""Access to pages: an address with a token, and viser servers that check every request."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from crazysim.errors import RenderError
 
 WILDCARD_ADDRESSES = ("0.0.0.0", "::")
-"""Addresses to listen at that stand for every network."""
+"""Addresses that stand for listening on all networks."""
 LOOPBACK_ADDRESSES = ("127.0.0.1", "localhost", "::1")
 """Addresses that other machines cannot reach."""
 
@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 class Access:
     """Address of a live page, and the check of its requests.
 
-    A page of another site can send requests to this machine, with the name of its own site as ``Origin``, or, once that
-    name is resolved to this machine, as ``Host``. Both are refused, and so are requests without the token.
+    A page of another site can send requests to this machine. They carry the name of that site as ``Origin`` or, if the
+    name is made to resolve to this machine (DNS rebinding), as ``Host``. Both are refused, as are requests without the
+    token.
     """
 
     def __init__(self, host: str, port: int):
@@ -64,7 +65,7 @@ class Access:
         return ""
 
     def answer(self, connection: Any, request: Any) -> Any:
-        """Return the response of websockets that refuses a request, or None, with the token taken out of its path."""
+        """Return a websockets response that refuses a request, or remove the token from its path and return None."""
         reason = self.refusal(request.path, request.headers)
         if not reason:
             request.path = request.path.removeprefix(f"/{self._token}") or "/"
@@ -80,9 +81,9 @@ class Access:
 
 
 def is_own_name(host: str, listening: str) -> bool:
-    """Return True if a ``Host`` header names this machine as no other site can.
+    """Return True if a ``Host`` header names this machine in a way that no other site can.
 
-    That is by a number, as ``localhost``, by the machine's name, or by the address that the server listens at.
+    Such names are IP addresses, ``localhost``, the machine's name, and the address that the server listens at.
 
     Args:
         host: Value of the header.
@@ -108,9 +109,10 @@ def wrong_name_message(host: str) -> str:
 
 
 def guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
-    """Return a running server of viser that answers only accepted requests.
+    """Return a running viser server that answers only accepted requests.
 
-    viser has no setting for that. Its server is one of websockets, which is given the check while viser makes it.
+    viser has no setting for this. Its server is a websockets server; while viser creates it, ``websockets``' ``serve``
+    is replaced by a function that adds the check.
 
     Args:
         viser: The module.
@@ -118,7 +120,7 @@ def guarded_server(viser: Any, access: Access, **settings: Any) -> Any:
         **settings: Further arguments of ``viser.ViserServer``.
 
     Raises:
-        RenderError: If this version of viser makes its server in another way.
+        RenderError: If this version of viser creates its server in another way.
     """
     import websockets.asyncio.server as library
 

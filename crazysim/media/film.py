@@ -40,8 +40,8 @@ class Film:
                 sim.step(10)
                 film.add(sim)
 
-    Its clock is the time of the first world shown, which resets do not set back. Calls of ``add`` before the next frame
-    is due draw nothing; after a longer pause the image is repeated for several frames.
+    Its clock is the simulated time of the first world shown; a reset of that world does not set the clock back. ``add``
+    draws nothing before the next frame is due; if several frames are due, they all show the same image.
     """
 
     n_frames: int
@@ -56,7 +56,7 @@ class Film:
         progress: bool = False,
         total: int | None = None,
     ):
-        """Prepare a film, which is in the file ``NAME.part`` until it is closed.
+        """Prepare a film. Until it is closed, its frames are in the file ``NAME.part``.
 
         Args:
             path: Path of an ``.mp4`` or ``.gif`` file.
@@ -71,7 +71,7 @@ class Film:
         """
         self.path, self.view = Path(path), View() if view is None else view
         check_writable(self.path, tuple(ENCODERS))
-        self._file = self.path.absolute()  # the working directory may change; no option, as -y.mp4 would be
+        self._file = self.path.absolute()  # the working directory may change; ffmpeg would take -y.mp4 for an option
         for name, value in (("fps", fps), ("speed", speed)):
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"expected a positive {name}, got {value!r}")

@@ -34,7 +34,7 @@ class Flight:
     body_quat: NDArray
     """Attitudes of the other mocap bodies, xyzw. (n, n_worlds, n_bodies, 4)"""
     setpoint: NDArray
-    """Positions of state commands, m; no drones with other commands. (n, n_worlds, n_drones or 0, 3)"""
+    """Positions of state commands, world frame, m; empty for other commands. (n, n_worlds, n_drones or 0, 3)"""
     worlds: NDArray
     """Indices of the worlds in the simulation. (n_worlds,)"""
     drone_ids: NDArray
@@ -50,7 +50,7 @@ class Flight:
         return self.pos.shape[2]
 
     def index(self, world: int) -> int:
-        """Return the index in the recording of a world of the simulation."""
+        """Return the index within ``worlds`` of a world of the simulation."""
         indices = np.flatnonzero(self.worlds == world)
         if not len(indices):
             raise ConfigError(f"expected a recorded world, one of {self.worlds.tolist()}, got {world!r}")
@@ -100,7 +100,7 @@ class Flight:
 
     @classmethod
     def load(cls, path: str | Path) -> Flight:
-        """Return the flight that ``save`` or a ``Recorder`` with a path has written, even one that crashed.
+        """Load a flight written by ``save`` or by a ``Recorder`` with a path, even if the recording program crashed.
 
         Raises:
             ConfigError: If the file does not exist, or is of another format.
@@ -159,7 +159,7 @@ def pack_scene(scene: dict[str, Any]) -> bytes:
 
 
 def pack_sample(sample: dict[str, Any]) -> bytes:
-    """Return a sample as a chunk of a journal: float64, in the order of ``SAMPLE_FIELDS``; the scene has the sizes."""
+    """Return a sample as a chunk of a journal: float64, ordered as ``SAMPLE_FIELDS``, with sizes from the scene."""
     return np.concatenate([np.ravel(sample[name]) for name in SAMPLE_FIELDS]).astype("<f8").tobytes()
 
 

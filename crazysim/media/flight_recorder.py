@@ -46,8 +46,8 @@ class Recorder:
             recorder.add()
         recorder.flight().save("flight.npz")
 
-    With a path every sample is appended to that file as it is added, and none is kept in memory: the process may crash
-    at any moment, and ``Flight.load`` returns the flight up to there.
+    With a path, each sample is appended to that file as it is added, and none is kept in memory. If the process
+    crashes, ``Flight.load`` returns the flight up to the last sample.
     """
 
     def __init__(self, sim: Sim, worlds: Sequence[int] | None = None, path: str | Path | None = None):
@@ -78,11 +78,11 @@ class Recorder:
     def add(self, time: float | None = None) -> None:
         """Record the present poses.
 
-        A second sample at the same time replaces the first, or in a file is left out.
+        In memory, a second sample at the same time replaces the first; in a file, it is left out.
 
         Args:
-            time: Time since the start of the recording, s; None for the first recorded world's, which resets of
-                the world do not set back.
+            time: Time since the start of the recording, s; None for the time of the first recorded
+                world, which resets of the world do not set back.
 
         Raises:
             OSError: If the file cannot be written.
@@ -164,8 +164,8 @@ def flight_of(sim: Sim, states: Any, dt: float, worlds: Sequence[int] | None = N
 def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
     """Set poses, setpoints and clock of a simulation to a moment of a flight, to draw it.
 
-    Bodies are drawn as they were recorded, also those that plugins place, such as loads. Velocities, controllers and
-    records of plugins stay as they are. To continue a simulation, keep ``data = sim.data`` and restore it.
+    Bodies are drawn as they were recorded, including those that plugins move, such as loads. Velocities, controllers
+    and records of plugins are unchanged. To continue a simulation, keep ``data = sim.data`` and restore it.
 
     Args:
         sim: Simulation with the drones, worlds and bodies of the one that was recorded.
@@ -216,7 +216,7 @@ def show_flight_at(sim: Sim, flight: Flight, time: float) -> None:
 
 @jax.jit
 def _with_worlds(old: dict[str, Array], worlds: Array, new: dict[str, Array]) -> dict[str, Array]:
-    """Return arrays with other numbers in some worlds; the first ones of the last axis if there are fewer."""
+    """Return arrays with new values in some worlds. Where their last axis is shorter, its first entries are set."""
     return {name: x.at[worlds, ..., : new[name].shape[-1]].set(new[name]) for name, x in old.items()}
 
 

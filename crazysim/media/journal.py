@@ -1,9 +1,9 @@
-"""Journals: files of chunks that are written as they come, and stay readable after a crash.
+"""Journals: files to which chunks are appended one by one, and which stay readable after a crash.
 
-A file is its first line, ``crazysim journal 1``, and chunks: kind (4 bytes), length of the content (8 bytes, little
-endian), CRC-32 of kind and content (4 bytes), content. Each chunk is handed to the operating system in one write, so
-that the end of the process, even by SIGKILL, loses nothing that was appended. A chunk that is cut off, by a full disk
-or a loss of power, ends the file for a reader, with a warning.
+A file consists of the line ``crazysim journal 1`` and chunks: kind (4 bytes), length of the content (8 bytes, little
+endian), CRC-32 of kind and content (4 bytes, little endian), content. Each chunk is handed to the operating system in
+one write, so that nothing that was appended is lost if the process ends, even by SIGKILL. If a chunk is cut off, by a
+full disk or a loss of power, readers warn and stop before it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CHUNK_HEADER = struct.Struct("<4sQI")
 
 
 class Journal(Closing):
-    """A file that chunks are appended to."""
+    """File to which chunks are appended."""
 
     path: Path
     """Path of the file."""
@@ -89,7 +89,7 @@ class Journal(Closing):
 def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
     """Yield kind and content of the chunks of a file, which may still be growing.
 
-    At the first chunk that is cut off or damaged, it warns and ends.
+    The iteration ends with a warning at the first chunk that is cut off or damaged.
 
     Raises:
         ValueError: If the file is not a journal.
@@ -110,7 +110,7 @@ def read_journal(path: str | Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def is_journal(path: str | Path) -> bool:
-    """Return True if a file exists and begins as a journal does."""
+    """Return True if a file exists and begins with the first line of a journal."""
     path = Path(path)
     if not path.is_file():
         return False

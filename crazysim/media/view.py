@@ -24,7 +24,7 @@ MAX_PIXELS = 16_384
 """Largest width and height of an image."""
 
 MIN_VIEW_RADIUS = 0.25
-"""Least radius around points that a camera holds in view, m: at it a Crazyflie is a sixth of the image's height."""
+"""Smallest radius around points that a camera holds in view, m; a Crazyflie is then a sixth of the image's height."""
 DISTANCE_MARGIN = 1.25
 """Distance of a camera that holds points in view, as a multiple of the distance from which they just fit."""
 
@@ -33,7 +33,7 @@ DISTANCE_MARGIN = 1.25
 class View:
     """A view of a simulation: one world, or several in a grid.
 
-    Trails and the point that a following camera looks at carry over from image to image.
+    Trails and the smoothed aim of the camera persist between images.
     """
 
     worlds: Sequence[int] = (0,)
@@ -64,7 +64,7 @@ class View:
     draw: Callable[[Sim, int], None] | None = None
     """Function that draws further overlays of a world, ``draw(sim, world)``; None for none."""
     columns: int | None = None
-    """Worlds per row; None for as many rows as columns."""
+    """Worlds per row; None for about as many as there are rows."""
     border: int = setting(default=2, low=0)
     """Width of the lines between worlds, pixels."""
     _trail: Trail | None = field(default=None, init=False, repr=False)
@@ -210,7 +210,7 @@ def _aim_at(points: NDArray, fovy: float) -> NDArray:
     """Return the middle of points, m, and the distance from which all are in view, m. (n, 3) -> (4,)
 
     Args:
-        points: Points, those that are not finite are left out.
+        points: Points, m; points that are not finite are left out.
         fovy: Vertical field of view, degrees; images are at least as wide as high.
     """
     points = points[np.isfinite(points).all(-1)]

@@ -1,4 +1,4 @@
-"""Recorded flights in a browser: a self-contained page with a bar to play and scrub."""
+"""Recorded flights in a browser: a self-contained page with playback controls."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ FOV = 50.0
 def page(flight: Flight, world: int | None = None, lights: NDArray | None = None) -> str:
     """Return one world of a flight as an HTML page with drones, obstacles, setpoints and trails.
 
-    The page contains viewer and flight: it opens from a file, without a server or a network.
+    The page contains the viewer and the flight, so that it can be opened as a file, without server or network.
 
     Args:
         flight: Flight.
         world: Index of the world in the simulation; None for the first that was recorded.
-        lights: Colours of a light on every drone at the flight's times, 0 to 1; None for no lights.
+        lights: Colour of the light on each drone at each of the flight's times, 0 to 1; None for no lights.
             (n, n_drones, 3)
 
     Raises:
@@ -184,7 +184,7 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
     def move(handle: Any, pos: NDArray, quat: NDArray | None = None) -> None:
         pose = np.concatenate([pos, [] if quat is None else np.roll(quat, 1)])
         if not np.isfinite(pose).all() or np.array_equal(last_values.get(handle.name, np.inf), pose):
-            return  # unchanged poses are sent once, and non-finite ones not at all
+            return  # unchanged poses are not sent again, and non-finite poses are never sent
         last_values[handle.name] = pose
         handle.position = pose[:3]
         if quat is not None:
@@ -211,7 +211,7 @@ def _record(server: Any, flight: Flight, k: int, lights: NDArray | None) -> Any:
 
 
 def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> None:
-    """Add geoms of one body and one colour to a scene of viser: planes one by one, all others as one mesh."""
+    """Add the geoms of one body and colour to a viser scene: each plane as a grid, all other geoms as one mesh."""
     solid = [shape for shape in shapes if shape.kind != "plane"]
     for i, shape in enumerate(shape for shape in shapes if shape.kind == "plane"):
         width, height = (2 * PLANE_SIZE if size == 0 else 2 * float(size) for size in shape.size[:2])
@@ -235,7 +235,7 @@ def add_static(scene: Any, name: str, shapes: list[VisualGeom], rgba: tuple) -> 
 
 
 def mesh_of(shapes: list[VisualGeom]) -> Any:
-    """Return geoms of one body as one mesh of trimesh, in the body's frame; planes are left out."""
+    """Return the geoms of one body, except planes, as one trimesh mesh in the body's frame."""
     import trimesh
 
     meshes = []
@@ -267,7 +267,7 @@ def _mesh(shape: VisualGeom) -> Any:
 
 
 def rgb(rgba: Any, darker: float = 1.0) -> tuple[int, int, int]:
-    """Return a colour, 0 to 1, as red, green and blue from 0 to 255."""
+    """Return red, green and blue from 0 to 255 of a colour from 0 to 1, multiplied by ``darker``."""
     r, g, b = (round(255 * darker * float(np.clip(channel, 0, 1))) for channel in rgba[:3])
     return r, g, b
 

@@ -30,7 +30,7 @@ def save(path: str | Path, tree: Any, meta: dict[str, Any]) -> None:
         meta: Metadata that JSON can represent.
 
     Raises:
-        ConfigError: If the file cannot be written; then nothing of it stays.
+        ConfigError: If the file cannot be written; no partial file is left.
     """
     arrays = {name: np.asarray(_key_data(x)) for name, x in _named_leaves(tree)}
     with replacing(path) as file:
@@ -50,7 +50,7 @@ def read(path: str | Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 
 def reading_checkpoint(path: str | Path) -> AbstractContextManager[None]:
-    """Raise errors of a block that reads a checkpoint as ``crazysim.storage.reading`` does."""
+    """Return a context manager that raises errors of reading a checkpoint as ``crazysim.storage.reading`` does."""
     remedy = "Use the folder of an intact run, or train again: crazysim train TASK --out FOLDER."
     return reading(path, "a checkpoint of crazysim", remedy)
 

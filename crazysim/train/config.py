@@ -42,7 +42,7 @@ class Recipe:
 
 
 _LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "discount": 0.99}
-"""Hyperparameters of tasks in which a reward follows seconds after what earned it."""
+"""Hyperparameters of tasks in which a reward follows seconds after the actions that earn it."""
 
 RECIPES: dict[str, Recipe] = {
     "hover": Recipe(config={"iterations": 80, "learning_rate": 2e-3}),
@@ -90,7 +90,7 @@ def recipe_of(task: str, algorithm: str | None = None) -> Recipe:
 
     Args:
         task: Name of the task.
-        algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for that which suits the task.
+        algorithm: Name of the algorithm, a key of ``ALGORITHMS``; None for the algorithm of the task's recipe.
     """
     recipe = RECIPES.get(task, DEFAULT_RECIPES["ppo"])
     return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
@@ -104,10 +104,10 @@ ALTERABLE_HYPERPARAMETERS = (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Complete configuration of a run. A checkpoint resumes with the same one but for ``ALTERABLE_HYPERPARAMETERS``."""
+    """Complete configuration of a run. A resumed run may only change ``ALTERABLE_HYPERPARAMETERS`` and the device."""
 
     task: str
-    """Name of a registered task, or the absolute place of its class, ``FILE.py:NAME`` or ``MODULE:NAME``."""
+    """Name of a registered task, or the absolute reference of its class, ``FILE.py:NAME`` or ``MODULE:NAME``."""
     algorithm: str
     """Name of the algorithm, a key of ``ALGORITHMS``."""
     seed: int
@@ -138,7 +138,7 @@ class TrainConfig:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        as_key(self.seed)  # which is an error for more than 64 bits
+        as_key(self.seed)  # raises an error for more than 64 bits
 
     @staticmethod
     def create(
@@ -153,7 +153,7 @@ class TrainConfig:
         """Return the configuration of a run; omitted values come from the recipe of the task.
 
         Args:
-            task: Name of a task, the place of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
+            task: Name of a task, the reference of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task.
             algorithm: Name of the algorithm, a key of ``ALGORITHMS``.
             seed: Random seed; None for 0.
             n_worlds: Number of parallel worlds.
@@ -184,7 +184,7 @@ class TrainConfig:
 
     @property
     def title(self) -> str:
-        """Name of the task in messages and of the default folder: without the place of its class, in lower case."""
+        """Name of the task in messages and of the default folder: without file or module, in lower case."""
         name = split_reference(self.task)[1] if is_reference(self.task) else self.task
         return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(".")[2]).lower()
 
@@ -215,7 +215,7 @@ class TrainConfig:
 
 
 def _is_same_setting(x: Any, y: Any) -> bool:
-    """Return true if a setting has a value, in the form that JSON gives it: lists and tuples are alike."""
+    """Return true if two values of a setting are the same in JSON, where lists and tuples are alike."""
     try:
         return json.dumps(x) == json.dumps(y)
     except (TypeError, ValueError):

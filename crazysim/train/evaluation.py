@@ -19,13 +19,13 @@ from crazysim.envs.wrappers import RewardTerms
 from crazysim.pytree import PyTree, static
 
 EVALUATION_SEED = 0x5EED
-"""Seed of the held-out initial states; keys of training are folded, so they never coincide with it."""
+"""Seed of the held-out initial states. Keys of training are made with ``fold_in``, and never coincide with its key."""
 TERM_PREFIX = "reward "
 """Beginning of the names of the terms of a reward, as in ``RewardTerms``."""
 
 
 class _FunctionPolicy(PyTree):
-    """Policy given as a plain function, which is static for JAX."""
+    """Policy of a plain function, which JAX treats as static."""
 
     fn: Callable[[Obs], Array] = static()
     """Function from observations to actions."""
@@ -45,7 +45,7 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
     """Fly one episode in every world and return its record.
 
     Returns:
-        ``error``: task error after every step, held from the end of the episode on (n_steps, n_worlds, n_drones);
+        ``error``: task error after every step, constant after the end of the episode (n_steps, n_worlds, n_drones);
         ``over``: True once the episode has terminated (n_steps, n_worlds); ``nonfinite``: True where it did so because
         the world became non-finite (n_worlds,); ``reward``: sum over the episode (n_worlds, n_drones); ``terms``: terms
         of the reward by name, means over worlds and drones, zero from the end of an episode on (n_steps,) each;
@@ -101,8 +101,8 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         ``success``: fraction of drones that succeed; ``crashed``: fraction of worlds that terminated although not all
         of their drones had succeeded; ``nonfinite``: fraction of worlds that became non-finite; ``length``: mean
         length of an episode, s; ``error``: mean error of the worlds that did not crash over the last ``task.hold``
-        seconds, m (at the end of the episode for tasks with ``task.succeeded``), NaN if all crashed; ``reward``: mean
-        return of an episode; ``reward NAME``: part of it by each term.
+        seconds, in ``task.unit`` (at the end of the episode for tasks with ``task.succeeded``), NaN if all crashed;
+        ``reward``: mean return of an episode; ``reward NAME``: contribution of each term to it.
     """
     flight = fly(env, as_tree(policy), jax.random.key(EVALUATION_SEED) if key is None else key)
     by_task = "succeeded" in flight
@@ -126,7 +126,7 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
 
 
 def outcome(metrics: Mapping[str, float], unit: str) -> str:
-    """Return the error and the crashes in the metrics of ``evaluate`` as a text, which explains a missing error.
+    """Return the error and the crashes in the metrics of ``evaluate`` as text, which explains a missing error.
 
     Args:
         metrics: From ``evaluate``.

@@ -133,7 +133,7 @@ def to_c(policy: Policy, path: str | Path, meta: Mapping[str, Any], name: str = 
         policy: The policy.
         path: File to write.
         meta: Description of its inputs and outputs, from ``describe(env)`` or from ``load_policy``.
-        name: Name of the function, and prefix of every definition of the header.
+        name: Name of the function, and prefix of the names of the constants.
 
     Returns:
         The path.

@@ -20,7 +20,7 @@ LIMITS = ("max_grad_norm",)
 
 
 def check_hyperparameters(config: Any) -> None:
-    """Check the fields of a frozen ``Config``, and convert them to Python's numbers and tuples."""
+    """Check the fields of a frozen ``Config``, and convert them to Python numbers and tuples."""
     for field in dataclasses.fields(config):
         value, default = getattr(config, field.name), field.default
         if isinstance(default, tuple):

@@ -22,14 +22,14 @@ Layers = list[tuple[Array, Array]]
 def init_mlp(key: Array, sizes: Sequence[int], last_scale: float) -> Layers:
     """Return layers with uniformly distributed weights and zero biases.
 
-    They have the variance of the entries of orthogonal matrices, scale^2 / max(n_in, n_out), which take longer to trace
-    and compile than one draw of all weights.
+    The weights have the variance of the entries of scaled orthogonal matrices, scale^2 / max(n_in, n_out). Orthogonal
+    matrices themselves would take longer to trace and compile than this one draw of all weights.
 
     Args:
         key: Random key.
         sizes: Number of inputs, sizes of the hidden layers, number of outputs.
         last_scale: Scale of the weights of the last layer; small for a policy, so that it starts near the zero action.
-            That of the others is the root of 2.
+            The scale of the other layers is the square root of 2.
     """
     pairs = list(itertools.pairwise(sizes))
     ends = np.cumsum([n_in * n_out for n_in, n_out in pairs])

@@ -33,7 +33,7 @@ class Config:
     epochs: int = 4
     """Passes over the samples of a rollout."""
     minibatches: int = 8
-    """Minibatches, and so updates, per epoch; each has all samples of some worlds."""
+    """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
     hidden: tuple[int, ...] = (64, 64)
     """Sizes of the hidden layers of policy and value function."""
     learning_rate: float = 1e-3
@@ -124,7 +124,7 @@ def init(env: Env, config: Config, key: Array) -> Learner:
 def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
     """Return the learner after one rollout and its updates, and the metrics of the iteration.
 
-    The metric ``finite`` is True if weights and losses are finite.
+    The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite.
     """
     key, k_fly, k_learn = jax.random.split(learner.key, 3)
     state, samples, raw, metrics = _collect(learner, env, config, k_fly)
@@ -239,7 +239,7 @@ def _scale(returns: RunningStats) -> Array:
 
 
 def _rescale_value(layers: Layers, old: RunningStats, new: RunningStats) -> Layers:
-    """Return the value network whose outputs, scaled by new statistics, are what they were with the old ones."""
+    """Return the value network with outputs that, scaled by the new statistics, equal those scaled by the old ones."""
     *hidden, (weight, bias) = layers
     ratio = _scale(old) / _scale(new)
     return [*hidden, (weight * ratio, bias * ratio + (old.mean - new.mean) / _scale(new))]

@@ -1,4 +1,4 @@
-"""Runs: training with everything that shows what was learned, in one folder."""
+"""Training runs: training, evaluation, plots and a film, in one folder."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def run(
     """Train a policy, evaluate it, plot the training and an episode, and film it, as ``crazysim train`` does.
 
     The folder then has ``checkpoint.npz``, ``policy.npz``, ``curve.json``, ``curve.png``, ``episode.png`` and
-    ``policy.mp4``. Where matplotlib, the encoder or OpenGL is missing, the pictures are left out, with a line that says
-    so. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` that a handler of a signal raises.
+    ``policy.mp4``. Where matplotlib, the encoder or OpenGL is missing, the plots or the film are left out, and a line
+    is logged. An interrupt (Ctrl-C) writes a checkpoint first, and so does a ``SystemExit`` from a signal handler.
 
     Args:
-        task: Name of a task, the place of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such as
-            ``TwoHoops(radius=0.4)``.
+        task: Name of a task, the reference of a class of your own, ``FILE.py:NAME`` or ``MODULE:NAME``, or a task, such
+            as ``TwoHoops(radius=0.4)``.
         folder: Folder of the run; None for ``out/NAME``.
         resume: True to continue from the checkpoint in the folder, with its settings where none are given.
         film: True to write a film.
@@ -47,7 +47,8 @@ def run(
         progress: True to show progress bars, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
-            those of an evaluation after it begin with ``"evaluation "``. Each call waits for the device. None for none.
+            names of metrics of an evaluation after it begin with ``"evaluation "``. Each call waits for the device.
+            None for none.
         settings: ``algorithm``, ``seed``, ``n_worlds``, ``options`` and ``config`` of ``TrainConfig.create``.
 
     Raises:

@@ -24,14 +24,14 @@ from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE
 
 TARGET_COLOR, TARGET_SIZE = (0.1, 0.8, 0.3, 0.6), 0.03
-"""Colour of the target of a drone, RGBA, and its least radius, m."""
+"""Colour of the mark of a drone's target, RGBA, and its smallest radius, m."""
 
 
 def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
-    """Plot success, error and the terms of the reward over a training, as the evaluations found them.
+    """Plot success, error and reward terms over the course of training, as measured by the evaluations.
 
     Args:
-        curves: Contents of ``curve.json`` of each run, by the name of the run. The terms of the first are plotted.
+        curves: Contents of ``curve.json`` of each run, by the name of the run. Reward terms are those of the first.
         path: Image to write, such as a ``.png``.
 
     Raises:
@@ -63,7 +63,7 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
 def plot_episode(
     env: Env, policy: Callable[[Obs], Array], path: str | Path, key: Array | None = None
 ) -> dict[str, np.ndarray]:
-    """Plot the terms of the reward and the error over an episode, means over all worlds, and return the terms.
+    """Plot the mean reward terms and quantiles of the error over an episode in all worlds, and return the terms.
 
     Args:
         env: Environment without automatic resets; each world flies from one initial state.

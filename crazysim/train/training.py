@@ -55,10 +55,10 @@ class TrainResult:
     """Folder of the files of the run."""
     metrics: dict[str, float]
     """Metrics of ``evaluate`` for the kept policy on held-out initial states; ``iteration``, its iteration;
-    ``check``, its success on the check set; of the whole run ``seconds``, ``compile_seconds`` of them, s, and
-    ``env_steps``, environment steps of all drones."""
+    ``check``, its success on the check set; and for the whole run ``seconds``, its duration, s, ``compile_seconds``,
+    the compilation time within it, s, and ``env_steps``, environment steps of all drones."""
     policy: Policy
-    """Kept policy: of those that were evaluated, the one with most successes on the check set, the latest of equals."""
+    """Kept policy: the latest evaluated one with a success on the check set within two standard errors of the best."""
     env: DroneEnv
     """Environment of the evaluations, without automatic resets."""
 
@@ -75,11 +75,11 @@ def train(
 ) -> TrainResult:
     """Train a policy and write checkpoint, learning curve and policy into a folder.
 
-    Every evaluation flies two sets of initial states that are not trained on. The success on the check set decides
-    which policy is kept; the held-out set gives the figures, and decides nothing.
+    Every evaluation flies two sets of initial states that are not used for training. The success on the check set
+    decides which policy is kept; the held-out set is only used for the reported figures.
 
-    Each evaluation writes a checkpoint. So does an interrupt (Ctrl-C), or a ``SystemExit`` that a handler of a signal
-    raises, before it is passed on. A resumed run is bit for bit the same as an uninterrupted one on the same machine.
+    Each evaluation writes a checkpoint. So does an interrupt (Ctrl-C), or a ``SystemExit`` from a signal handler,
+    before it is raised again. A resumed run is bit for bit the same as an uninterrupted one on the same machine.
 
     Args:
         config: Configuration of the run.
@@ -90,7 +90,8 @@ def train(
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
-            those of an evaluation after it begin with ``"evaluation "``. Each call waits for the device. None for none.
+            names of metrics of an evaluation after it begin with ``"evaluation "``. Each call waits for the device.
+            None for none.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
@@ -144,7 +145,7 @@ def train(
         compiled = algorithm.iterate.lower(_attach_device(shapes, base.sim.device), env, hyperparameters).compile()
         return compiled, time.perf_counter() - compiling
 
-    # Each compiles for seconds, mostly on one core.
+    # Each compilation takes seconds, mostly on one core, so they run in parallel.
     with announce_if_slow("compiling the training", "5 to 20 s"), compiling_threads(3) as pool:
         compiling, starting = pool.submit(compile_iteration), pool.submit(start)
         evaluating = pool.submit(compile_evaluation)
@@ -187,7 +188,7 @@ def train(
         checkpoint.save(folder / POLICY, best, meta | description)
         with replacing(folder / CURVE) as file:
             file.write(json.dumps([*curve, point], indent=1).encode())
-        # A run without the interruption makes no evaluation here, so it decides nothing in the resumed run.
+        # An uninterrupted run makes no evaluation here, so this one must not influence the resumed run.
         kept, point["kept"] = (kept, False) if interrupted else (best, point["kept"])
         curve.append(point)
         save(learner)
@@ -211,7 +212,7 @@ def train(
         with _bar(hyperparameters.iterations, done, progress) as show:
             for i in range(done, hyperparameters.iterations):
                 learner, metrics = iterate(learner)
-                require_finite(finite, i)  # of the iteration before, while this one runs
+                require_finite(finite, i)  # checks the previous iteration while this one runs
                 finite = metrics["finite"]
                 show(metrics if i % 5 == 0 else None)
                 point = None
@@ -250,20 +251,20 @@ def train(
 
 
 def _numbers(metrics: dict[str, Array], point: dict[str, Any] | None) -> dict[str, float]:
-    """Return the metrics of an iteration, and of the evaluation after it if there was one, as numbers of the host."""
+    """Return the metrics of an iteration, and of the evaluation after it if there was one, as floats."""
     numbers = {name: float(x) for name, x in jax.device_get(metrics).items() if name != "finite"}
     return numbers | {f"evaluation {name}": float(x) for name, x in (point or {}).items() if name != "iteration"}
 
 
 def least_kept_success(success: float, n_worlds: int) -> float:
-    """Return the success rate from which on a later policy is kept: two standard errors below the best.
+    """Return the lowest success rate with which a later policy is kept: two standard errors below the best.
 
     The standard error is computed for the rate after two more successes and two more failures (Agresti and Coull 1998,
     "Approximate is better than exact"), which is not zero where all have succeeded.
 
     Args:
         success: Best success rate so far.
-        n_worlds: Number of starts that it was measured at.
+        n_worlds: Number of starts with which it was measured.
     """
     n = n_worlds + 4
     rate = (success * n_worlds + 2) / n
@@ -271,7 +272,7 @@ def least_kept_success(success: float, n_worlds: int) -> float:
 
 
 def kept_point(curve: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the point of a learning curve whose policy was kept, the last of them."""
+    """Return the last point of a learning curve whose policy was kept."""
     return next(point for point in reversed(curve) if point["kept"])
 
 
@@ -286,9 +287,9 @@ def load_policy(folder: str | Path, task: str | None = None) -> tuple[Policy, Tr
 
     Args:
         folder: Folder of the run.
-        task: Place of the class of the task, ``FILE.py:NAME`` or ``MODULE:NAME``, where it has moved since the
-            training, or this user has not named it on this machine before; its code is executed. None for the place in
-            the run: ``config.make_env`` then executes only a file that this user has named before.
+        task: Reference of the task's class, ``FILE.py:NAME`` or ``MODULE:NAME``, if it has moved since the training, or
+            if this user has not named it on this machine before; its code is executed. None for the reference in the
+            run, which ``config.make_env`` only loads if this user has named it before.
 
     Raises:
         ConfigError: If the folder holds no policy that this version can read.
@@ -343,7 +344,7 @@ def stored_config(folder: str | Path) -> TrainConfig:
 
 
 def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str, float]:
-    """Return the arrays of a checkpoint, the learning curve until then, the hash of the code of the task, and the time.
+    """Return the arrays of a checkpoint, the learning curve until then, the hash of the task's code, and seconds.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
@@ -355,7 +356,7 @@ def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dic
 
 
 def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None:
-    """Check that a checkpoint belongs to a run with this configuration, but for what may change."""
+    """Check that a checkpoint belongs to a run with this configuration, except for settings that may change."""
     if meta["crazysim"] != crazysim.__version__:
         raise ConfigError(
             f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a new "
@@ -373,7 +374,7 @@ def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None
 
 
 def _settings(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a configuration that a resumed run keeps, by name, with options and hyperparameters."""
+    """Return the settings, options and hyperparameters that a resumed run must keep, by name."""
     place, name = split_reference(settings["task"]) if is_reference(settings["task"]) else ("", settings["task"])
     flat = {k: x for k, x in settings.items() if k not in ("options", "config")}
     kept = {k: x for k, x in settings["config"].items() if k not in ALTERABLE_HYPERPARAMETERS}

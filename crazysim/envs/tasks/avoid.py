@@ -26,7 +26,7 @@ from crazysim.scene.objects import Handle
 from crazysim.sim.sim import Sim
 
 CELL, CELL_JITTER = 0.8, 0.15
-"""Width of the cells that hold at most one obstacle each, and largest component of the distance of an obstacle from the
+"""Width of the cells that hold at most one obstacle each, and largest component of the offset of an obstacle from the
 middle of its cell, m: a drone fits between a pole and whatever is next to it."""
 FIELD_LENGTH = 4
 """Number of cells from the starts to the goals."""
@@ -37,10 +37,10 @@ POLE_RADIUS, BOX_WIDTH = 0.05, 0.3
 HEIGHT = 2.0
 """Height of poles and ceiling, m."""
 JITTER = 0.15
-"""Largest component of the distance of starts and goals from their places, m."""
+"""Largest component of the offset of starts and goals from their places, m."""
 CRUISE_SPEED = 2.0
-"""Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so it brakes with up
-to g, and stops from there within v^2 / 2 g = 0.2 m, a quarter of a cell."""
+"""Speed above which flying faster costs reward, m/s. Actions tilt a drone by at most 45 degrees, so that it brakes
+with up to g and stops from this speed within v^2 / (2 g) = 0.2 m, a quarter of a cell."""
 SPACING = 0.6
 """Distance between the starts, and between the goals, of several drones, m."""
 
@@ -68,7 +68,7 @@ class Crossing(PyTree):
 
 
 class Field(NamedTuple):
-    """Size of the field, for a number of drones."""
+    """Dimensions of the field and the arena for a number of drones."""
 
     width: int
     """Number of cells across."""
@@ -109,7 +109,7 @@ class Avoid(Task):
             raise ConfigError("expected at least one obstacle, got n_poles=0 and n_boxes=0. Set one of them.")
 
     def field(self, n_drones: int) -> Field:
-        """Return the size of the field: a third of the cells stay free, and all drones fit beside each other."""
+        """Return the dimensions of the field: a third of the cells stay free, and all drones fit beside each other."""
         n = self.n_poles + self.n_boxes
         width = max(4, -(-3 * n // (2 * FIELD_LENGTH)), -(-int(10 * SPACING * n_drones) // int(10 * CELL)))
         size = CELL * np.array([FIELD_LENGTH, width])
@@ -135,7 +135,7 @@ class Avoid(Task):
 
         @stage("drone")
         def check(data: SimData) -> SimData:
-            """Disable a drone that touches something or leaves the arena, and note one that reaches its goal."""
+            """Disable a drone that touches something or leaves the arena, and record when it reaches its goal."""
             record, pos = crossing_of(data), data.states.pos
             left = jnp.any(jnp.abs(pos[:2]) > half.astype(pos.dtype), axis=-1) | (pos[2] > HEIGHT)
             disabled = record.disabled | (~record.reached & (left | contacts(data).any))
@@ -177,11 +177,11 @@ class Avoid(Task):
         return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
 
     def nearest_obstacles(self, data: SimData) -> tuple[Array, Array]:
-        """Return the nearest obstacles, as ways from the drone and from there on. (n_drones, n_seen, 3) each
+        """Return vectors from each drone to its nearest obstacles, and from there to their middles, world frame.
 
         Returns:
-            Way to the nearest point of each, m; way from that point to the middle of a box, which shows how far the box
-            extends to either side, zero for a pole, m.
+            Vector to the nearest point of each obstacle, m; vector from that point to the middle of a box, which shows
+            how far the box extends to either side, or zero for a pole, m. (n_drones, n_seen, 3) each
         """
         dtype, handles = data.states.pos.dtype, crossing_of(data).handles
         rows = slice(handles[0].rows[0], handles[-1].rows[-1] + 1)
@@ -204,10 +204,10 @@ class Avoid(Task):
         return seen[..., :3], seen[..., 3:]
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and the ways to its goal, to the nearest obstacles and to other drones, m.
+        """Return the drone's state, and vectors to its goal, to the nearest obstacles and to other drones, m.
 
-        ``obstacles_near`` are the ways to their nearest points, ``obstacles_middle`` the ways from there to the middles
-        of boxes, zero for poles.
+        ``obstacles_near`` are vectors to their nearest points; ``obstacles_middle`` are vectors from there to the
+        middles of boxes, and zero for poles.
         """
         n_drones = data.core.n_drones
         ways, to_middle = self.nearest_obstacles(data)

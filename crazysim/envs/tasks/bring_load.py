@@ -26,7 +26,7 @@ class Delivery(PyTree):
     goal: Array = leaf("drone", 1)
     """Goal of the load, world frame, m. (n_worlds, n_drones, 3)"""
     remaining_way_before: Array = leaf("drone", 0)
-    """Remaining way, ``remaining_way``, at the beginning of this environment step, m. (n_worlds, n_drones)"""
+    """Result of ``remaining_way`` at the beginning of this environment step, m. (n_worlds, n_drones)"""
     steps_there: Array = leaf("drone", 0)
     """Number of physics steps for which the load has been at its goal without a break. (n_worlds, n_drones)"""
     delivered: Array = leaf("drone", 0)
@@ -103,7 +103,7 @@ def delivery_of(data: SimData) -> Any:
 
 
 def initial_outcome(data: SimData) -> dict[str, Array]:
-    """Return the fields of ``Delivery`` at the start: nothing is delivered, and no drone has crashed. All worlds."""
+    """Return the fields of ``Delivery`` of all worlds at the start: nothing is delivered, and no drone has crashed."""
     pos = data.states.pos
     shape = pos.shape[:2]
     no = device_array(np.zeros(shape), bool)

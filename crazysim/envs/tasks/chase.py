@@ -26,9 +26,9 @@ from crazysim.sim.sim import Sim
 CARS, VEHICLE = "cars", "f1tenth_ros"
 """Name of the population, and vehicle model."""
 SPACING = 6.0
-"""Distance between the first places of the cars of several drones, m; a drone observes its own car only."""
+"""Distance between the initial positions of the cars of several drones, m; a drone observes its own car only."""
 MAX_DISTANCE, CEILING = 3.0, 2.5
-"""Largest horizontal distance of a drone from its car, and largest height of a drone, m."""
+"""Largest horizontal distance of a drone from the roof of its car, and largest height of a drone, m."""
 MIN_SPEED_SHARE = 0.3
 """Smallest speed of a car, as a share of the largest."""
 MAX_STEER = 0.25
@@ -44,8 +44,8 @@ class Chase(TouchDown):
     A car drives straight on or in circles, at a speed and with a steering angle of its own in every episode. A drone
     starts in flight around it. It has landed when it touches the car from above, within 12 cm of the middle of the
     roof, with at most 0.5 m/s relative to it and a tilt of at most 20 degrees; contact is checked at every physics
-    step. Any other contact with a car's body or the floor is a crash, as is getting 3 m away from the car or higher
-    than 2.5 m. An episode ends when every drone has landed or crashed.
+    step. Any other contact with a car's body or the floor is a crash, as is being more than 3 m away from the
+    roof horizontally or higher than 2.5 m. An episode ends when every drone has landed or crashed.
     """
 
     name = "chase"
@@ -68,7 +68,7 @@ class Chase(TouchDown):
         n, car, vehicle = data.core.n_drones, data.plugins[CARS], load_vehicle(VEHICLE)
         x = draw(key, n, start=3, rpy=3, vel=3, yaw=1, speed=1, steer=1)
         speed, steer = self.speed * scale_to(x["speed"], MIN_SPEED_SHARE, 1.0), scale_symmetric(x["steer"], MAX_STEER)
-        # Those of a car that rolls without slip; its tyres then slip a little.
+        # Velocities of a car that rolls without slip; its tyres then slip a little.
         side = jnp.tan(steer) * (vehicle.number("axles.rear") / vehicle.wheelbase)
         car = car.replace(
             yaw=scale_symmetric(x["yaw"], np.pi),
@@ -97,9 +97,9 @@ class Chase(TouchDown):
         return (rotation.dot(away, away)[..., 0] > MAX_DISTANCE**2) | (pos[..., 2] > CEILING)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the way to its roof, m, the roof's relative velocity, m/s, and the car's turning.
+        """Return the drone's state, the vector to its roof, m, the roof's relative velocity, m/s, and the car's motion.
 
-        Those are ``heading``, the unit vector along the car in the horizontal plane, and ``yaw_rate``, rad/s.
+        The latter is ``heading``, the unit vector along the car in the horizontal plane, and ``yaw_rate``, rad/s.
         """
         car, drone = data.plugins[CARS], data.core.drone_id
         heading = jnp.concatenate([jnp.cos(car.yaw), jnp.sin(car.yaw)], axis=-1)

@@ -32,20 +32,21 @@ from crazysim.sim.sim import Sim
 CARS, VEHICLE = "cars", "f1tenth_ros"
 """Name of the population, and vehicle model."""
 SPACING = 10.0
-"""Distance between the first places of the cars of several drones, m."""
+"""Distance between the initial positions of the cars of several drones, m."""
 HALF_WIDTH, MIN_HEIGHT, CEILING = 4.5, 0.25, 2.5
-"""Largest distance of a drone from its car's first place along x and y, and its smallest and largest height, m. The
-smallest keeps it above cars and trailers."""
+"""Largest distance of a drone from its car's initial position along x and y, and its smallest and largest height, m.
+The smallest height keeps it above cars and trailers."""
 SIZE, RING = (0.08, 0.08, 0.05), 0.07
 """Full lengths of a load, and height of its ring above its middle, m."""
 HOOK_MASS, DAMPING, REACH, MAX_SPEED = 0.003, 2e-4, 0.07, 0.6
-"""Mass of the hook, kg, damping of its joint, N m s, and its reach, m, and largest speed, m/s, to pick up a load."""
+"""Mass of the hook, kg; damping of its joint, N m s; largest distance, m, and speed relative to a ring, m/s, at
+which it picks up a load."""
 MIN_SPEED_SHARE = 0.3
 """Smallest speed of a car, as a share of the largest."""
 MAX_STEER = 0.25
 """Largest steering angle of a car, rad: circles of 1.3 m radius."""
 GOAL = ((-1.0, -1.0, 0.8), (1.0, 1.0, 1.3))
-"""Lowest and highest goal of a load from its car's first place, m."""
+"""Lower and upper corner of the box of a load's goals, relative to its car's initial position, m."""
 DROP_HEIGHT = 0.15
 """Height of a ring below which a load that was taken counts as dropped, m: it hangs lower than the trailer."""
 
@@ -64,9 +65,8 @@ class Deliver(BringLoad):
     Behind a car that drives straight on or in circles, a trailer carries a load with a ring. A drone starts in flight
     above it, with a hook on a swinging rod, which picks the load up within 7 cm of the ring at less than 0.6 m/s
     relative to it. On the trailer the load does not slip. It is delivered when it has been within ``tolerance`` of its
-    goal, at most 0.2 m/s fast, for ``hold`` seconds. A drone crashes
-    when it gets lower than 0.25 m, higher than 2.5 m or too far away, or when its load, once picked up, sinks below
-    0.15 m. A crash ends the episode.
+    goal, at most 0.2 m/s fast, for ``hold`` seconds. A drone crashes when it gets lower than 0.25 m, higher than 2.5 m
+    or too far away, or when the ring of its load, once picked up, sinks below 0.15 m. A crash ends the episode.
     """
 
     name = "deliver"
@@ -91,7 +91,7 @@ class Deliver(BringLoad):
 
         @stage("drone")
         def judge(data: SimData) -> SimData:
-            """Move a load that waits with its trailer; note what is taken and delivered, and a crash."""
+            """Move a load that waits along with its trailer; record pick-ups, deliveries and crashes."""
             load = data.plugins["load"]
             taken = delivery_of(data).taken | load.attached
             ring, vel = (pick(x, data.core.drone_id) for x in moving_rings(data.plugins[CARS]))
@@ -133,7 +133,7 @@ class Deliver(BringLoad):
         return with_record(data, delivery_of(data).replace(goal=goal))
 
     def remaining_way(self, data: SimData) -> Array:
-        """Return the way of the hook to the load, and of the load to its goal, m. (...)"""
+        """Return the distance of the hook from the load plus the task error, m. (...)"""
         load = data.plugins["load"]
         return rotation.safe_norm(load.pos - load.tip_pos)[..., 0] + self.error(data)
 
@@ -179,7 +179,7 @@ class Deliver(BringLoad):
 
 
 def rings_of(car: CarData) -> Array:
-    """Return the rings of loads that stand in the middle of the trailers' decks, of one world, m. (n_members, 3)"""
+    """Return the positions of rings of loads in the middle of the trailers' decks, of one world, m. (n_members, 3)"""
     vehicle = load_vehicle(VEHICLE)
     centre, thickness = vehicle.value("trailer.deck_centre"), vehicle.value("trailer.deck")[2]
     front, _ = trailer_axles(car.state, car.params)
@@ -190,10 +190,10 @@ def rings_of(car: CarData) -> Array:
 
 
 def moving_rings(car: CarData) -> tuple[Array, Array]:
-    """Return the rings of ``rings_of`` and their velocities, m/s, of one world. (n_members, 3) each
+    """Return the positions of ``rings_of``, m, and their velocities, m/s, of one world. (n_members, 3) each
 
-    The velocities follow from the turning joints: a difference of two positions in float32, times 500 Hz, would be off
-    by 2e-4 m/s.
+    The velocities are derivatives of ``rings_of``: a difference of two float32 positions, times 500 Hz, would be off by
+    2e-4 m/s.
     """
 
     def place(*moved: Array) -> Array:
@@ -204,7 +204,7 @@ def moving_rings(car: CarData) -> tuple[Array, Array]:
 
 
 def middle_of(data: SimData) -> Array:
-    """Return the first place of each drone's car, of one drone or one world, m. (..., 3)"""
+    """Return the initial position of each drone's car, of one drone or one world, m. (..., 3)"""
     places = np.pad(SPACING * grid_2d(data.core.n_drones), ((0, 0), (0, 1)))
     return pick(jnp.asarray(places, data.states.pos.dtype), data.core.drone_id)
 

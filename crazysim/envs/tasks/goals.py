@@ -49,7 +49,7 @@ class GoalTask(Task):
         return with_goal(data, pos)
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state and the way to its goal, m."""
+        """Return the drone's state and the vector to its goal, m."""
         return state_of(data) | {"difference_to_goal": goal_of(data).pos - data.states.pos}
 
     def crashed(self, data: SimData) -> Array:
@@ -80,13 +80,13 @@ def goal_of(data: SimData) -> Goal:
 
 
 def with_goal(data: SimData, pos: ArrayLike, vel: ArrayLike = 0.0) -> SimData:
-    """Return the data with other goals: positions, m, and velocities, m/s. (..., n_drones, 3) each"""
+    """Return the data with new goals: positions, m, and velocities, m/s. (..., n_drones, 3) each"""
     pos = jnp.broadcast_to(pos, data.states.pos.shape)
     return with_record(data, Goal(pos, jnp.broadcast_to(vel, pos.shape)))
 
 
 def with_record(data: SimData, record: PyTree) -> SimData:
-    """Return the data with another record of the task."""
+    """Return the data with a new record of the task."""
     return data.replace(plugins=data.plugins | {NAME: record})
 
 
@@ -118,7 +118,7 @@ def out_of_bounds(data: SimData, half_width: float, height: float) -> Array:
 
 
 def pick(x: Array, number: Array) -> Array:
-    """Return one of several entries: a selection among all, which costs less than an index.
+    """Return the entry with a given index, by masking all entries, which is faster than indexing.
 
     Args:
         x: Entries. (..., n, k)
@@ -168,7 +168,7 @@ def install_rules(sim: Sim, record: PyTree, rules: Stage, collisions: bool = Fal
 def collision_stage(sim: Sim) -> Stage:
     """Return a stage that disables drones that touch each other, in the task's record.
 
-    Drones whose ``out`` is true in the record neither touch nor are touched. The record needs leaves ``disabled`` and
+    Drones whose ``out`` is true in the record are ignored. The record needs leaves ``disabled`` and
     ``out``, (n_worlds, n_drones) each.
     """
     contacts = sim.scene.contact_fn((), floor=False)
@@ -192,7 +192,7 @@ def nearest_drones(data: SimData, n: int, counts: Array | None = None) -> tuple[
     Args:
         data: The data of one world.
         n: Number of others to return; fewer if there are fewer.
-        counts: True where a drone can be seen; None for all. Others are zero. (n_drones,)
+        counts: True where a drone can be seen; None for all. Entries for other drones are zero. (n_drones,)
 
     Returns:
         (n_drones, n, 3) each

@@ -26,7 +26,7 @@ class Hover(GoalTask):
     """Reach a random point and hover there.
 
     A drone starts in flight, slightly tilted and moving, in a box around (0, 0, 1.2); so does its goal. An episode ends
-    on the floor, and 3 m from the axis or above it.
+    when a drone touches the floor, rises above 3 m, or is more than 3 m from the z axis along x or y.
     """
 
     name = "hover"

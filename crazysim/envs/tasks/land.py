@@ -52,14 +52,15 @@ class Land(TouchDown):
     """Land on a pad, 0.2 m above the floor.
 
     A drone has landed when it touches the pad from above, within its radius, with at most 0.5 m/s relative to it and a
-    tilt of at most 20 degrees; contact is checked at every physics step. Any other contact is a crash, as is leaving
-    the 2.8 m around the middle of the pad's path. An episode ends when every drone has landed or crashed.
+    tilt of at most 20 degrees; contact is checked at every physics step. Any other contact is a crash, as is moving
+    more than 1.4 m along x or y from the middle of the pad's path, or above 2.5 m. An episode ends when every drone
+    has landed or crashed.
     """
 
     name = "land"
     Record = PadLanding
     what = "pad"
-    crash = 2.0  # at 10, as much as a landing pays, policies hover beside the pad: of their first contacts few are soft
+    crash = 2.0  # at 10, the reward of a landing, policies hover beside the pad: few of their first contacts are soft
 
     speed: float = setting(default=0.0, low=0.0, high=10.0)
     """Speed of a pad on a circle of 0.3 to 0.7 m radius, in either direction, m/s; zero for pads that stand still."""

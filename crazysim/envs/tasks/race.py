@@ -31,16 +31,16 @@ from crazysim.sim.sim import Sim
 SENSOR_RANGE = 0.7
 """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
 START_JITTER = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1)
-"""Largest component of the distance of a start from its place, m, and of its roll, pitch and yaw, rad."""
+"""Largest offset of a start from its place along x, y and z, m, and largest roll, pitch and yaw, rad."""
 MASS_DEVIATION, INERTIA_DEVIATION = 0.115, 0.04
-"""Largest relative deviation of mass and inertia from the airframe's from level 1 on: 5 g and 1e-6 kg m^2 of a
+"""Largest relative deviation of mass and inertia from the airframe's values, from level 1 on: 5 g and 1e-6 kg m^2 of a
 cf21B_500, as in lsy_drone_racing."""
 GATE_JITTER = (0.15, 0.15, 0.1, 0.05, 0.1, 0.2)
-"""Largest displacement, m, and rotation, rad, of a gate from level 2 on."""
+"""Largest displacement along x, y and z, m, and largest roll, pitch and yaw, rad, of a gate from level 2 on."""
 OBSTACLE_JITTER = (0.15, 0.15, 0.05)
-"""Largest displacement of an obstacle from level 2 on, m."""
+"""Largest displacement of an obstacle along x, y and z from level 2 on, m."""
 FOOT = np.array([0.0, 0.0, POLE_HEIGHT])
-"""From the foot of an obstacle to its upper end, m."""
+"""Vector from the foot of an obstacle to its upper end, m."""
 
 Rewards = Callable[[SimData, Array, Array], dict[str, Array]]
 """``rewards(data, action, last_action)``: terms by name. (n_drones,) each"""
@@ -68,16 +68,16 @@ class Race(Task):
     level: int = setting(default=0, low=0, high=3)
     """Amount of randomness, 0 to 3."""
     track: Track = field(default_factory=Track)
-    """The course. Level 3 takes numbers, heights and limits from it."""
+    """The course. Level 3 uses only its limits, and the numbers and heights of its gates and obstacles."""
     sensor_range: float = setting(default=SENSOR_RANGE, low=0.0)
     """Distance in the plane below which a drone observes the true pose of a gate or obstacle, m."""
     seconds: float = 12.0
     """Length of an episode, s."""
     reward: Rewards = dense
-    """Function that returns the terms of the reward; ``race_rules.sparse`` is another."""
+    """Function that returns the terms of the reward; ``race_rules.sparse`` is an alternative."""
     practice: bool = False
-    """True to start anywhere on the course, for learning: as often as at the start, a drone is behind the first gate,
-    the second and so on, which count as passed. Several drones are all at the start, or each behind another gate."""
+    """True to start anywhere on the course, for learning: with equal probability at the start or behind any gate except
+    the last, with the gates up to there passed. Several drones are all at the start, or each behind another gate."""
 
     def install(self, sim: Sim) -> None:
         if self.practice and sim.n_drones >= max(self.track.n_gates, 2):
@@ -88,7 +88,7 @@ class Race(Task):
         jitter = np.linalg.norm(START_JITTER[:2]) + (np.linalg.norm(GATE_JITTER[:2]) if self.level == 2 else 0)
         course = check_track(self.track, sim.n_drones, float(jitter), self.level == 3)
         tallest = float(np.max(np.asarray(course.gates_pos)[:, 2])) + GATE_JITTER[2]
-        # All posts have one length, so that they are computed side by side; the rest is below the floor.
+        # All posts have the same length, so that they are computed as one batch; they extend below the floor.
         gates = sim.scene.add("gate", count=course.n_gates, pos=course.gates_pos, quat=self._gates_quat(),
                               stand=tallest, width=OPENING, height=OPENING)  # fmt: skip
         obstacles_pos = np.asarray(course.obstacles_pos, float) - FOOT
@@ -235,7 +235,7 @@ def _repeat_per_drone(sim: Sim, names: Mapping[str, int]) -> None:
 
 
 def _randomize_inertia(params: SimParams, shares: Array) -> SimParams:
-    """Return parameters with other masses and inertias, from numbers in [-1, 1]. (n_drones, 4)"""
+    """Return parameters with masses and inertias randomised by numbers in [-1, 1]. (n_drones, 4)"""
     mass = params.mass * (1 + MASS_DEVIATION * shares[..., :1])
     root = jnp.sqrt(1 + INERTIA_DEVIATION * shares[..., 1:])
     scale = root[..., :, None] * root[..., None, :]
@@ -243,7 +243,7 @@ def _randomize_inertia(params: SimParams, shares: Array) -> SimParams:
 
 
 def _pos_behind_gate(data: SimData, passed: Array, x: Array) -> tuple[Array, Array]:
-    """Return a position of a drone that has just passed some gates, m, and its velocity, m/s; at rest if it has not.
+    """Return positions just behind the last gates passed, m, and velocities, m/s, which are zero where none is passed.
 
     Args:
         data: The data of one world.

@@ -1,4 +1,7 @@
-"""Observations of the race: the course as far as a drone has come near it. All functions are of one world."""
+"""Observations of the race: true poses of gates and obstacles that a drone has come near, nominal poses of others.
+
+All functions take the data of one world.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +30,12 @@ def visited_objects(data: SimData, sensor_range: float) -> tuple[Array, Array]:
 
 
 def observe(data: SimData, sensor_range: float) -> dict[str, Array]:
-    """Return the observations of lsy_drone_racing, each as one row, and more of them for small networks.
+    """Return the observations of lsy_drone_racing, each flattened per drone, and further ones for small networks.
 
-    Those are ``rot`` (9), ``vel_body`` (3), ``gate_corners`` of the next two gates in the drone's frame (24),
-    ``obstacles_near``, ways to the axes of the next two poles (6), and with several drones ``drones_near``, the
-    nearest two of those still in the race (6); all from observed poses, in the drone's frame, m.
+    The further ones are ``rot``, the attitude as a matrix, body to world (9); and in the drone's frame ``vel_body``,
+    m/s (3), ``gate_corners``, vectors to the corners of the next two gates, m (24), ``obstacles_near``, horizontal
+    vectors to the axes of the nearest two poles, m (6), and with several drones ``drones_near``, vectors to the nearest
+    two that are still in the race, m (6). Gates and poles have their observed poses.
     """
     record, s, n_drones = race_of(data), data.states, data.core.n_drones
     gates_pos, gates_quat, poles = (

@@ -1,6 +1,6 @@
 """Rules of the race: gates and obstacles of a course, progress of each drone, and rewards for it.
 
-All functions are of one world, or, without the axis of drones, of one drone.
+All functions take the data of one world or, without the axis of drones, of one drone.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from crazysim.scene.objects import Handle
 OPENING = 0.45
 """Width and height of a gate's opening, m."""
 POLE_HEIGHT = 1.7
-"""Height of an obstacle, m; the part that is too long for its place is below the floor."""
+"""Length of an obstacle, m; if its upper end is lower than that, the rest is below the floor."""
 BYPASS_DISTANCE = 0.45
-"""Distance from the middle of a gate at which a way around it passes, m."""
+"""Distance from the middle of a gate at which the way around its frame passes, m."""
 FUNNEL = 0.15
-"""Distance from the axis of a gate, m, that is no detour at the gate itself; it grows by a metre for each before it."""
+"""Radius around a gate's axis within which the way to the gate has no detour, m, at the gate itself; it grows by 1 m
+per metre before the gate."""
 
 
 class RaceRecord(PyTree):
@@ -47,9 +48,9 @@ class RaceRecord(PyTree):
     remaining_way_before: Array = leaf("drone", 0)
     """Way to go before this environment step, m. (n_worlds, n_drones)"""
     nominal_pos: Array | None = leaf("world", 2)
-    """Nominal positions of gates, then of obstacles, m; None if they stand there. (n_worlds, 1, n, 3)"""
+    """Nominal positions of gates, then of obstacles, m; None if they are the true ones. (n_worlds, 1, n, 3)"""
     nominal_quat: Array | None = leaf("world", 2)
-    """Nominal attitudes of gates, xyzw; None if they have those. (n_worlds, 1, n_gates, 4)"""
+    """Nominal attitudes of gates, xyzw; None if they are the true ones. (n_worlds, 1, n_gates, 4)"""
     gates: Handle = static()
     """Handle of the gates, in their order."""
     obstacles: Handle = static()
@@ -110,7 +111,7 @@ def next_gate_distance(data: SimData) -> Array:
 
 
 def remaining_way(data: SimData) -> Array:
-    """Return the way to the end of the course through the middle of every gate, m. (n_drones,)"""
+    """Return the length of the way to the end of the course through the middles of the gates, m. (n_drones,)"""
     record = race_of(data)
     pos, quat = gates_of(data)
     legs = way_to_gate(rotation.rotate_inverse(quat[..., 1:, :], pos[..., :-1, :] - pos[..., 1:, :]))
@@ -121,9 +122,9 @@ def remaining_way(data: SimData) -> Array:
 
 
 def way_to_gate(pos: Array) -> Array:
-    """Return the way to the middle of a gate, from beside it by a detour, and from behind it around its frame, m.
+    """Return the length of the way to a gate's middle, with a detour from beside, around the frame from behind, m.
 
-    By the distance in a straight line the best place would be one beside the frame, where the frame is in the way.
+    With the straight-line distance, the best place would be one beside the frame, although the frame is in the way.
 
     Args:
         pos: Position in the gate's frame, m. (..., 3)

@@ -19,14 +19,15 @@ from crazysim.envs.tasks.goals import Goal, goal_of, install_goal, on_floor, sta
 from crazysim.sim.sim import Sim
 
 HEIGHT = 5.0
-"""Height of the start, m; enough to sink for a whole episode at most speeds."""
+"""Height of the start, m; enough to descend for a whole episode with usual values of ``speed``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReachVel(Task):
     """Reach a random velocity and keep it. The task error is a difference of velocities, m/s.
 
-    A drone starts in flight, 5 m high, slightly tilted and moving. An episode ends on the floor.
+    A drone starts in flight, 5 m high, slightly tilted and moving. An episode ends when a drone touches the
+    floor.
     """
 
     name = "reach_vel"
@@ -34,7 +35,7 @@ class ReachVel(Task):
     Record = Goal
 
     speed: float = setting(default=1.0, low=0.0)
-    """Largest component of the velocity, m/s; the vertical one is at most a quarter of it."""
+    """Largest component of the target velocity, m/s; the vertical one is at most a quarter of that."""
     seconds: float = 4.0
     """Length of an episode, s."""
     tolerance: float = 0.1
@@ -52,7 +53,7 @@ class ReachVel(Task):
         return with_goal(data, start, scale_symmetric(x["goal"], self.speed * np.array([1.0, 1.0, 0.25])))
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state and the missing velocity, m/s."""
+        """Return the drone's state and the target velocity minus its velocity, m/s."""
         return state_of(data) | {"difference_to_target_vel": goal_of(data).vel - data.states.vel}
 
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
@@ -67,5 +68,5 @@ class ReachVel(Task):
         return jnp.any(on_floor(data))
 
     def error(self, data: SimData) -> Array:
-        """Return the difference from the velocity, m/s."""
+        """Return the norm of the difference from the target velocity, m/s."""
         return rotation.safe_norm(goal_of(data).vel - data.states.vel)[..., 0]

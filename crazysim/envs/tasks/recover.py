@@ -31,7 +31,7 @@ class Recover(GoalTask):
     speed: float = setting(default=2.0, low=0.0)
     """Largest component of the velocity at the start, m/s."""
     spin: float = setting(default=6.0, low=0.0)
-    """Largest body rate at the start, rad/s."""
+    """Largest component of the angular velocity at the start, body frame, rad/s."""
     seconds: float = 5.0
     """Length of an episode, s."""
     tolerance: float = 0.1

@@ -29,16 +29,16 @@ SEPARATION = (0.24, 0.24, 0.6)
 0.3 m along the thrust with which Preiss, Hoenig, Ayanian and Sukhatme (Downwash-aware trajectory planning for large
 quadrotor teams, 2017) describe a Crazyflie."""
 CROWDING = 2.5
-"""Separation below which another drone costs, in half axes of the ellipsoid. With 1.5 drones that cross the middle
-learn too late to keep away: a third of the episodes ended in a crash."""
+"""Separation below which another drone costs reward, in half axes of the ellipsoid. With 1.5, drones that cross the
+middle evade too late: a third of the episodes ended in a crash."""
 SPACING = 0.9
-"""Smallest distance of neighbours on the circle of the starts, m."""
+"""Smallest distance between neighbours on the circle of the starts, m."""
 HEIGHT = 1.2
 """Height of the circle, m."""
 ROOM = 1.5
 """Distance of the arena's limits from the circle and the formation, m."""
 JITTER = 0.1
-"""Largest component of the distance of a start from its place on the circle, m."""
+"""Largest component of the offset of a start from its place on the circle, m."""
 
 
 class SwarmRecord(PyTree):
@@ -54,10 +54,11 @@ class SwarmRecord(PyTree):
 class Swarm(Task):
     """Change places on a circle, or form a formation, at a distance from each other.
 
-    The drones start on a circle that is turned at random. Without a formation each one should take the place of
-    another, the same number of places on for all. No drone may enter the ellipsoid around another, with half axes of
-    0.24 m across and 0.6 m in height, below which it would also fly in its downwash; that is checked at every physics
-    step. An episode ends when one does, if ``strict``, on the floor, and 1.5 m outside of circle and formation.
+    The drones start on a circle that is turned at random. Without a formation, each one must take the place of
+    another, the same number of places further along the circle for all. No drone may enter the ellipsoid around
+    another, with half axes of 0.24 m horizontally and 0.6 m vertically because of the downwash; that is checked at
+    every physics step. An episode ends when a drone enters one, if ``strict``, when it touches the floor, or
+    when it leaves the arena, whose limits are 1.5 m beyond the circle and the formation.
     """
 
     name = "swarm"
@@ -75,7 +76,7 @@ class Swarm(Task):
     """Distance below which a drone counts as in its place, m."""
 
     def install(self, sim: Sim) -> None:
-        """Give every drone a goal, and check separation at every physics step."""
+        """Add the record and the stage that tracks the separation at every physics step."""
         if sim.n_drones < 2:
             raise ConfigError(f"expected at least two drones in a swarm, got {sim.n_drones}. Use n_drones=2 or more.")
         if self.formation is not None:
@@ -106,7 +107,7 @@ class Swarm(Task):
         x = draw(key, turn=1, places=1, drones=(n, 9))
         offset, rpy, vel = jnp.split(2 * x["drones"] - 1, 3, axis=-1)
         begin = 2 * jnp.pi * (x["turn"] + np.arange(n, dtype=dtype) / n)
-        # All move on by 1 to n - 1 places.
+        # All drones move on by the same number of places, from 1 to n - 1.
         places = 1 + jnp.floor((n - 1) * x["places"])
         end = begin + 2 * jnp.pi * places / n
         goal = on_circle(end, n) if self.formation is None else jnp.asarray(np.asarray(self.formation, float), dtype)
@@ -140,7 +141,7 @@ class Swarm(Task):
         return on_floor(data) | beyond | (self.strict & (swarm_of(data).closest < 1))
 
     def limits(self, n_drones: int) -> np.ndarray:
-        """Return the limits of the arena, m. (3,)"""
+        """Return the largest absolute coordinates within the arena, m. (3,)"""
         radius = circle_radius(n_drones)
         if self.formation is None:
             return np.array([radius, radius, HEIGHT]) + ROOM
@@ -176,7 +177,7 @@ def swarm_of(data: SimData) -> SwarmRecord:
 
 
 def as_formation(formation: Sequence[Sequence[float]], n_drones: int) -> np.ndarray:
-    """Return a formation as an array, checked. (n_drones, 3)"""
+    """Return a validated formation as an array. (n_drones, 3)"""
     try:
         slots = np.asarray(formation, float)
     except (TypeError, ValueError) as error:

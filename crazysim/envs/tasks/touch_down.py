@@ -30,7 +30,7 @@ class Landing(PyTree):
     landed: Array = leaf("drone", 0)
     """True where the drone has touched down softly. (n_worlds, n_drones)"""
     crashed: Array = leaf("drone", 0)
-    """True where it has touched anything otherwise, or left its part of the arena. (n_worlds, n_drones)"""
+    """True where it has touched anything in another way, or left its part of the arena. (n_worlds, n_drones)"""
     out_before: Array = leaf("drone", 0)
     """True where it had landed or crashed before this environment step. (n_worlds, n_drones)"""
     remaining_way_before: Array = leaf("drone", 0)
@@ -46,7 +46,7 @@ class Landing(PyTree):
 class TouchDown(Task):
     """Base of tasks in which every drone lands on a place of its own, which may move.
 
-    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``place`` and ``has_left_arena``.
+    Subclasses are frozen dataclasses that define ``install``, ``spawn``, ``target_motion`` and ``has_left_arena``.
     """
 
     Record = Landing
@@ -65,7 +65,8 @@ class TouchDown(Task):
 
         Args:
             data: Simulation.
-            ahead: Steps that a place by time is ahead of the data: 1 in a stage behind the integration.
+            ahead: Physics steps by which a place that moves by time is advanced: 1 in a stage after the integration and
+                before ``steps`` increases.
         """
         raise NotImplementedError(self._undefined("target_motion(data)"))
 
@@ -74,12 +75,12 @@ class TouchDown(Task):
         raise NotImplementedError(self._undefined("has_left_arena(data)"))
 
     def touch(self, contacts: ContactFn, radius: float, scope: str = "drone") -> Stage:
-        """Return the stage that decides at the first contact whether it is a landing, before the steps increase.
+        """Return the stage that decides at the first contact whether it is a landing; runs before ``steps`` increases.
 
         Args:
             contacts: Contacts with floor and objects; object i belongs to drone i.
             radius: Largest horizontal distance from the middle of the place at touch-down, m.
-            scope: Scope of the stage: ``drone``, or ``world`` for objects that a population places.
+            scope: Scope of the stage: ``drone``, or ``world`` for objects that a population moves.
         """
 
         @stage(scope)
@@ -110,7 +111,7 @@ class TouchDown(Task):
         return with_record(data, record.replace(out_before=record.out, remaining_way_before=self.error(data)))
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, and the way to its place, m, and the place's relative velocity, m/s."""
+        """Return the drone's state, the vector to its place, m, and the place's relative velocity, m/s."""
         pos, vel = self.target_motion(data)
         return state_of(data) | {
             f"difference_to_{self.what}": pos - data.states.pos,

@@ -27,7 +27,7 @@ from crazysim.trajectories import Trajectory, figure_eight
 MAX_ERROR = 1.5
 """Distance from the trajectory at which an episode ends, m."""
 MAX_SAMPLES = 1000
-"""Most samples of the time ahead: 3,000 numbers of an observation."""
+"""Largest number of samples ahead; they are 3,000 numbers of an observation."""
 LATEST = 20.0
 """Latest time on the trajectory at which an episode starts, s."""
 
@@ -43,8 +43,8 @@ class Phase(PyTree):
 class TrackTrajectory(Task):
     """Follow a trajectory.
 
-    A drone starts near a random point of the trajectory, and observes the next samples of it. An episode ends on the
-    floor, and 1.5 m away from where the drone should be.
+    A drone starts near a random point of the trajectory, and observes the next samples of it. An episode ends when a
+    drone touches the floor, or is more than 1.5 m away from where it should be.
     """
 
     name = "track"
@@ -53,11 +53,11 @@ class TrackTrajectory(Task):
     trajectory: Trajectory = field(default_factory=figure_eight)
     """The trajectory; by default a figure eight of 2 m by 1 m in 5 s, which repeats."""
     n_samples: int = setting(default=5, low=1, high=MAX_SAMPLES)
-    """Number of samples of the time ahead that a policy observes."""
+    """Number of future samples of the trajectory that a policy observes."""
     spacing: float = setting(default=0.1, positive=True)
     """Time between samples, s."""
     spread: float = setting(default=0.2, low=0.0)
-    """Largest component of the distance from the trajectory at the start, m."""
+    """Largest component of the offset from the trajectory at the start, m."""
     seconds: float = 10.0
     """Length of an episode, s."""
     tolerance: float = 0.05
@@ -95,7 +95,7 @@ class TrackTrajectory(Task):
         return [x[..., :3] for x in evaluate(t)]
 
     def observe(self, data: SimData) -> dict[str, Array]:
-        """Return the drone's state, the differences from the trajectory, and the ways to its next samples, m."""
+        """Return the drone's state, the differences from the trajectory, and vectors to its next samples, m."""
         t, s = self.time(data), data.states
         times = t[..., None] + (self.spacing * np.arange(1 + self.n_samples)).astype(t.dtype)
         pos, vel = self.motion(times)  # now, and at the samples

@@ -42,7 +42,7 @@ BAR = 0.05
 RADIUS = 0.03
 """Radius of a load, m."""
 ROOM = 0.25
-"""Smallest height of the opening above the length of the link, m: the drone and its load hang in it together."""
+"""Smallest difference between the opening's height and the link's length, m: drone and load pass it together."""
 
 
 class GateDelivery(Delivery):
@@ -56,10 +56,11 @@ class GateDelivery(Delivery):
 class Transport(BringLoad):
     """Carry a load on a rod or cable through a gate, and hold it at a goal behind it.
 
-    A drone starts in flight with a swinging load. The gate stands in a lane of its own; drone and load must pass its
-    plane through the opening. Missing it is a crash, as is touching the frame or the floor, and leaving the lane; this
-    is checked at every physics step. A load is delivered when it has been within ``tolerance`` of its goal, behind the
-    gate, at most 0.2 m/s fast, for ``hold`` seconds. An episode ends when a drone crashes.
+    A drone starts in flight with a swinging load. Each drone has its own lane with a gate; drone and load must pass
+    the plane of the gate through the opening. Missing it is a crash, as is touching the frame or the
+    floor, and leaving the lane; this is checked at every physics step. A load is delivered when it has been within
+    ``tolerance`` of its goal, behind the gate, at most 0.2 m/s fast, for ``hold`` seconds. An episode ends when a drone
+    crashes.
     """
 
     name = "transport"
@@ -95,7 +96,7 @@ class Transport(BringLoad):
 
         @stage("drone")
         def judge(data: SimData) -> SimData:
-            """Note a crash, and a load that stays at its goal."""
+            """Record crashes, and loads that stay at their goals."""
             return with_record(
                 data, self.update_outcome(data, contacts(data).any | self.misses(data) | out_of_lane(data))
             )
@@ -137,9 +138,10 @@ class Transport(BringLoad):
         return data.replace(plugins=data.plugins | {"load": load})
 
     def remaining_way(self, data: SimData) -> Array:
-        """Return the way of the load to its goal, before the gate by way of its opening, m. (...)
+        """Return the length of the load's way to its goal, through the opening if it is before the gate, m. (...)
 
-        There the load aims half the link's length below the middle, so that drone and load pass with equal margins.
+        In the opening, the load aims half the link's length below the middle, so that drone and load pass with equal
+        margins.
         """
         pos, quat = gate_of(data)
         load, goal = load_pos(data), delivery_of(data).goal
@@ -181,8 +183,8 @@ class Transport(BringLoad):
     def rewards(self, data: SimData, action: Array, last_action: Array) -> dict[str, Array]:
         """Return progress and proximity of the load, and costs of swinging, turning, changing actions and a crash.
 
-        The approach reaches far, so that waiting before the gate pays less than passing it; proximity rewards rest at
-        the goal.
+        The ``approach`` term reaches far, so that waiting before the gate pays less than passing it; ``proximity``
+        rewards rest at the goal.
         """
         record, to_go = delivery_of(data), self.remaining_way(data)
         rate = direction(data)[1]

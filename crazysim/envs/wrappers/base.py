@@ -26,7 +26,7 @@ class Wrapper(Hooks, Env):
         self.name = name if name not in others else next(x for k in numbers if (x := f"{name} {k}") not in others)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Refuse wrappers that step the environment themselves, which is compiled as a whole."""
+        """Refuse subclasses that override ``reset``, ``restart`` or ``step``: the step is compiled as a whole."""
         super().__init_subclass__(**kwargs)
         own = {"reset", "restart", "step"} & set(vars(cls))
         if own:

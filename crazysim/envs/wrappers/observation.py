@@ -40,7 +40,7 @@ class Observe(Wrapper):
 class ObservationNoise(Wrapper):
     """Add normal noise to observations, independent in every step; the same seed and world give the same noise.
 
-    ``std`` has the standard deviations by name of the observation, each in its unit.
+    ``std`` maps names of observations to standard deviations, each in the unit of the observation.
     """
 
     def __init__(self, env: Env, std: dict[str, float]):
@@ -75,8 +75,8 @@ def _draw_normal(key: Array, number: int, like: Array) -> Array:
 class Normalize(Wrapper):
     """Normalise observations to mean zero and variance one over all worlds and drones so far, clipped to [-10, 10].
 
-    ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy as it was trained,
-    pass them: ``Normalize(env, stats)`` leaves them unchanged.
+    ``state.memory["Normalize"]`` holds the statistics, by name of the observation. To fly a policy with the
+    statistics of its training, pass them: ``Normalize(env, stats)`` does not update them.
     """
 
     batched = True
