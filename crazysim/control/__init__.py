@@ -76,5 +76,5 @@ __getattr__ = lazy(
 
 
 def __dir__() -> list[str]:
-    """Return the public names, those not yet imported included."""
+    """Return the public names, including those not yet imported."""
     return __all__

@@ -2,10 +2,12 @@
 
 A force follows from the errors of position and velocity (``crazysim.control.position``), a torque from the errors of
 attitude and body rates. Forces and torques that the model lacks, such as wind, a load, a wrong mass or a shifted centre
-of mass, are estimated from velocities that differ from those that the rotors should have caused, and compensated.
+of mass, are estimated from the difference between the measured velocities and those that the rotors should have caused,
+and compensated.
 
-All gains follow from one rate ``a`` about each axis. A drone whose thrusts follow their command with the rate ``a``
-turns under gains per inertia kp and kd on attitude and body rate as ``s^3 / a + s^2 + kd s + kp``. With
+All gains follow from one rate ``a`` about each axis. A drone whose thrusts follow their command with the rate ``a``,
+under gains per inertia kp and kd on attitude and body rate, has the characteristic polynomial
+``s^3 / a + s^2 + kd s + kp``. With
 
     kd = 0.6 a,   kp = 0.12 a^2,   and at most half of the rate of roll and pitch about yaw,
 
@@ -15,14 +17,15 @@ the gains of the position loop follow.
 
 The rate has two limits. The first is lag: ``1 / a`` is at least the lag of the rotors, with feedback of their speeds,
 and at least 1.5 periods of the controller. The second is the authority: a large error turns the drone along the line
-on which kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can, from every error,
-if that is at most the angular acceleration that they give in hover where e is largest (``turn_rates``). Without this
-limit a drone with quick rotors turns faster than it can stop, saturates to both sides in turn, and never settles.
+on which kp e + kd e' = 0, so that the rotors must brake it with (kp / kd)^2 e = 0.04 a^2 e. They can stop it from every
+error if this value at the largest e is at most the angular acceleration that they give in hover (``turn_rates``).
+Without this limit, a drone with quick rotors turns faster than it can stop, saturates to both sides in turn, and never
+settles.
 
-A rotor that speeds up turns the body the other way. With rotors of the inertia I, whose drag torque changes by q over
-their speed, the yaw torque follows the drag torque y as y + z y' with z = I / q, up to a second for heavy rotors. As
-feedback that lead would alternate the rotors at every tick. The rotors are therefore given only the part
-1 / (1 + r z) of the missing drag torque, with their rate r: the torque then follows as
+A rotor that speeds up turns the body the other way. For rotors of inertia I whose drag torque has the slope q over
+speed, a drag torque y comes with the yaw torque y + z y' with z = I / q, up to a second for heavy rotors. Under
+feedback, this lead would reverse the demand on the rotors at every tick. The rotors are therefore given only the
+fraction 1 / (1 + r z) of the missing drag torque, with their rate r. The torque then follows its demand as
 
     (1 + z s) / (1 + (z + 1 / r) s),
 
@@ -61,7 +64,7 @@ ROTOR_RATE = 50.0
 MAX_LEAD = 5.0
 """Largest factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
 MAX_FEEDBACK_STEP = 0.5
-"""Largest part of the missing rotor speed that the feedback adds in one tick of the controller, 1."""
+"""Largest fraction of the missing rotor speed that the rotors make up in one tick of the controller, 1."""
 DAMPING_RATIO = 0.6
 """Angular acceleration per body rate over the rate about the axis, 1."""
 STIFFNESS_RATIO = 0.12
@@ -69,9 +72,9 @@ STIFFNESS_RATIO = 0.12
 OBSERVER_RATE_RATIO = 0.6
 """Rate of the estimate of unknown torques over the largest rate about an axis, 1."""
 TORQUE_MAX = 0.5
-"""Largest unknown torque that is compensated, as the rotation error against which it holds, rad."""
+"""Largest unknown torque that is compensated, as the rotation error to which it is the response, rad."""
 YAW_RATE_MAX = 35.0
-"""Largest rate about body z that holds a heading, rad/s: what a Crazyflie's gyroscope measures (BMI088, data sheet)."""
+"""Largest rate about body z to hold a heading, rad/s: the range of a Crazyflie's gyroscope (BMI088, data sheet)."""
 INVERTED_COSINE = 1e-6
 """One plus the cosine of the tilt error below which its direction counts as undefined, 1: 0.08 degrees."""
 
@@ -88,13 +91,13 @@ class AutoParams(RigidBodyParams):
     torque_max: Array = leaf("parameter", 1)
     """Largest unknown torque that is compensated, N m. (3,)"""
     observer: Array = leaf("parameter", 1, (1,))
-    """Part of a new measurement in the estimate of unknown torques, 1. (1,)"""
+    """Weight of a new measurement in the estimate of unknown torques, 1. (1,)"""
     lead: Array = leaf("parameter", 1, (1,))
-    """Factor on the difference of desired and present rotor speeds, 1. (1,)"""
+    """Factor on the difference between desired and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
     """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
     share: Array = leaf("parameter", 1, (1,))
-    """Part of the missing yaw torque that the rotors' drag is to give; the reaction to them gives the rest, 1. (1,)"""
+    """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
     position: PositionParams | None
     """Gains and limits of the position loop; None without one."""
 
@@ -157,7 +160,7 @@ class AutoTarget(PyTree):
 
 
 class AutoMemory(PyTree):
-    """Memory of the default controller: what it expects of this tick, and its estimates."""
+    """Memory of the default controller: target, expected angular momentum and estimated torque."""
 
     target: AutoTarget | None
     """Result of the position loop; None at command levels below ``state``, which have none."""
@@ -180,9 +183,9 @@ class AutoMemory(PyTree):
 def quat_error(quat: Array) -> Array:
     """Return the rotation vector, shortened to ``2 sin(angle / 2)``, that turns a body into a desired attitude.
 
-    The thrust is tilted along the shortest way, and the rest turns about it (Brescianini and D'Andrea 2018). The first
-    two entries are the tilt error, the third is the yaw error; each is an angle where it is small, and 2 at 180
-    degrees.
+    The thrust is tilted the shortest way, and the remaining rotation is about it (Brescianini and D'Andrea 2018). The
+    first two entries are the tilt error, the third is the yaw error. Each error approximates the angle where it is
+    small, and is 2 at 180 degrees.
 
     Args:
         quat: Attitude of the desired frame in the body frame, unit, xyzw. (..., 4)
@@ -273,7 +276,7 @@ class Auto(Controller):
             target = cast(AutoTarget, memory.target)
             error = rotation.multiply(rotation.conjugate(s.quat), target.quat)
             z, w = error[..., 2:3], error[..., 3:]
-            thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its part along the present z axis
+            thrust = target.thrust * (2 * (w * w + z * z) - 1)  # its component along the current z axis
             error, rate = quat_error(error), target.ang_vel
             on: Any = True
         else:
@@ -288,7 +291,7 @@ class Auto(Controller):
         total = momentum - rotation.along_z((p.reaction * rotors[..., 2:])[..., 0])
         impulse = p.torque_max / self.freq
         measured = jnp.clip(total - memory.momentum, -impulse, impulse)
-        at_rest = dot(s.ang_vel, s.ang_vel) == 0  # the floor holds it
+        at_rest = dot(s.ang_vel, s.ang_vel) == 0  # taken to stand on the floor
         unknown = (1 - p.observer) * memory.torque + jnp.where(at_rest, 0.0, p.observer * self.freq) * measured
         expected = total + (rotors - gyroscopic) / self.freq
         torque = gyroscopic - unknown - matvec(p.J * p.damping[..., None, :], s.ang_vel - rate)

@@ -1,7 +1,7 @@
-"""Gains by bandwidth: what rotors, their lag and the rate of a controller allow.
+"""Gains by bandwidth, as far as rotors, their lag and the rate of a controller allow.
 
-A drone with rotors of lag rate ``a`` turns under a feedback of attitude and body rate, with gains per inertia kp and
-kd, as ``s^3 / a + s^2 + kd s + kp``. The rule here is
+A drone whose rotors have the lag rate ``a``, under feedback of attitude and body rate with gains per inertia kp and kd,
+has the characteristic polynomial ``s^3 / a + s^2 + kd s + kp``. The rule here is
 
     kd = a,   kp = 0.3 a^2,   and at most half of these rates about yaw, where rotors have less authority,
 
@@ -10,12 +10,12 @@ frequency of 0.12 a: together the five modes then have damping ratios of 0.39 an
 them). A controller that runs every 1/freq s acts half a period late, and its input is one period old at worst, which
 counts as lag: ``1 / a = 1 / rotor_rate + 1.5 / freq``.
 
-Two limits lower these rates. A large error e turns the drone along the line on which kp e + kd e' = 0, so the rotors
-have to brake it with (kp / kd)^2 e. Beyond what they can give (``max_ang_acc``) the drone turns faster than it can
-stop: ``turn_rates`` bounds kp / kd. And a rotor that speeds up turns the body the other way, at once: with rotors of
-the lag rate r whose momentum changes by z over their drag torque (``reaction_time``), a demand of yaw torque has 1 + r
-z times its effect in the first tick. A controller without a model of this may take away no more than ``MAX_REACTION``
-of an error of the yaw rate in a tick.
+Two limits lower these rates. First, a large error e turns the drone along the line on which kp e + kd e' = 0, so the
+rotors have to brake it with (kp / kd)^2 e. If they cannot give as much (``max_ang_acc``), the drone turns faster than
+it can stop; therefore ``turn_rates`` bounds kp / kd. Second, a rotor that speeds up turns the body the other way at
+once. With the lag rate r and the ratio z of the changes of a rotor's angular momentum and drag torque
+(``reaction_time``), a demand of yaw torque has 1 + r z times its effect in the first tick. A controller without a model
+of this may remove no more than ``MAX_REACTION`` of an error of the yaw rate in a tick.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from crazysim.dynamics.rotor import RPM_TO_RAD_S
 ATTITUDE_STIFFNESS = 0.3
 """Attitude gain per inertia over the squared lag rate, 1."""
 MAX_REACTION = 1 / 3
-"""Largest part of an error of the yaw rate that the reaction to accelerating rotors takes away in a tick, 1."""
+"""Largest fraction of an error of the yaw rate that the reaction to accelerating rotors removes in a tick, 1."""
 YAW_RATE_RATIO = 0.5
 """Ratio of the rate of the yaw loop to the rate of roll and pitch, 1."""
 STOPPABLE_ERRORS = np.array([2.0, 2.0, 1.0])
-"""Rotation errors about x, y and z from which a turn can be stopped, 1: 2 sin(angle / 2) of half a turn, and 1 rad."""
+"""Rotation errors about x, y and z from which a turn can be stopped, 1: 2 sin(angle / 2) for half a turn, and 1 rad."""
 POSITION_RATE_RATIO = 0.12
 """Natural frequency of the position loop over the lag rate, 1."""
 
@@ -80,9 +80,9 @@ def reaction_time(airframe: Airframe) -> float:
 
 
 def precession_rate(airframe: Airframe) -> float:
-    """Return the angular acceleration about x or y that rotors exert in hover per rate about the other axis, 1/s.
+    """Return the angular acceleration about x or y that rotors cause in hover per body rate about the other axis, 1/s.
 
-    It is their net angular momentum over the smaller inertia: zero where as many rotors turn one way as the other.
+    It is their net angular momentum over the smaller inertia, and zero if the rotors' angular momenta cancel.
     """
     signs, hover = airframe.value("rotors.yaw_torque_sign"), RPM_TO_RAD_S * hover_rotor_vel(airframe)
     momentum = np.sum(signs * airframe.value("rotors.inertia") * hover)
@@ -92,7 +92,7 @@ def precession_rate(airframe: Airframe) -> float:
 def max_ang_acc(airframe: Airframe) -> np.ndarray:
     """Return the angular acceleration that the rotors can give about each axis, either way, rad/s^2. (3,)
 
-    Roll and pitch may lower the collective thrust below hover, as ``prioritized_thrusts`` does, yaw may not.
+    Roll and pitch may lower the collective thrust below hover, as in ``prioritized_thrusts``; yaw may not.
     """
     shares = allocation_matrix(airframe) / np.concatenate([[1.0], hover_arms(airframe)])
     low, high = (float(airframe.value(f"rotors.thrust_{end}", ())) for end in ("min", "max"))
@@ -101,7 +101,8 @@ def max_ang_acc(airframe: Airframe) -> np.ndarray:
     torques = []
     for axis in (1, 2):
         ratio = shares[:, axis] / lift
-        # Rotor i needs at least low / lift_i - t ratio_i, rotor k allows high / lift_k - t ratio_k, all the weight.
+        # At a torque t, rotor i needs a collective thrust of at least low / lift_i - t ratio_i. Rotor k allows at most
+        # high / lift_k - t ratio_k, and the weight is an upper limit too.
         rooms = np.append(high / lift, weight)[None] - (low / lift)[:, None]
         needs = np.abs(np.append(ratio, 0.0)[None] - ratio[:, None])
         torques.append(np.min(rooms[needs > 0] / needs[needs > 0]))
@@ -121,7 +122,7 @@ def bandwidth(airframe: Airframe, freq: int, rate: float | None = None, reacts: 
         airframe: The airframe.
         freq: Rate of the controller, Hz.
         rate: Rate of the lag of the rotors, 1/s; None for ``rotor_rate``.
-        reacts: True for a controller that leaves the reaction to accelerating rotors out of account.
+        reacts: True for a controller that does not compensate the reaction to accelerating rotors.
     """
     rate = 1 / (1 / (rotor_rate(airframe) if rate is None else rate) + 1.5 / freq)
     axes = np.minimum(rate * np.array([1.0, 1.0, YAW_RATE_RATIO]), turn_rates(airframe) / ATTITUDE_STIFFNESS)

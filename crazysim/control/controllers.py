@@ -29,7 +29,7 @@ def find_controller(controller: Any, switch: Any = None) -> Controller:
     """Return the controller of a simulation.
 
     Args:
-        controller: Name, ``Controller``, or a list of them, which ``switch`` chooses from.
+        controller: Name, ``Controller``, or a list of these from which ``switch`` chooses.
         switch: Function or indices, as for ``Switch``; None for a single controller.
     """
     if isinstance(controller, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Controller ``"crazyflow"``: the cascade of Crazyflow 0.4.0, which flies its flights."""
+"""Controller ``"crazyflow"``: the cascade of Crazyflow 0.4.0, to reproduce its flights."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class CrazyflowState(Controller):
     freq: int = 100
     """Rate, Hz."""
     inner: Controller | None = None
-    """Controller that follows the attitudes; None with fitted dynamics, which do."""
+    """Controller that follows the attitude commands; None with fitted dynamics, which follow them themselves."""
 
     def params(self, airframe: Airframe) -> StateParams:
         keys = (*state_controller.KEYS, *(() if self.inner is None else attitude_controller.KEYS))
@@ -68,8 +68,9 @@ class CrazyflowState(Controller):
 class Crazyflow(Controller):
     """Cascade of Crazyflow, with gains from the airframe's table ``[controller]``, at every command level.
 
-    It follows attitudes (``attitude2force_torque``) and body rates (``body_rate2force_torque``). At the level ``state``
-    and with fitted dynamics ``CrazyflowState`` precedes or replaces it, and lower levels need no controller.
+    It follows attitudes (``attitude2force_torque``) and body rates (``body_rate2force_torque``). At the level
+    ``state``, ``CrazyflowState`` precedes it, or replaces it with fitted dynamics. Levels below ``body_rate``, and
+    attitude commands with fitted dynamics, need no controller.
     """
 
     name: ClassVar[str] = "crazyflow"

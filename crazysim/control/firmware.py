@@ -33,13 +33,13 @@ COMMAND_LEVELS = (Control.state, Control.attitude, Control.body_rate)
 MOTOR_UNITS = ("throttle", "thrust", "rpm")
 """Units of motor commands."""
 LIBRARY_FUNCTIONS = ("crazysim_memory_size", "crazysim_init", "crazysim_update_all", "crazysim_version")
-"""Functions of a library that are called from here."""
+"""Functions that a library must export."""
 MAX_LIBRARY, MAX_MEMORY = 2**28, 2**24
 """Largest library, and largest memory of a drone, bytes."""
 LOADING_TIMEOUT = 60
-"""Longest time that loading a library takes, s."""
+"""Longest time that loading a library may take, s."""
 N_COMMAND, N_FEEDFORWARD = 16, 8
-"""Numbers of a state command and of its feedforward."""
+"""Number of entries of a state command, and of its feedforward."""
 
 
 class CFirmwareMemory(PyTree):
@@ -62,11 +62,12 @@ class CFirmware(Controller):
     include: ClassVar[Path] = Path(__file__).parent
     """Folder of ``firmware.h``, for the compiler's option ``-I``."""
     library: str | Path
-    """Path of the shared library. A copy is loaded, so a file that was compiled again is another library to the next
-    ``CFirmware``; libraries that it needs are not searched beside it."""
+    """Path of the shared library. A copy is loaded, so the next ``CFirmware`` uses a file that was compiled again.
+    Libraries on which it depends are therefore not found next to the original."""
     motors: Literal["throttle", "thrust", "rpm"] = "throttle"
-    """Unit of the motor commands: ``"throttle"``, the thrust of a rotor as a part of its maximum, as a Crazyflie's PWM
-    over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to what the rotor can give, and 0 is off."""
+    """Unit of the motor commands: ``"throttle"``, the thrust of a rotor as a fraction of its maximum, like a
+    Crazyflie's PWM over 65,535; ``"thrust"``, N; or ``"rpm"``. Thrusts are limited to the range of the rotor, and 0 is
+    off."""
     freq: int = 500
     """Rate, Hz."""
 
@@ -149,7 +150,7 @@ def _call_library(library: str, level: int, n_motors: int, words: Any, inputs: A
 
 
 def copy_library(library: str | Path) -> str:
-    """Load a copy of a library that has its content of now, and return the path of the copy.
+    """Load a copy of a library with its current content, and return the path of the copy.
 
     Raises:
         ConfigError: If it cannot be loaded, lacks a function, or was compiled with another version of ``firmware.h``.
@@ -189,7 +190,7 @@ def copy_library(library: str | Path) -> str:
 def _loading_error(library: Path) -> str:
     """Return the reason why a library cannot be loaded, empty if it can.
 
-    A process of its own tries it, because the system kills a process that loads a truncated library.
+    A separate process tries it, because the system kills a process that loads a truncated library.
     """
     command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
     try:
@@ -202,7 +203,7 @@ def _loading_error(library: Path) -> str:
 
 
 _open_library = functools.cache(ctypes.CDLL)
-"""Open a library by its path, once: the types of its functions stay."""
+"""Open a library by its path. The cache returns the same object each time, so its declared function types persist."""
 
 
 @functools.cache

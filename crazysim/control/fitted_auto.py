@@ -1,4 +1,4 @@
-"""The default controller for fitted dynamics, which contain the response to attitudes: its position loop alone."""
+"""The default controller for fitted dynamics: only its position loop, because they include the attitude response."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class FittedParams(PyTree):
     model: Params
     """Parameters of the fitted model that the controller assumes."""
     angles: Array = leaf("parameter", 1)
-    """Ratio of commanded roll, pitch and yaw to the angles that the model settles at, 1. (3,)"""
+    """Ratio of commanded roll, pitch and yaw to the angles at which the model settles, 1. (3,)"""
     ahead: Array = leaf("parameter", 1)
-    """Parts of jerk, s, and snap, s^2, by which commands precede the setpoint, as attitudes follow late. (2,)"""
+    """Factors on jerk, s, and snap, s^2, that advance the attitude command to compensate the response's delay. (2,)"""
     position: PositionParams
     """Gains and limits of the position loop."""
 
@@ -36,8 +36,8 @@ class FittedParams(PyTree):
     def create(airframe: Airframe, dynamics: Dynamics, freq: int) -> FittedParams:
         """Return the shared parameters of an airframe.
 
-        The delay below the position loop is the larger one of the attitude's, damping over stiffness, and of the
-        thrust's, and 1.5 periods of the controller.
+        The delay below the position loop is the larger one of the attitude's delay, damping over stiffness, and the
+        thrust's delay, plus 1.5 periods of the controller.
 
         Args:
             airframe: The airframe.

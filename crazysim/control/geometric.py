@@ -41,9 +41,9 @@ class GeometricParams(RigidBodyParams):
     """Gains and parameters of geometric control, each shared or one per drone."""
 
     kr: Array = leaf("parameter", 1)
-    """Gain on position, N/m. (3,)"""
+    """Gain on the position error, N/m. (3,)"""
     kv: Array = leaf("parameter", 1)
-    """Gain on velocity, N s/m. (3,)"""
+    """Gain on the velocity error, N s/m. (3,)"""
     kR: Array = leaf("parameter", 1)
     """Gain on the rotation error, N m. (3,)"""
     kw: Array = leaf("parameter", 1)
@@ -71,7 +71,7 @@ class GeometricParams(RigidBodyParams):
 
 
 def bandwidth_gains(airframe: Airframe, rates: Bandwidth) -> dict[str, Any]:
-    """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` that give an airframe the rates of a bandwidth."""
+    """Return the gains ``kr``, ``kv``, ``kR`` and ``kw`` with which an airframe has the rates of a ``Bandwidth``."""
     mass, moments = airframe.value("rigid_body.mass", ()), np.diag(airframe.inertia)
     return {
         "kr": mass * rates.position**2,
@@ -97,8 +97,8 @@ def geometric_control(
     The controller of Lee, Leok and McClamroch (2010): a force from the errors of position and velocity,
     an attitude whose z axis is along that force, and a torque from the errors of rotation and body rates. The
     desired attitude, rates and angular acceleration belong to a drone whose thrust is that force and changes with jerk
-    and snap of the setpoint (``attitude_of_thrust``). The drag of the setpoint's velocity is compensated, with its
-    derivatives at the present attitude (Faessler, Franchi and Scaramuzza 2018). The rotors' limits are respected by
+    and snap of the setpoint (``attitude_of_thrust``). The drag at the setpoint's velocity and its derivatives are
+    compensated, at the current attitude (Faessler, Franchi and Scaramuzza 2018). The rotors' limits are respected by
     priority (``prioritized_wrench``), so a saturated drone keeps its attitude and the motors stay on.
 
     Args:
@@ -160,8 +160,8 @@ def attitude_torque(matrix: Array, ang_vel: Array, desired: Attitude, *, params:
 def attitude_errors(matrix: Array, ang_vel: Array, desired: Attitude) -> tuple[Array, Array, Array]:
     """Return rotation error, error of the body rates, and the desired angular acceleration, all in the body frame.
 
-    The rotation error is ``vee(R_d^T R - R^T R_d) / 2``, rad for small errors; the rates compare after rotation from
-    the desired frame into the body's.
+    The rotation error is ``vee(R_d^T R - R^T R_d) / 2``, rad for small errors. The desired rates are rotated from the
+    desired frame into the body frame before they are compared.
 
     Args:
         matrix: Rotation matrix R, body to world. (..., 3, 3)
@@ -192,11 +192,12 @@ class Geometric(Controller):
     gains: Gains = "bandwidth"
     """Rule for the gains, as for ``GeometricParams.create``."""
     feedforward: bool = True
-    """True to feed the derivatives of the setpoint forward; without, it is the law of AIMotionLab-Virtual."""
+    """True to feed the derivatives of the setpoint forward; False for the law of AIMotionLab-Virtual."""
     integral: float = 0.0
-    """Rate at which the integral of the position error takes up a constant force, 1/s: its gain over that on the
-    position, per axis. 0 for none, and no memory. Without delays the loop is stable below the ratio of ``kv`` to the
-    mass. Errors that alone would require more than ``MAX_INTEGRAL_RATIO`` are left out."""
+    """Rate at which the integral of the position error compensates a constant force, 1/s: the ratio of the integral
+    gain to the position gain on each axis. 0 for no integral and no memory. Without delays, the loop is stable below
+    the ratio of ``kv`` to the mass. Errors for which the position gain alone demands more than ``MAX_INTEGRAL_RATIO``
+    are not integrated."""
 
     def params(self, airframe: Airframe) -> GeometricParams:
         if not (np.isfinite(self.integral) and self.integral >= 0):

@@ -29,11 +29,11 @@ ROTOR_LEAD = 2.0
 """Factor by which the feedback of rotor speeds makes the rotors faster than their own lag, 1."""
 
 MAX_FEEDBACK_STEP = 0.5
-"""Largest part of the missing rotor speed that the feedback adds in one tick of the controller, 1."""
+"""Largest fraction of the missing rotor speed that the rotors make up in one tick of the controller, 1."""
 DISTURBANCE_MAX = 5.0
-"""Largest acceleration by a disturbance that is compensated along an axis, m/s^2: half of the weight."""
+"""Largest acceleration by a disturbance that is compensated along an axis, m/s^2: about half of gravity."""
 TORQUE_MAX = 0.5
-"""Largest torque by a disturbance that is compensated, as the rotation error against which it holds, rad."""
+"""Largest torque by a disturbance that is compensated, as the rotation error to which it is the response, rad."""
 
 
 class INDIParams(PyTree):
@@ -44,11 +44,11 @@ class INDIParams(PyTree):
     mixing_matrix: Array = leaf("parameter", 2)
     """Rotor thrusts to collective thrust, 1, and body torque, m. (4, n_rotors)"""
     lead: Array = leaf("parameter", 1)
-    """Factor on the difference of commanded and present rotor speeds, 1. (1,)"""
+    """Factor on the difference between commanded and current rotor speeds, 1. (1,)"""
     reaction: Array = leaf("parameter", 1, (1,))
     """Angular momentum of the rotors about body z over their drag torque, both as changes around hover, s. (1,)"""
     share: Array = leaf("parameter", 1, (1,))
-    """Part of the missing yaw torque that the rotors' drag is to give; the reaction to them gives the rest, 1. (1,)"""
+    """Fraction of the missing yaw torque demanded from rotor drag, 1; the reaction to spin-up gives the rest. (1,)"""
     filter: Array = leaf("parameter", 1)
     """Coefficients b0, a1, a2 of the low-pass filter. (3,)"""
 
@@ -80,7 +80,7 @@ class INDIParams(PyTree):
 
 
 class INDIMemory(PyTree):
-    """Memory of INDI: the velocities of the last tick, and the states of the filter."""
+    """Memory of INDI: velocity and angular momentum at the last tick, and the states of the filter."""
 
     vel: Array = leaf("drone", 1)
     """Velocity at the last tick, world frame, m/s. (n_worlds, n_drones, 3)"""
@@ -132,19 +132,20 @@ def indi_control(
 ) -> tuple[Array, INDIMemory]:
     """Return the rotor speeds that track a setpoint under unknown forces and torques, and the memory.
 
-    The loops are the same as in ``geometric_control``. Its models of force and torque are replaced by increments on
-    what the rotors exert at present (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the force):
+    The loops are the same as in ``geometric_control``. Its models of force and torque are replaced by increments of the
+    current force and torque of the rotors (Smeur, Chu and de Croon 2016 for the torque, Tal and Karaman 2018 for the
+    force):
 
         f = f_rotors + m (a_desired - a),   tau = tau_rotors + J (w'_desired - w')
 
     The disturbances ``m a - f_rotors - m g`` and ``J w' - tau_rotors`` are limited (``DISTURBANCE_MAX``,
-    ``TORQUE_MAX``), so that the rotors do not push against the floor under a drone that stands.
+    ``TORQUE_MAX``), so that the rotors of a drone that stands do not push against the floor.
 
     Acceleration a and angular acceleration w' are differences of the velocities over one tick. They and the force and
     torque of the rotors, from their measured speeds, pass through the same low-pass filter, so that their delays
-    cancel. Whatever the model leaves out, such as wind, a shifted load or a wrong mass, shows in a and w', and is
-    compensated. The rotors are driven beyond the commanded speed by ``params.lead`` times what is missing, which makes
-    them faster than their lag.
+    cancel. Effects that the model omits, such as wind, a shifted load or a wrong mass, appear in a and w', and are
+    compensated. The returned speed is the current speed plus ``params.lead`` times the difference to the desired speed,
+    which makes the rotors faster than their lag.
 
     Args:
         pos: Position, world frame, m. (..., 3)

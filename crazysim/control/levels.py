@@ -43,7 +43,7 @@ def command_size(control: Control, n_rotors: int) -> int:
 
 
 def count_rotors(rotors: Array | None, n: int) -> Array | int:
-    """Return the number of rotors of a drone, (..., 1), by the mask of those it has; ``n`` where there is no mask."""
+    """Return the number of rotors of a drone from the mask of those it has, (..., 1), or ``n`` without a mask."""
     return n if rotors is None else jnp.sum(jnp.where(rotors, 1.0, 0.0), axis=-1, keepdims=True)
 
 

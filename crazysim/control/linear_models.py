@@ -12,7 +12,7 @@ from crazysim import rotation
 from crazysim.rotation import cross, dot, matvec
 
 Model = Callable[[Array, Array], Array]
-"""State and input to the derivative of the state."""
+"""Function from a state and an input to the derivative of the state."""
 
 
 def drone_derivative(x: Array, u: Array, mass: Array, J: Array, gravity_vec: Array) -> Array:
@@ -45,14 +45,14 @@ def load_derivative(
 ) -> Array:
     """Return the derivative of the state of a drone with a point load on a rigid, massless rod.
 
-    The rod hangs by a joint without friction. At the centre of mass it exerts no torque on the drone. With the thrust
-    ``f`` and the unit vector q from joint to load (Sreenath, Lee and Kumar 2013):
+    The rod hangs from a frictionless joint. A joint at the centre of mass exerts no torque on the drone. With the
+    thrust ``f`` and the unit vector q from joint to load (Sreenath, Lee and Kumar 2013):
 
         m L q'' = q x (q x f) - m L |q'|^2 q
         (m + m_L) (v' - g) = f - m_L L q''
 
-    A joint at ``d`` from the centre of mass moves with the acceleration p'' of that point. With p_0'' as without the
-    rod, w_0' likewise, and the pull ``t q`` per mass of the load:
+    A joint at ``d`` from the centre of mass has the acceleration p''. Let v_0', w_0' and p_0'' be the accelerations
+    without the rod, and ``t q`` the pull of the rod on the drone, divided by the mass of the load:
 
         t (1 + m_L / m + m_L (d x q).J^-1 (d x q)) = q.(g - p_0'') + L |q'|^2
         L q'' = g - t q - p'',   v' = v_0' + m_L / m t q,   w' = w_0' + m_L t J^-1 (d x q)
@@ -94,7 +94,7 @@ def load_derivative(
         pull = along / (1 + load_mass / mass + load_mass * dot(lever, turn))
         acc, ang_acc = acc + load_mass / mass * pull * q, ang_acc + load_mass * pull * turn
         q_acc = (gravity_vec - pull * q - joint_acceleration(acc, ang_acc)) / length
-    # q'' = J a'' + J' a': the columns of J are orthogonal, so the angles' accelerations are two projections.
+    # q'' = D a'' + D' a' with D = dq/da: its columns are orthogonal, so the angles' accelerations are two projections.
     slope, slope_rate = jax.jvp(jax.jacfwd(rod_direction), (angles,), (rates,))
     rest = q_acc - slope_rate @ rates
     angles_acc = slope.T @ rest / jnp.sum(slope * slope, axis=0)
@@ -110,7 +110,7 @@ def rod_direction(angles: Array) -> Array:
 def rod_angles(direction: Array, direction_rate: Array) -> tuple[Array, Array]:
     """Return the angles a, b of a rod, rad, and their rates, rad/s; the inverse of ``rod_direction``.
 
-    Finite everywhere: where the rod is level along y, b is zero and its rate is limited.
+    The result is finite everywhere: where the rod is level along y, b is zero and the rates are limited.
 
     Args:
         direction: Unit vector from drone to load. (..., 3)

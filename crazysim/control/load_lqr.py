@@ -135,13 +135,13 @@ def load_gain(
 def load_reference(
     setpoint: Setpoint, params: LoadLQRParams, rod_jerk: Array | None = None
 ) -> tuple[Reference, Array, Array]:
-    """Return the motion of the drone that carries a load along a setpoint, and direction and rate of the rod.
+    """Return the motion of a drone that carries a load along a setpoint, and the direction of the rod and its rate.
 
-    The rod pulls the load along its specific force, ``q = -(a_L - g) / |a_L - g|``, so the drone is at ``r_L - L q``,
-    and its thrust is ``f = (m + m_L)(a_L - g) - m L q_tt``, plus the drag of a level drone. The body rates follow from
-    ``f_t = (m + m_L) j_L - m L q_ttt``, in which the last term needs the fifth derivative of the load's position: more
-    than a setpoint has. A joint off the centre of mass shifts the drone, and the load's pull adds a torque; the
-    acceleration of the joint relative to the centre of mass is neglected.
+    The rod pulls the load along its specific force, ``q = -(a_L - g) / |a_L - g|``, so the drone is at ``r_L - L q``.
+    Its thrust is ``f = (m + m_L)(a_L - g) - m L q_tt``, and compensates the drag of a level drone too. The body rates
+    follow from ``f_t = (m + m_L) j_L - m L q_ttt``, whose last term needs the fifth derivative of the load's position,
+    which a setpoint does not have. A joint away from the centre of mass shifts the drone, and the load's pull adds a
+    torque; the acceleration of the joint relative to the centre of mass is neglected.
 
     Args:
         setpoint: Setpoint of the load.
@@ -165,7 +165,7 @@ def load_reference(
 
 
 def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Reference, Array, Array]:
-    """Return the reference of a setpoint of the drone, with a load that hangs as if its acceleration were constant.
+    """Return the reference for a setpoint of the drone, with a load that hangs as if its acceleration were constant.
 
     Args:
         setpoint: Setpoint of the drone.
@@ -183,7 +183,7 @@ def hanging_reference(setpoint: Setpoint, params: LoadLQRParams) -> tuple[Refere
 
 
 def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, Array]:
-    """Return the joint of the rod from the centre of mass, m, and its velocity relative to that, m/s. (..., 3) each"""
+    """Return position, m, and velocity, m/s, of the joint relative to the centre of mass, world frame. (..., 3) each"""
     attach = jnp.broadcast_to(attach, ang_vel.shape)
     return matvec(matrix, attach), matvec(matrix, cross(ang_vel, attach))
 
@@ -191,7 +191,7 @@ def _joint_motion(matrix: Array, ang_vel: Array, attach: Array) -> tuple[Array, 
 def _reference(pos: Array, vel: Array, force: Array, rate: Array, sp: Setpoint, p: LoadLQRParams) -> Reference:
     """Return the reference of a drone whose thrust vector is ``force``, N, with the derivative ``rate``, N/s.
 
-    The torque holds against a load that accelerates as the setpoint does, at the joint of the rod.
+    The torque includes compensation for the pull at the joint of a load that accelerates like the setpoint.
     """
     total = p.mass + p.load_mass
     attitude = attitude_of_thrust(force / total, rate / total, sp.snap, sp.yaw, sp.yaw_rate, sp.yaw_acc)
@@ -250,7 +250,7 @@ def load_lqr_control(
 
 
 class LoadLQRMemory(PyTree):
-    """Memory of the LQR with load: a derivative at the last tick, whose difference gives the next one."""
+    """Memory of the LQR with load: a derivative at the last tick, of which a difference gives the next derivative."""
 
     rod_acc: Array = leaf("drone", 1)
     """Second derivative of the direction of the rod at the last tick, 1/s^2. (n_worlds, n_drones, 3)"""

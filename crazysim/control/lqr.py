@@ -64,13 +64,13 @@ def lqr_weights(
     load_mass: float = 0.0,
     length: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights Q (n, n) and R (4, 4): as given, or suited to an airframe's bandwidth.
+    """Return the weights Q (n, n) and R (4, 4): the given ones, or weights that suit an airframe's bandwidth.
 
-    Bryson's rule: each weight is one over the square of an acceptable error. An error of position of 1 m counts as
-    much as the velocity, the tilt, the body rates, the thrust and the torque that the rule of
-    ``crazysim.control.bandwidth`` would give it: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural frequency
-    w of the position and the attitude stiffness k. Yaw counts as roll and pitch. The angle of a rod with a load counts
-    as a shift of the load: 1 m of position is 1 / length rad, and its rate as the natural frequency times that.
+    The default follows Bryson's rule: each weight is one over the square of an acceptable error. The acceptable
+    position error is 1 m. The acceptable velocity, tilt, body rates, thrust and torque are the values with which the
+    rule of ``crazysim.control.bandwidth`` would answer it: w, w^2 / g, w^3 / g, m w^2 and J k w^2 / g, with the natural
+    frequency w of the position loop and the attitude stiffness k. Yaw has the same value as roll and pitch. The
+    acceptable angle of a rod shifts its load by 1 m, which is 1 / length rad; the acceptable rate is w times as much.
 
     Args:
         airframe: The airframe.
@@ -182,7 +182,7 @@ def state_error(
 ) -> Array:
     """Return the errors of position, velocity, rotation and body rates. (..., 12)
 
-    The rotation error is ``vee(R_d^T R - R^T R_d) / 2``: near hover the errors of roll, pitch and yaw.
+    The rotation error is ``vee(R_d^T R - R^T R_d) / 2``; near hover these are the errors of roll, pitch and yaw.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -207,7 +207,7 @@ def state_error(
 
 
 def to_heading_frame(vector: Array, yaw: Array) -> Array:
-    """Return a world vector in the frame that is turned by the yaw about z. (..., 3)"""
+    """Return the components of a world vector in the frame that is turned by the yaw about z. (..., 3)"""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = vector[..., :1], vector[..., 1:2], vector[..., 2:]
     return jnp.concatenate([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
@@ -217,7 +217,7 @@ def lqr_control(pos: Array, quat: Array, vel: Array, ang_vel: Array, setpoint: S
     """Return the wrench of the LQR about hover, with the wrench of the setpoint's motion as feed-forward.
 
     ``u = u_ref - K e``. Errors of position and velocity are taken in the frame of the desired heading, so that one gain
-    serves every yaw, and reference attitude, rates and wrench come from flatness (``flat_reference``).
+    serves every yaw. Reference attitude, rates and wrench come from flatness (``flat_reference``).
 
     Args:
         pos: Position, world frame, m. (..., 3)

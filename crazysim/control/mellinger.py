@@ -1,4 +1,4 @@
-"""Mellinger's controller as the Crazyflie firmware flies it today."""
+"""Mellinger's controller as implemented in the Crazyflie firmware."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class MellingerParams(PyTree):
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
     kp: Array = leaf("parameter", 1)
-    """Gain on position, N/m. (3,)"""
+    """Gain on the position error, N/m. (3,)"""
     kd: Array = leaf("parameter", 1)
-    """Gain on velocity, N s/m. (3,)"""
+    """Gain on the velocity error, N s/m. (3,)"""
     ki: Array = leaf("parameter", 1)
-    """Gain on the integral of position, N/(m s). (3,)"""
+    """Gain on the integral of the position error, N/(m s). (3,)"""
     integral_max: Array = leaf("parameter", 1)
-    """Limit of the integral of position, m s. (3,)"""
+    """Limit of the integral of the position error, m s. (3,)"""
     kR: Array = leaf("parameter", 1)
     """Gain on the rotation error, PWM. (3,)"""
     kw: Array = leaf("parameter", 1)
@@ -148,9 +148,9 @@ def torque_of_rotation(
 
 
 class Mellinger(Controller):
-    """The firmware's controller after Mellinger and Kumar (2011), position part included, at one rate.
+    """The firmware's controller after Mellinger and Kumar (2011), position and attitude parts at one rate.
 
-    Unlike Crazyflow's cascade, which descends from it, it lowers all motors where one would exceed its maximum, has no
+    Unlike Crazyflow's cascade, which is derived from it, it lowers all motors if one would exceed its maximum, has no
     minimum PWM, resets its integrals at zero thrust, and runs the position part at the rate of the attitude part. The
     firmware's version has no rate mode: use ``controller="pid"`` for body rates. At the level ``state`` the desired
     body rates come from the command, ``cmd[13:16]``; a ``Setpoint`` has none. Source: controller_mellinger.c
@@ -163,7 +163,7 @@ class Mellinger(Controller):
     freq: int = 500
     """Rate, Hz (``ATTITUDE_RATE``)."""
     whole_numbers: bool = False
-    """True to truncate torque and PWM to integers where the firmware does; gradients are those without."""
+    """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 
     def params(self, airframe: Airframe) -> MellingerParams:
         return MellingerParams.create(airframe)
@@ -191,7 +191,7 @@ class Mellinger(Controller):
         params: MellingerParams,
         rotor_vel: Array,
     ) -> MellingerMemory:
-        # The integrals continue the present force and torque as far as their limits allow.
+        # The integrals are set to continue the current force and torque, as far as their limits allow.
         p, s = params, data.states
         rates = _desired_rates(data, command)
         zero = jnp.zeros_like(s.ang_vel)

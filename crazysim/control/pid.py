@@ -36,9 +36,9 @@ class PID(Controller):
     """The firmware's default controller: PID loops for position, velocity, attitude and body rates.
 
     At the level ``state`` it follows position and yaw, as the firmware does with a full-state setpoint: velocity and
-    acceleration are not fed forward. At the level ``body_rate`` rates are followed and nothing levels the drone, which
-    the literature calls CTBR. Source: controller_pid.c, position_controller_pid.c, attitude_pid_controller.c and pid.c
-    of bitcraze/crazyflie-firmware, commit 2a18fc29.
+    acceleration are not fed forward. At the level ``body_rate`` it follows only rates and does not level the drone:
+    CTBR (collective thrust and body rates) in the literature. Source: controller_pid.c, position_controller_pid.c,
+    attitude_pid_controller.c and pid.c of bitcraze/crazyflie-firmware, commit 2a18fc29.
     """
 
     name: ClassVar[str] = "pid"
@@ -50,9 +50,10 @@ class PID(Controller):
     """Rate of the position and velocity loops, Hz (``POSITION_RATE``)."""
     hold_yaw: bool = False
     """True if a commanded yaw rate moves a yaw angle that the attitude loop holds, as in the firmware. That loop acts
-    on Euler angles, so it disturbs the rates of a drone that is tilted far. False: the rate loop follows it."""
+    on Euler angles, so it disturbs the rates of a strongly tilted drone. If False, the rate loop follows the yaw rate
+    directly."""
     whole_numbers: bool = False
-    """True to truncate torque and PWM to integers where the firmware does; gradients are those without."""
+    """True to truncate torque and PWM to integers where the firmware does; gradients ignore the truncation."""
 
     def params(self, airframe: Airframe) -> PIDParams:
         return PIDParams.create(airframe, self.outer_freq, self.freq)
@@ -90,8 +91,8 @@ class PID(Controller):
     def take_over(
         self, data: DroneData, command: Setpoint | Array, memory: PIDMemory, params: PIDParams, rotor_vel: Array
     ) -> PIDMemory:
-        # At the level ``state`` the integrals of the velocity loop take up the difference of thrust, roll and pitch,
-        # and the integrals of the rate loop at every level the difference of torque.
+        # At the level ``state``, the integrals of the velocity loop absorb the difference in thrust, roll and pitch.
+        # At every level, the integrals of the rate loop absorb the difference in torque.
         s, p, rest = data.states, params, jax.tree.map(jnp.zeros_like, memory)
         rpy, ang_vel = DEGREES_PER_RADIAN * rotation.to_rpy(s.quat), DEGREES_PER_RADIAN * s.ang_vel
         thrust, torque = command_of_rotor_vel(rotor_vel, params=p.motors)

@@ -35,9 +35,9 @@ class PIDParams(PyTree):
     """Gains and limits of the cascade, each shared or one per drone. Angles are in degrees, as in the firmware."""
 
     position: PIDLoop
-    """Position loop, along and across the present yaw, m to m/s."""
+    """Position loop, along and across the current heading and up, m to m/s."""
     velocity: PIDLoop
-    """Velocity loop, along and across the present yaw: m/s to pitch and roll, degrees, and thrust, 1000 PWM."""
+    """Velocity loop, along and across the heading and up: m/s to pitch and roll, degrees, and thrust, 1000 PWM."""
     attitude: PIDLoop
     """Attitude loop, degrees to degrees/s."""
     rate: PIDLoop
@@ -45,7 +45,7 @@ class PIDParams(PyTree):
     tilt_max: Array = leaf("parameter", 1)
     """Limits of the desired roll and pitch, degrees. (2,)"""
     thrust_base: Array = leaf("parameter", 1, (1,))
-    """Thrust that the velocity loop adds to, about the thrust of hover, PWM. (1,)"""
+    """Thrust to which the output of the velocity loop is added, roughly the hover thrust, PWM. (1,)"""
     thrust_min: Array = leaf("parameter", 1, (1,))
     """Minimum thrust of the velocity loop, PWM. (1,)"""
     motors: PowerDistributionParams
@@ -97,7 +97,7 @@ class PIDMemory(PyTree):
 def desired_velocity(
     pos: Array, heading: Array, pos_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Return the desired velocity, along and across the heading and up, and the memory: the position loop.
+    """Run the position loop: return the desired velocity, along and across the heading and up, and the memory.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -117,7 +117,7 @@ def desired_velocity(
 def desired_attitude(
     vel: Array, heading: Array, vel_des: Array, memory: PIDLoopMemory, freq: float, *, params: PIDParams
 ) -> tuple[Array, Array, PIDLoopMemory]:
-    """Return the desired roll, pitch and thrust, and the memory: the velocity loop.
+    """Run the velocity loop: return the desired roll and pitch, the thrust, and the memory.
 
     Args:
         vel: Velocity, world frame, m/s. (..., 3)
@@ -140,7 +140,7 @@ def desired_attitude(
 def desired_rates(
     rpy: Array, rpy_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Return the desired body rates, degrees/s, and the memory: the attitude loop, on Euler angles.
+    """Run the attitude loop, on Euler angles: return the desired body rates, degrees/s, and the memory.
 
     Args:
         rpy: Roll, pitch, yaw, degrees. (..., 3)
@@ -155,7 +155,7 @@ def desired_rates(
 def desired_torque(
     ang_vel: Array, ang_vel_des: Array, memory: PIDLoopMemory, freq: float, *, loop: PIDLoop
 ) -> tuple[Array, PIDLoopMemory]:
-    """Return the torque that follows body rates, PWM, and the memory: the rate loop.
+    """Run the rate loop: return the torque that follows the desired body rates, PWM, and the memory.
 
     Args:
         ang_vel: Angular velocity, body frame, degrees/s. (..., 3)
@@ -169,7 +169,7 @@ def desired_torque(
 
 
 def to_heading_frame(heading: Array, vector: Array) -> Array:
-    """Return a world vector along the heading, across it to the left, and up. (..., 3)
+    """Return the components of a world vector along the heading, to the left of it, and up. (..., 3)
 
     Args:
         heading: Cosine and sine of the yaw. (..., 2)
@@ -180,7 +180,7 @@ def to_heading_frame(heading: Array, vector: Array) -> Array:
 
 
 def heading_vector(quat: Array) -> Array:
-    """Return cosine and sine of the yaw of an attitude; one and zero where it points straight up or down. (..., 2)"""
+    """Return cosine and sine of an attitude's yaw; one and zero where body x points straight up or down. (..., 2)"""
     x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
     ahead = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
     return rotation.safe_normalize(ahead, jnp.asarray([1.0, 0.0], quat.dtype))

@@ -21,7 +21,8 @@ DEFAULT_INTEGRAL_MAX = 5000.0
 class PIDLoop(PyTree):
     """Gains and limits of three PID loops, each shared or one per drone.
 
-    A gain that is zero in all three loops is None, and its part of the loop and of the memory is omitted.
+    An integral or derivative gain that is zero in all three loops is None, and its part of the loop and of the memory
+    is omitted.
     """
 
     kp: Array = leaf("parameter", 1)
@@ -39,7 +40,7 @@ class PIDLoop(PyTree):
 
     @staticmethod
     def create(airframe: Airframe, path: str, freq: float) -> PIDLoop:
-        """Return the loops of a table of an airframe, run at a rate, Hz."""
+        """Return the loops in an airframe's table at ``path``, for loops that run at ``freq`` Hz."""
         table = airframe.table(path)
         gains = {key: airframe.value(f"{path}.{key}", (3,)) for key in ("kp", "ki", "kd")}
         ki, kd = (as_parameter(gains[key]) if np.any(gains[key]) else None for key in ("ki", "kd"))
@@ -56,14 +57,14 @@ class PIDLoop(PyTree):
 
 
 class PIDLoopMemory(PyTree):
-    """Memory of three PID loops; None where the loops have no such part."""
+    """Memory of three PID loops; a field is None where the loops have no such part."""
 
     integral: Any = leaf("drone", 1)
     """Integrals of the error, input s. (n_worlds, n_drones, 3)"""
     measured: Any = leaf("drone", 1)
     """Measured values at the last tick. (n_worlds, n_drones, 3)"""
     delays: Any = leaf("drone", 2)
-    """The two last internal values of the filter of the derivative. (n_worlds, n_drones, 2, 3)"""
+    """Last two internal values of the filter of the derivative, latest first. (n_worlds, n_drones, 2, 3)"""
 
     @staticmethod
     def at_rest(loop: PIDLoop) -> PIDLoopMemory:
@@ -75,17 +76,17 @@ class PIDLoopMemory(PyTree):
         )
 
     def started_at(self, measured: Array, started: Array) -> PIDLoopMemory:
-        """Return the memory in which the last measured values are given ones, where the loop has not started. (3,)"""
+        """Return the memory with ``measured`` (3,) as the last measured values where the loop has not started."""
         if self.measured is None:
             return self
         return self.replace(measured=jnp.where(started, self.measured, measured))
 
     def reset_where(self, mask: Array, measured: Array, filters: bool = True) -> PIDLoopMemory:
-        """Return the memory with zero integrals and given last measured values in loops of a mask.
+        """Return the memory, with zero integrals and new last measured values where a mask is True.
 
         Args:
-            mask: True where the loop is reset. (1,)
-            measured: Measured values. (3,)
+            mask: True where the loops are reset. (1,)
+            measured: New last measured values. (3,)
             filters: True to reset the filter of the derivative too.
         """
         return PIDLoopMemory(
@@ -139,12 +140,12 @@ def pid_step(
 
 
 def continue_integral(memory: PIDLoopMemory, out: Array, wanted: Array, *, loop: PIDLoop) -> PIDLoopMemory:
-    """Return the memory with integrals that turn the outputs of a tick into wanted ones, within their limits.
+    """Return the memory with integrals, within their limits, that turn the outputs of a tick into desired ones.
 
     Args:
         memory: Memory of the loops.
         out: Outputs with this memory. (3,)
-        wanted: Wanted outputs. (3,)
+        wanted: Desired outputs. (3,)
         loop: Gains and limits.
     """
     integral_max: Any = loop.integral_max
@@ -163,7 +164,7 @@ def _low_pass(sample: Array, delays: Array, coefficients: Array) -> tuple[Array,
 
 
 def _wrap_angle(angle: Array, wrapped: Sequence[bool]) -> Array:
-    """Return angles beyond 180 degrees one revolution less, and those below -180 degrees one more, where wrapped."""
+    """Return angles, where ``wrapped``, less one turn above 180 degrees and plus one turn below -180 degrees."""
     if not any(wrapped):
         return angle
     mask = jnp.asarray(wrapped)

@@ -18,15 +18,15 @@ POSITION_RATE_RATIO = 0.4
 OBSERVER_RATE_RATIO = 1.5
 """Rate of the estimate of unknown forces times the same delay, 1."""
 MAX_THRUST_SHARE = 0.9
-"""Part of the largest thrust that the feedback uses, 1; the rest is for the attitude."""
+"""Fraction of the largest thrust that the feedback uses, 1; the rest is for the attitude."""
 MAX_HORIZONTAL_RATIO = 1.0
 """Largest horizontal acceleration by feedback over gravity, 1: a tilt of 45 degrees."""
 MAX_FALL_RATIO = 0.5
-"""Largest downward acceleration by feedback over gravity, 1: rotors keep half of their thrust to turn with."""
+"""Largest downward acceleration by feedback over gravity, 1: half of the hover thrust remains to turn the drone."""
 MIN_UPWARD_RATIO = 0.1
 """Upward force of the rotors over the weight that keeps a falling drone upright, 1; idle rotors give twice that."""
 MIN_FEEDBACK_RATIO = 0.1
-"""Least acceleration that the feedback may use over gravity, 1, for drones that can hardly lift themselves."""
+"""Lower bound on the upward and horizontal limits of the feedback over gravity, 1, for drones with little lift."""
 MAX_DISTURBANCE_RATIO = 0.5
 """Largest compensated acceleration by unknown forces along an axis, over gravity, 1."""
 
@@ -45,15 +45,16 @@ class PositionParams(PyTree):
     acc_max: Array = leaf("parameter", 1)
     """Largest acceleration by feedback, horizontal, up and down, m/s^2. (3,)"""
     observer: Array = leaf("parameter", 1, (1,))
-    """Part of a new measurement in the estimate of unknown forces, 1. (1,)"""
+    """Weight of a new measurement in the estimate of unknown forces, 1. (1,)"""
 
     @staticmethod
     def create(airframe: Airframe, delay: float, freq: int) -> PositionParams:
         """Return the shared parameters of an airframe.
 
-        The loop is critically damped at the natural frequency ``POSITION / delay``. Feedback accelerates no more than
-        the rotors can while they carry the drone. The position error counts up to twice the distance at which it alone
-        requires that, so that a far setpoint is approached at a limited speed from which the drone can stop.
+        The loop is critically damped at the natural frequency ``POSITION_RATE_RATIO / delay``. Its acceleration is
+        limited to what the rotors can give while they carry the drone. The position error is limited to twice the
+        distance that alone demands this acceleration, so that the drone approaches a distant setpoint at a speed from
+        which it can stop.
 
         Args:
             airframe: The airframe.
@@ -100,10 +101,10 @@ def specific_force(
 ) -> tuple[Array, PositionMemory]:
     """Return the specific force that leads to a setpoint, and the memory.
 
-    The difference between the velocity and the one expected from the known forces, over one tick, is a measurement of
-    the unknown ones. It is limited (``MAX_DISTURBANCE_RATIO``) and then filtered, so that the estimate does not wind up
-    while a drone is held, or when it is moved by hand or by a reset. A drone at rest is one that the floor holds:
-    forces along the floor are not measured, as they would tilt it further.
+    The difference between the velocity and the velocity expected from the known forces, divided by one tick, measures
+    the unknown forces. It is limited (``MAX_DISTURBANCE_RATIO``) and then filtered, so that the estimate does not wind
+    up while a drone is held, or when it is moved by hand or by a reset. A drone whose velocity is exactly zero is taken
+    to stand on the floor: horizontal forces are not measured then, because compensating them would tilt it further.
 
     Args:
         pos: Position, world frame, m. (..., 3)
@@ -136,9 +137,9 @@ def specific_force(
 def keep_upright(specific: Array, setpoint: Setpoint, params: PositionParams) -> Array:
     """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
 
-    Where feedback, drag and estimates cancel the weight, as in a fall, the sum points anywhere. A small upward
-    force is kept, which most rotors give in any case. A setpoint that accelerates downward by more than gravity does
-    turn the drone over: what it needs beyond gravity lowers the limit twice.
+    Where feedback, drag and estimates cancel the weight, as in a fall, the sum may point in any direction. A small
+    upward force is kept, which most rotors give in any case. A setpoint that accelerates downward by more than gravity
+    does turn the drone over: the limit is lowered by twice the excess over gravity.
 
     Args:
         specific: Specific force of the rotors, world frame, m/s^2. (..., 3)
@@ -151,11 +152,11 @@ def keep_upright(specific: Array, setpoint: Setpoint, params: PositionParams) ->
 
 
 def _limit_length(x: Array, limit: Array) -> Array:
-    """Return a vector shortened to a length. (..., n)"""
+    """Return a vector, shortened where it is longer than a limit. (..., n)"""
     norm = safe_norm(x)
     return x * jnp.where(norm > limit, limit / jnp.where(norm > limit, norm, 1.0), 1.0)
 
 
 def _join_height(horizontal: Array, height: Array) -> Array:
-    """Return the vector of its horizontal part and its height. (..., 3)"""
+    """Return the vector with a horizontal and a vertical part. (..., 3)"""
     return jnp.concatenate([horizontal, height], axis=-1)

@@ -62,15 +62,15 @@ def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams,
     Where a motor would exceed its maximum, all motors are lowered by the largest excess, which keeps the torque at the
     expense of thrust. Then negative PWM is raised to zero, the firmware's default idle thrust. A thrust of zero or less
     switches the motors off. Source: ``powerDistributionLegacy`` and ``powerDistributionCap`` in
-    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29. It keeps the torque, half of it for
-    roll and pitch, and the PWM as integers. Without that, the PWM differs by less than 4, and by less than 5 where a
-    motor is at its maximum.
+    power_distribution_quadrotor.c of bitcraze/crazyflie-firmware, commit 2a18fc29. The firmware truncates the torque,
+    half of it for roll and pitch, and the PWM to integers. Without truncation, the PWM differs by less than 4, and by
+    less than 5 where a motor is at its maximum.
 
     Args:
         thrust: Thrust of each motor, PWM. (..., 1)
         torque: Torque about the body axes, PWM. (..., 3)
         params: Parameters, shared or with the leading axes of the command.
-        whole_numbers: True to truncate to integers where the firmware does; the gradient is that without.
+        whole_numbers: True to truncate to integers where the firmware does; the gradient ignores the truncation.
 
     Returns:
         PWM of each motor. (..., n_rotors)
@@ -81,7 +81,7 @@ def distribute(thrust: Array, torque: Array, *, params: PowerDistributionParams,
         pwm = truncate(thrust + jnp.sum(shares, axis=-1))
     else:
         pwm = thrust + matvec(p.torque_allocation, torque)
-    # The gradient of jnp.max divides by the number of equal elements, which is zero where XLA rounds a copy otherwise.
+    # The gradient of jnp.max divides by the number of equal elements, which is zero if XLA rounds a copy differently.
     highest = functools.reduce(jnp.maximum, [pwm[..., i : i + 1] for i in range(pwm.shape[-1])])
     excess = highest - p.pwm_max
     pwm = pwm - jnp.where(excess > 0, excess, 0.0)
@@ -108,14 +108,14 @@ def rotor_vel_of_pwm(pwm: Array, *, params: PowerDistributionParams) -> Array:
 
 
 def pwm_of_thrust(thrust: Array, *, params: PowerDistributionParams) -> Array:
-    """Return the PWM of each motor at which all together give a collective thrust, N. (..., 1)"""
+    """Return the PWM of each motor at which all motors together give a collective thrust in N. (..., 1)"""
     p = params
     n_rotors = count_rotors(p.rotors, p.torque_allocation.shape[-2])
     return thrust * (p.pwm_max / (n_rotors * p.thrust_max))
 
 
 def command_of_rotor_vel(rotor_vel: Array, *, params: PowerDistributionParams) -> tuple[Array, Array]:
-    """Return the thrust of each motor (..., 1) and the torque (..., 3) that lead to rotor speeds, PWM.
+    """Return the thrust per motor (..., 1) and the torque (..., 3), both in PWM, that lead to given rotor speeds.
 
     Args:
         rotor_vel: Rotor speeds, rpm. (..., n_rotors)

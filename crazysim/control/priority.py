@@ -13,13 +13,13 @@ from crazysim.control.levels import mask_rotors
 from crazysim.rotation import matvec, safe_clip
 
 UNLIMITED_THRUST = 1e9
-"""Collective thrust beyond any rotor's limit, N."""
+"""Collective thrust beyond the limits of any rotors, N."""
 
 
 def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
-    """Return a wrench that every rotor can give, from a desired one by the priority of ``prioritized_thrusts``.
+    """Return the wrench within the limits of the rotors for a desired one, by the priority of ``prioritized_thrusts``.
 
-    A wrench that every rotor can give, with its yaw torque either way, is returned unchanged.
+    A wrench that every rotor can give, with its yaw torque in either direction, is returned unchanged.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
@@ -35,17 +35,17 @@ def prioritized_wrench(wrench: Array, *, params: AllocationParams) -> Array:
 def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
     """Return the thrusts within the limits of the rotors that give a desired wrench by priority, N. (..., n_rotors)
 
-    ``force_torque2rotor_vel`` clips each rotor on its own, which changes the torque. Roll and pitch decide where the
-    thrust points and yaw does not, so that order of priority keeps a saturated drone stable (Faessler, Falanga and
-    Scaramuzza 2017): roll and pitch torque are scaled down only if no collective thrust makes room for
-    them, the collective thrust is moved to where they fit, and the yaw torque gets the rest: what every rotor can give
-    either way. Rotors are never switched off.
+    ``force_torque2rotor_vel`` clips each rotor on its own, which changes the torque. Roll and pitch determine the
+    direction of the thrust and yaw does not, so this order of priority keeps a saturated drone stable (Faessler,
+    Falanga and Scaramuzza 2017). Roll and pitch torque are scaled down only if no collective thrust makes room for
+    them, the collective thrust is moved to where they fit, and the yaw torque is limited to the remaining room that
+    every rotor has in both directions. Rotors are never switched off.
 
     Roll and pitch torque raise the collective thrust up to the weight at most. Rotors that could carry ten times the
     weight would otherwise throw the drone up as long as they turn it.
 
-    If all rotors carry the same part of the collective thrust, and the weight does not limit it, roll and pitch torque
-    keep the largest scale that fits, otherwise one that is at most as large.
+    If all rotors carry the same fraction of the collective thrust, and the weight does not limit it, the scale of roll
+    and pitch torque is the largest that fits; otherwise it may be smaller.
 
     Args:
         wrench: Collective thrust, N, and body torque, N m. (..., 4)
@@ -57,18 +57,19 @@ def prioritized_thrusts(wrench: Array, *, params: AllocationParams) -> Array:
 
 
 def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, Array, Array]:
-    """Return collective thrust, scale of the tilt torque, yaw torque over its arm, and what the tilt torque needs.
+    """Return collective thrust, scale of the tilt torque, yaw torque over its arm, and thrusts for the tilt torque.
 
-    The last is the thrust that each rotor adds for it, as collective thrust, N. (..., n_rotors)
+    The last are the thrusts that the rotors add for the unscaled tilt torque, each divided by the rotor's share of the
+    collective thrust, N. (..., n_rotors)
     """
     p = params
-    lift = mask_rotors(p.rotors, p.allocation_matrix[..., 0], 1.0)  # of each rotor per collective thrust, positive
+    lift = mask_rotors(p.rotors, p.allocation_matrix[..., 0], 1.0)  # rotor thrust per collective thrust, positive
     turn = _reduce_rotors(
         jnp.maximum, jnp.abs(p.allocation_matrix[..., 3] / lift)
-    )  # the most per yaw torque over its arm
+    )  # largest collective thrust per yaw torque over its arm
     ratio = matvec(p.allocation_matrix[..., 1:3] / lift[..., None] / p.arms[..., None, :2], wrench[..., 1:3])
 
-    # Rotor i allows collective thrusts F with low <= lift_i (F + s ratio_i) <= high; one that a drone lacks, any.
+    # Rotor i allows collective thrusts F with low <= lift_i (F + s ratio_i) <= high. A masked rotor allows any F.
     least = mask_rotors(p.rotors, p.thrust_min / lift, -UNLIMITED_THRUST)
     most = mask_rotors(p.rotors, p.thrust_max / lift, UNLIMITED_THRUST)
     still_low, still_high = _reduce_rotors(jnp.maximum, least), _reduce_rotors(jnp.minimum, most)
@@ -87,9 +88,9 @@ def _prioritize(wrench: Array, params: AllocationParams) -> tuple[Array, Array, 
 
 
 def _reduce_rotors(function: Callable[[Array, Array], Array], x: Array) -> Array:
-    """Return the largest or smallest entry, rotor by rotor. (..., 1)
+    """Return the largest or smallest entry over the rotors, by pairwise comparisons. (..., 1)
 
     The gradient of ``jnp.max`` divides by the number of entries that equal the result. Where XLA computes the entries
-    twice, with different rounding, that may be none.
+    twice, with different rounding, that number may be zero.
     """
     return functools.reduce(function, [x[..., k : k + 1] for k in range(x.shape[-1])])

@@ -93,7 +93,7 @@ class Controller:
     inner: Controller | None = None
     """Controller that follows the commands of this one; None where the allocation, rotors or fitted dynamics do."""
     follows_feedforward: ClassVar[bool] = True
-    """False if the state command is all that it follows, without ``feedforward``, which is then an error."""
+    """Whether it follows the ``feedforward`` of a state command; if False, a command with feedforward is an error."""
     follows_rates: ClassVar[bool] = False
     """True if it follows an attitude command together with ``data.controls.attitude.staged_ang_vel_des``."""
 
@@ -113,7 +113,7 @@ class Controller:
         """Return gains and constants for an airframe, in a record of leaves of scope ``parameter``, or None.
 
         Raises:
-            ConfigError: If the airframe lacks one.
+            ConfigError: If the airframe lacks a value that the controller needs.
         """
         return None
 
@@ -138,8 +138,8 @@ class Controller:
         Args:
             data: ``SimData`` of one drone, with the command in force in ``data.controls``; body rates of a state
                 command, which a ``Setpoint`` lacks, are ``data.controls.state.cmd[13:16]``.
-            command: Setpoint at the level ``state``; otherwise the command in force of the level that it follows, which
-                is ``data.controls.mode`` or the output of the controller whose ``inner`` it is. (4,)
+            command: Setpoint at the level ``state``; otherwise the command in force at the level that the controller
+                follows: ``data.controls.mode``, or the output of the controller whose ``inner`` it is. (4,)
             memory: Memory of the drone.
             params: Parameters of the drone.
 
@@ -150,14 +150,15 @@ class Controller:
         raise NotImplementedError(f"controller {self.name!r} does not define update")
 
     def take_over(self, data: DroneData, command: Setpoint | Array, memory: Any, params: Any, rotor_vel: Array) -> Any:
-        """Return the memory with which the controller starts to command a drone in flight, in place of another one.
+        """Return the memory with which the controller takes over a drone in flight from another controller.
 
-        By default the memory of when it was last active. Override it to make the first command continue the last.
+        By default it is the memory from when the controller was last active. Override this method to make the first
+        command continue the last command of the other controller.
 
         Args:
             data: ``SimData`` of one drone.
             command: Setpoint or command, as in ``update``.
-            memory: Memory of when the controller was last active.
+            memory: Memory from when the controller was last active.
             params: Parameters of the drone.
             rotor_vel: Rotor speeds that the other controller commanded last, rpm. (n_rotors,)
         """
@@ -174,7 +175,7 @@ class Controller:
 
     @property
     def members(self) -> tuple[Controller, ...]:
-        """The controllers that take turns: this one."""
+        """Controllers that take turns; by default only this one."""
         return (self,)
 
     @property

@@ -1,4 +1,4 @@
-"""Algebraic Riccati equations by structure-preserving doubling: inside jit, differentiable, in either precision."""
+"""Algebraic Riccati equations by structure-preserving doubling, under jit, differentiable, in float32 and float64."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jax import Array
 from crazysim.errors import ConfigError
 
 N_DOUBLINGS = 30
-"""Number of doublings: step k covers 2^k steps of time, and a closed loop whose slowest mode is 1 - 1e-8 converges."""
+"""Number of doublings. Doubling k covers 2^k time steps, so a closed loop with an eigenvalue of 1 - 1e-8 converges."""
 N_REFINEMENTS = 2
 """Newton steps after the doubling; each doubles the number of correct digits."""
 
@@ -24,9 +24,9 @@ def solve_discrete(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
     The structure-preserving doubling algorithm (Chu, Fan, Lin and Wang 2004): with ``G = B R^-1 B^T``, ``H = Q``,
     ``W = (I + G H)^-1``, each step replaces A by ``A W A``, G by ``G + A W G A^T`` and H by ``H + A^T H W A``. H
-    converges quadratically to P, and A to zero if and only if the closed loop is stable: otherwise P is NaN. The
-    number of steps is fixed, so the function has derivatives of either kind. Newton's method (Hewer 1971) removes the
-    rounding errors.
+    converges quadratically to P, and A to zero if and only if the closed loop is stable; otherwise P is NaN. The
+    number of steps is fixed, so the function has forward- and reverse-mode derivatives. Newton's method (Hewer 1971)
+    removes the rounding errors.
 
     Args:
         A: State matrix. (n, n)
@@ -49,8 +49,8 @@ def solve_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
         A^T P + P A - P B R^-1 B^T P + Q = 0
 
-    A Cayley transform with shift s gives a discrete equation of the same solution (Chu, Fan and Lin 2005), which is
-    solved by doubling, and Newton's method (Kleinman 1968) removes the rounding errors of the transform.
+    A Cayley transform gives a discrete equation with the same solution (Chu, Fan and Lin 2005), which is solved by
+    doubling. Newton's method (Kleinman 1968) removes the rounding errors of the transform.
 
     Args:
         A: State matrix. (n, n)
@@ -121,10 +121,10 @@ def gain_continuous(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 def check_gain(K: Any) -> Any:
-    """Return a gain computed on the host.
+    """Return a gain computed on the host, after a check that it is finite.
 
     Raises:
-        ConfigError: If it is NaN: the Riccati equation has no stabilising solution.
+        ConfigError: If it is not, because the Riccati equation has no stabilising solution.
     """
     if not np.all(np.isfinite(K)):
         raise ConfigError(

@@ -46,7 +46,7 @@ class Setpoint(PyTree):
 
     @jit_unless_traced()
     def feedforward(self) -> Array:
-        """Return what the state command lacks: jerk, snap, yaw rate, second derivative of the yaw. (..., 8)"""
+        """Return the feedforward of the state command: jerk, snap, yaw rate, second derivative of the yaw. (..., 8)"""
         return jnp.concatenate([self.jerk, self.snap, self.yaw_rate, self.yaw_acc], axis=-1)
 
     @staticmethod

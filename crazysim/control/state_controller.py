@@ -26,17 +26,17 @@ class StateParams(PyTree):
     mass: Array = leaf("parameter", 1, (1,))
     """Mass that the controller assumes, kg. (1,)"""
     kp: Array = leaf("parameter", 1)
-    """Gain on position, N/m. (3,)"""
+    """Gain on the position error, N/m. (3,)"""
     kd: Array = leaf("parameter", 1)
-    """Gain on velocity, N s/m. (3,)"""
+    """Gain on the velocity error, N s/m. (3,)"""
     ki: Array = leaf("parameter", 1)
-    """Gain on the integral of position, N/(m s). (3,)"""
+    """Gain on the integral of the position error, N/(m s). (3,)"""
     gravity_vec: Array = leaf("parameter", 1)
     """Gravitational acceleration that the controller assumes, world frame, m/s^2. (3,)"""
     thrust_scale: Array = leaf("parameter", 1, (1,))
     """Actual over desired thrust, 1: the firmware's mass_thrust does not match its mass. (1,)"""
     int_err_max: Array = leaf("parameter", 1)
-    """Limit of the integral of position, m s. (3,)"""
+    """Limit of the integral of the position error, m s. (3,)"""
 
     @staticmethod
     def create(airframe: Airframe) -> StateParams:
@@ -70,8 +70,8 @@ def state2attitude(
     """Return the attitude and thrust that track a full-state setpoint, and the new integral.
 
     The position part of the controller of Mellinger and Kumar (2011, eq. 6 to 9) as in the Crazyflie firmware: a force
-    that corrects position, velocity and the integral of position, a body z axis along that force, and the x axis
-    closest to the desired yaw. A zero quaternion in the setpoint means zero yaw.
+    from the errors of position and velocity and the integral of the position error, a body z axis along that force, and
+    the x axis closest to the desired yaw. A zero quaternion in the setpoint means zero yaw.
 
     Args:
         pos: Position, world frame, m. (..., 3)

@@ -42,11 +42,10 @@ class SwitchMemory(PyTree):
 
 
 class Switch(Controller):
-    """Several controllers; one commands a drone at a time. ``Sim(controller=[...], switch=...)`` makes it.
+    """Several controllers, one of which commands a drone at a time. ``Sim(controller=[...], switch=...)`` creates it.
 
-    Only the active controller runs: the memory of the others stands still. When a controller becomes active, its
-    ``take_over`` sets its memory so that its first command is as close to the last one as its limits allow. Wrenches
-    are allocated to the rotors here.
+    Only the active controller's memory changes. When a controller becomes active, its ``take_over`` sets its memory, so
+    that its first command can continue the last one. Wrenches are allocated to the rotors here.
     """
 
     name: ClassVar[str] = "switch"
@@ -58,9 +57,9 @@ class Switch(Controller):
     """Function ``(state, setpoint, time) -> index`` of one drone, or indices of all drones, () or (n_worlds, n_drones).
 
     ``state`` is the ``SimState`` of the drone, ``setpoint`` its ``Setpoint`` (the command at other levels), ``time``
-    that since the last reset, s. A negative index means the first controller, one beyond the last means the last."""
+    the time since the last reset, s. An index that the function returns is clipped to the controllers that exist."""
     freq: int = 500
-    """Rate at which the switch is evaluated, Hz; in a simulation, one that all the controllers' rates divide."""
+    """Rate at which the switch is evaluated, Hz; in a simulation, a common multiple of all the controllers' rates."""
 
     @property
     def members(self) -> tuple[Controller, ...]:
@@ -115,7 +114,7 @@ class Switch(Controller):
 
 
 def make_switch(controllers: Sequence[Controller], switch: Callable[..., Any] | Any) -> Switch:
-    """Return several controllers with a switch."""
+    """Return a ``Switch`` between several controllers."""
     if not controllers:
         raise ConfigError("expected at least one controller, got an empty list. Use controller=['pid', 'mellinger'].")
     if switch is None:
@@ -142,5 +141,5 @@ def _is_due(data: DroneData, freq: Any) -> Array | bool:
 
 
 def _select_tree(mask: Any, new: Any, old: Any) -> Any:
-    """Return one of two trees. A leaf that is the same in both stays as it is."""
+    """Return one of two trees by a mask. A leaf that is the same object in both is returned as is."""
     return jax.tree.map(lambda x, y: y if x is y else jnp.where(mask, x, y), new, old)

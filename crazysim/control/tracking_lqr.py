@@ -77,11 +77,11 @@ def error_derivative(error: Array, wrench: Array, reference: Reference, ang_acc:
 def tracking_gains(
     setpoints: Setpoint, dt: Array, mass: Array, J: Array, drag_matrix: Array, Q: Array, R: Array, substeps: int = 1
 ) -> Array:
-    """Return the gains of the LQR about the references of setpoints in a row, or NaN; pure and differentiable.
+    """Return the gains of the LQR about the references of successive setpoints, or NaN; pure and differentiable.
 
-    The error dynamics are linearised at every setpoint, and count until the next. A scan from the end backwards runs
-    the Riccati recursion in steps of ``dt / substeps``, discretised to second order. It starts from the solution of the
-    algebraic equation at the last setpoint, as if that were held forever.
+    The error dynamics are linearised at every setpoint, and held until the next. A backward scan runs the Riccati
+    recursion in steps of ``dt / substeps``, discretised to second order. It starts from the solution of the algebraic
+    equation at the last setpoint, as if that setpoint were held forever.
 
     Args:
         setpoints: Setpoints ``dt`` apart. (n, ...)
@@ -91,7 +91,7 @@ def tracking_gains(
         drag_matrix: Linear drag coefficients, body frame, N s/m. (3, 3)
         Q: Weights of the errors, per second. (12, 12)
         R: Weights of the wrench, per second. (4, 4)
-        substeps: Steps of the recursion from one setpoint to the next; few milliseconds each.
+        substeps: Steps of the recursion from one setpoint to the next, each of a few milliseconds at most.
 
     Returns:
         (n, 4, 12)
@@ -170,9 +170,9 @@ def tracking_lqr_control(
 class TrackingLQR(Controller):
     """Time-varying LQR (``tracking_lqr_control``) along a trajectory that is known in advance.
 
-    The gains belong to times since the reset of a world, so the setpoints that arrive must belong to the trajectory,
-    as from ``Follow`` with the same start.
-    It is the counterpart of AIMotionLab-Virtual's LTV-LQR, without that one's load.
+    The gains are indexed by the time since the reset of a world, so the commanded setpoints must follow the same
+    trajectory at the same times, as from ``Follow`` with the same start. It is the counterpart of AIMotionLab-Virtual's
+    LTV-LQR, without the load.
     """
 
     name: ClassVar[str] = "tracking_lqr"

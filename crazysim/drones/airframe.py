@@ -84,7 +84,7 @@ class Airframe:
         return np.diag(value) if value.ndim == 1 else value
 
     def rotor_vel(self, thrust: ArrayLike) -> NDArray[np.float64]:
-        """Return the speeds at which the rotors give a thrust, N, by their curves, rpm. (..., 1) or (..., n_rotors)
+        """Return the speeds at which the rotors give a thrust, from their curves, rpm. (..., 1) or (..., n_rotors)
 
         Args:
             thrust: Thrust of each rotor, N. (..., 1) or (..., n_rotors)
@@ -93,7 +93,7 @@ class Airframe:
         return (-k1 + np.sqrt(k1**2 - 4 * k2 * (k0 - np.asarray(thrust)))) / (2 * k2)
 
     def why_missing(self, path: str) -> str:
-        """Return why a table or value of the base was not inherited, with a space at the end; empty if it was."""
+        """Return the reason why a table or value of the base was not inherited, followed by a space; empty for none."""
         return f"{self.not_inherited} " if self.not_inherited and path.partition(".")[0] in TUNED_TABLES else ""
 
     @functools.cached_property
@@ -141,7 +141,7 @@ class Airframe:
 
     @property
     def full_thrust_voltage(self) -> float | None:
-        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None if ``[battery]`` has no such number."""
+        """Motor voltage at which a rotor reaches ``rotors.thrust_max``, V; None without a curve that reaches it."""
         if "battery.thrust_over_voltage" not in self.values:
             return None
         excess = self.value("battery.thrust_over_voltage") - [self.value("rotors.thrust_max"), 0, 0, 0]
@@ -150,7 +150,7 @@ class Airframe:
         return float(np.min(voltages)) if len(voltages) else None
 
     def __repr__(self) -> str:
-        """Return the name alone; the tables are long."""
+        """Return only the name, because the tables are long."""
         return f"Airframe({self.name!r})"
 
 
@@ -164,7 +164,7 @@ def airframe_names() -> tuple[str, ...]:
 
 
 def _lookup_advice(path: str, paths: Iterable[str]) -> str:
-    """Return the advice for a value that an airframe lacks: to add it if it exists, else the path that was meant."""
+    """Return the advice for a missing value: to add it if its path is a known key, or else a similar path."""
     table, _, key = path.rpartition(".")
     return (
         f"Add {key} to its table [{table}]; {GUIDE} lists all keys."

@@ -10,7 +10,7 @@ from crazysim.errors import AirframeWarning, ConfigError, short_repr, warn
 from crazysim.tables import INERTIA, check_numbers
 
 MAX_ROTORS = 64
-"""Most rotors; the VoloCity, an air taxi, has 18."""
+"""Largest number of rotors; the VoloCity, an air taxi, has 18."""
 MAX_THRUST_TO_WEIGHT = 1000
 """Largest ratio of thrust to weight; racers have about 20."""
 MAX_ANG_ACC = 1e6
@@ -20,15 +20,15 @@ MAX_ROTOR_VEL = 1e6
 MIN_LEVERAGE = 1e-3
 """Smallest singular value of the mixing matrix; a quadrotor in X has 2."""
 EXCESS, ROUNDING = 0.05, 1e-5
-"""Relative excess of the largest moment of inertia over the sum of the others that is a warning at most, as in moments
-that were measured one by one, and that counts as rounding. RotorPy's Crazyflie has 1%."""
+"""Relative excess of the largest moment of inertia over the sum of the others: up to ``EXCESS`` it is only a warning,
+as for moments that were measured one by one, and up to ``ROUNDING`` it is ignored. RotorPy's Crazyflie has 1%."""
 
 
 def check_airframe(airframe: Airframe) -> None:
     """Check shapes, ranges and the consistency of an airframe's numbers.
 
     Raises:
-        ConfigError: If no drone with these numbers flies.
+        ConfigError: If no drone with these numbers can fly.
 
     Warns:
         AirframeWarning: If the largest moment of inertia exceeds the sum of the others by up to 5%.

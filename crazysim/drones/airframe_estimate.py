@@ -24,16 +24,16 @@ AIR_DENSITY = 1.225
 PITCH_RATIO = 0.5
 """Pitch over diameter of a propeller whose pitch is not given, 1."""
 OUTER_MASS_SHARE = 0.4
-"""Part of the mass that sits at the rotors, 1; the built-in airframes have 0.31 to 0.52."""
+"""Fraction of the mass that is located at the rotors, 1; the built-in airframes have 0.31 to 0.52."""
 MERIT_DIAMETERS, MERITS = (0.127, 0.254), (0.44, 0.68)
-"""Figures of merit in hover of a propeller of 5 and one of 10 inches, and their diameters, m."""
+"""Diameters of propellers of 5 and 10 inches, m, and their figures of merit in hover, 1."""
 DRAG_RATE = 0.45
 """Linear drag over mass, 1/s; the built-in airframes that were identified from flights have 0.35 to 0.58."""
 ROTOR_TIME_CONSTANT = 0.05
 """Time constant of rotors up to 10 inches, s."""
 MAX_TABLE_ERROR = 0.05
-"""Part of the largest thrust or torque of a motor table by which it may fall where the speed rises, or by which two
-columns of one quantity may differ: an assumption about the errors of data sheets."""
+"""Fraction of the largest value of a motor table by which thrust or torque may fall where the speed rises, or by which
+two columns of one quantity may differ: an assumption about the errors of data sheets."""
 IDLE_THRUST_RATIO = 0.05
 """Smallest over largest thrust of a rotor that is on, 1."""
 MOTOR_EFFICIENCY = 0.75
@@ -47,7 +47,7 @@ CELL_VOLTAGE = 3.7
 CELL_RESISTANCE = 0.015
 """Resistance of a cell times its capacity, ohm A h."""
 MAX_DISC_LOADING = 1e4
-"""Thrust over disc area that only wrong units exceed, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
+"""Thrust over disc area above which units must be wrong, N/m^2: an induced velocity of 64 m/s; bumblebee has 1,200."""
 MotorTable = str | Path | Mapping[str, ArrayLike]
 """Path of a CSV file, or its columns."""
 COLUMNS = {
@@ -111,8 +111,8 @@ def estimate_airframe(
 ) -> str:
     """Return the TOML text of an airframe whose constants are estimated from a few numbers.
 
-    The file has what first principles, the battery and the controllers that follow from physics need, and no gains.
-    Each estimate states its formula and source.
+    The file has the values that the first-principles dynamics, the battery and the controllers without tuned gains
+    need, and no gains. Each estimate states its formula and source.
 
     Args:
         mass: Mass with the battery, kg.
@@ -187,7 +187,7 @@ class _File:
         self.sources: dict[str, str] = {}
 
     def add(self, table: str, key: str, value: ArrayLike, unit: str, source: str, **numbers: Any) -> None:
-        """Add a number with its unit and a source of ``SOURCES``, which ``numbers`` are filled into."""
+        """Add a number with its unit and a source of ``SOURCES``, whose text is formatted with ``numbers``."""
         if source not in self.sources:
             self.describe(source, SOURCES[source].format(**numbers) if numbers else SOURCES[source])
         line = f'{key} = {{ value = {_toml_value(value)}, unit = "{unit}", source = "{source}" }}'
@@ -280,7 +280,7 @@ def _rotors(
 
 
 def _inertia(mass: float, places: NDArray) -> NDArray:
-    """Return the inertia of points at the rotors: moments, or a matrix where its axes are not the body's."""
+    """Return the inertia of points at the rotors: moments, or a matrix if its principal axes are not the body's."""
     squares = np.einsum("ni,nj->ij", places, places) / len(places)
     matrix = OUTER_MASS_SHARE * mass * (np.trace(squares) * np.eye(3) - squares)
     off = matrix - np.diag(np.diag(matrix))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazysim.drones.airframe import Airframe
 
 LED_MATERIALS = ("led_top", "led_bot")
-"""Materials that each drone has its own copy of, so that its LEDs can have their own colours."""
+"""Materials of which each drone has its own copy, so that its LEDs can have their own colours."""
 
 MATERIALS = {
     "drone_carbon": (0.10, 0.10, 0.11, 1.0),
@@ -63,10 +63,10 @@ class BodyCamera:
 
 
 def outline(airframe: Airframe) -> dict[str, NDArray[np.float64]]:
-    """Return the table ``[shape]`` of an airframe, with values for the keys that it lacks.
+    """Return the table ``[shape]`` of an airframe, with defaults for missing keys.
 
-    They follow from the rotors' positions, and the battery's size from the mass, in the proportions of the built-in
-    airframes. docs/guides/airframes.md describes the keys.
+    The defaults follow from the rotors' positions, and the battery's size from the mass, in the proportions of the
+    built-in airframes. docs/guides/airframes.md describes the keys.
     """
     rotors = airframe.value("rotors.position")
     reach = float(np.max(np.linalg.norm(rotors[:, :2], axis=-1)))

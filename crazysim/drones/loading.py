@@ -24,15 +24,15 @@ BODY_KEYS = (
     "rotors.thrust_max",
     "rotors.thrust_curve",
 )
-"""Numbers that gains and fits of an airframe assume."""
+"""Numbers for which the gains and fits of an airframe hold."""
 
 
 def load_airframe(source: AirframeSource) -> Airframe:
-    """Return the airframe of a name, a TOML file anywhere on disk, or a dict of the same tables.
+    """Return the airframe from a name, a TOML file anywhere on disk, or a dict of the same tables.
 
     A number is written plainly, or as ``{ value = ..., unit = "...", source = "..." }`` as in the built-in files. With
-    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. Another body
-    (``BODY_KEYS``) does not inherit gains and fits (``TUNED_TABLES``).
+    the key ``base``, the name or path of another airframe, only the numbers that differ from it are given. If one of
+    ``BODY_KEYS`` differs, gains and fits (``TUNED_TABLES``) are not inherited.
 
     Args:
         source: Name of a built-in airframe, path of a ``.toml`` file, dict, or an airframe (returned as is).
@@ -50,7 +50,7 @@ def is_airframe_file(source: object) -> bool:
 
 
 def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
-    """Return the airframe of a source, which is the base of others."""
+    """Return the airframe of a source, given the chain of airframes that it is a base of."""
     if isinstance(source, Airframe):
         return source
     bases = extend_bases(bases, source)
@@ -66,7 +66,7 @@ def _load(source: Any, bases: tuple[str, ...]) -> Airframe:
 
 
 def _inherit(base: Airframe, changes: Mapping[str, NDArray]) -> tuple[dict[str, NDArray[np.float64]], str]:
-    """Return the numbers that an airframe inherits, and why not all of them.
+    """Return the numbers that an airframe inherits, and the reason why it does not inherit all, empty if it does.
 
     Args:
         base: The base.

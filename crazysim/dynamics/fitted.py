@@ -4,9 +4,9 @@
 
 The fits were made near level flight, and Euler angles are singular at a pitch of 90 degrees. Therefore the fit is used
 up to 80 degrees of pitch and blended into a spring and damper on the attitude error, which exists everywhere, between
-80 and 88 degrees. The same blend happens between 100 and 200 rad/s and between commands of 100 and 200 rad: there a
-drone passes the vertical so often that the singularity would add energy without end. Outside of the fitted range the
-motion is bounded and continuous, not identified.
+80 and 88 degrees. The same blend happens between 100 and 200 rad/s and between commands of 100 and 200 rad, where a
+drone passes the vertical so often that the singularity would add energy without bound. Outside of the fitted range the
+motion is bounded and continuous, but not identified.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ MIN_BLENDED_COSINE = math.cos(math.radians(88))
 MAX_FITTED_MAGNITUDE = 100.0
 """Body rate, rad/s, and commanded angles, rad, up to which the fit is used; the blend ends at twice as much.
 
-Three times the 2,000 degrees per second that a Crazyflie's gyroscope can measure (BMI088, data sheet), and sixteen
-revolutions.
+This is about three times the 2,000 degrees per second that a Crazyflie's gyroscope can measure (BMI088, data sheet),
+and sixteen revolutions.
 """
 
 
@@ -113,7 +113,7 @@ def dynamics(
         vel: Velocity, world frame, m/s. (..., 3)
         ang_vel: Angular velocity, body frame, rad/s. (..., 3)
         cmd: Roll, pitch, yaw, rad, and collective thrust, N. (..., 4)
-        rotor_vel: Present collective thrust, N, in every entry; unused by ``so_rpy``. (..., k)
+        rotor_vel: Current collective thrust, N, in every entry; unused by ``so_rpy``. (..., k)
         dist_f: External force on the centre of mass, world frame, N. (..., 3)
         dist_t: External torque, world frame, N m. (..., 3)
         params: Parameters, shared or with the leading axes of the state.

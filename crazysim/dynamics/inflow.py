@@ -1,7 +1,7 @@
 """Thrust of a rotor that moves through the air, by blade element and momentum theory.
 
-The static thrust of a speed, which thrust curves hold, and one number for the blades are all that is needed: the pitch
-of the blades follows from the static thrust.
+The model needs only the static thrust at a rotor speed, from the thrust curve, and one coefficient of the blades; the
+pitch of the blades follows from the static thrust.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from crazysim.rotation import safe_sqrt
 
 MIN_AIR_SPEED = 1e-3
 """Speed that is added in quadrature to the air speed at a rotor, m/s, so that a stopped rotor in still air has an
-inflow. An assumption; 1 mm/s changes nothing else."""
+inflow. An assumption; 1 mm/s has no other noticeable effect."""
 N_ITERATIONS = 3
 """Newton steps from the solution without in-plane velocity. In-plane velocities of up to four times the induced one
 leave an error of at most 5e-7 of the static thrust (seen in float64 for 100,000 random states)."""
@@ -30,16 +30,16 @@ def disc_factor(radius: Array, air_density: Array) -> Array:
 def blade_coefficient(
     slope: np.ndarray | float, thrust: np.ndarray | float, ang_vel: np.ndarray | float, disc: np.ndarray | float
 ) -> np.ndarray:
-    """Return the loss of thrust per inflow velocity and rotor speed, N s^2/(m rad), from that per axial velocity.
+    """Return the coefficient b of the blades, the loss of thrust per inflow velocity and rotor speed, N s^2/(m rad).
 
-    A rotor that climbs at a velocity u loses thrust, but its induced velocity falls too. In hover, ``T = 2 rho A v^2``
-    and ``T = B - b omega (u + v)`` have the slope ``dT/du = -d`` with ``b omega = 2 d y / (y - d)`` and ``y = T / v``:
-    d cannot exceed y, the limit for a lift slope without bound. For blades of constant chord and pitch
-    ``b = rho A R sigma a / 4`` with solidity sigma and lift slope a (the coefficient of inflow in
-    ``C_T = sigma a / 2 (theta / 3 - lambda / 2)``). The result is negative or infinite where there is none.
+    A rotor that climbs at a velocity u loses thrust, but its induced velocity v falls too. In hover, momentum theory
+    and ``T = B - b omega (u + v)`` together have the slope ``dT/du = -d`` with ``b omega = 2 d y / (y - d)`` and
+    ``y = T / v``, where ``T = 2 rho A v^2``. d cannot exceed y, the limit of an infinite lift slope. Blades of constant
+    chord and pitch have ``b = rho A R sigma a / 4`` with solidity sigma and lift slope a (the coefficient of inflow in
+    ``C_T = sigma a / 2 (theta / 3 - lambda / 2)``). The result is negative or infinite where no coefficient exists.
 
     Args:
-        slope: Loss of thrust per axial velocity of the hovering rotor, d, N s/m.
+        slope: Loss d of thrust per axial velocity of the hovering rotor, N s/m.
         thrust: Thrust in hover, N.
         ang_vel: Speed in hover, rad/s.
         disc: ``disc_factor`` of the rotor, kg/m.
@@ -81,7 +81,7 @@ def thrust_in_flight(
         static_thrust: Thrust T_0 at this speed in still air, N; below zero counts as zero. (...)
         ang_vel: Speed of the rotor, rad/s. (...)
         axial: Velocity of the hub relative to the air along the thrust, m/s. (...)
-        in_plane_square: Square of that across the thrust, m^2/s^2. (...)
+        in_plane_square: Square of the velocity of the hub relative to the air across the thrust, m^2/s^2. (...)
         blade: Coefficient b, N s^2/(m rad). (...)
         radius: Radius of the propeller, m. (...)
         air_density: Density of air, kg/m^3. (...)
@@ -114,8 +114,8 @@ def ceiling_factor(gap: Array, radius: Array) -> Array:
     ``rho A v^2 (R / d)^2 / 16`` (Bernoulli). The momentum of the wake is thrust less suction,
     ``rho A v v_wake``, and ``T = rho A v_wake^2 / 2``.
     Hsiao and Chirarattananon (2019, arXiv 1905.04632) treat and measure propellers below a ceiling by momentum and
-    blade element theory. Gaps below a twentieth of the radius count as that, an assumption. Above the ceiling there is
-    none: the ratio is 1, as in free air.
+    blade element theory. Gaps below a twentieth of the radius count as a twentieth, an assumption. A rotor above the
+    ceiling (negative gap) has the factor 1, as in free air.
 
     Args:
         gap: Height of the ceiling over the rotor, m. (...)

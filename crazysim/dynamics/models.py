@@ -12,7 +12,7 @@ from crazysim.drones.airframe import GRAVITY_MAGNITUDE
 from crazysim.errors import ConfigError, UnknownNameError
 
 MAX_LAG_RATE = 1.5
-"""Largest product of a rate and a step: Euler steps diverge from 2 on, and a lag overshoots by half its error here."""
+"""Largest product of a rate and a step. Euler steps diverge from 2 on; at 1.5, a lag overshoots by half its error."""
 GRAVITY = (0.0, 0.0, -GRAVITY_MAGNITUDE)
 """Gravitational acceleration, world frame, m/s^2."""
 
@@ -60,7 +60,7 @@ def require_freq(airframe: Airframe, dynamics: Dynamics, freq: int) -> None:
     """Check that the lags and the damping of an airframe are slow enough for the rate of the physics.
 
     Raises:
-        ConfigError: If steps diverge; the message has the least rate.
+        ConfigError: If a rate is above ``MAX_LAG_RATE * freq``; the message states the lowest ``freq`` that suffices.
     """
     numbers, mass = airframe.values, airframe.value("rigid_body.mass")
     rates_by_path: dict[str, np.ndarray] = {}

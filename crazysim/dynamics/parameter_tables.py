@@ -31,7 +31,7 @@ SOURCES: tuple[tuple[str, str, dict[str, str]], ...] = (
     ("attitude2force_torque", "controller.attitude", {key: key for key in _ATTITUDE}),
     ("body_rate2force_torque", "controller.attitude", {key: key for key in _ATTITUDE}),
 )
-"""Tables of Crazyflow, the airframe's tables that they come from, and Crazyflow's name for each key."""
+"""Crazyflow's table, the airframe's table from which it is filled, and Crazyflow's name for each key of the latter."""
 
 
 def load_params(
@@ -82,7 +82,7 @@ def load_params(
 def load_fn_params(
     fn: Callable[..., Any], drone: AirframeSource, xp: ModuleType | None = None, device: Any = None
 ) -> dict:
-    """Return the parameters that ``first_principles.dynamics`` uses, as ``load_params`` has them.
+    """Return the parameters from ``load_params`` that ``first_principles.dynamics`` uses.
 
     Args:
         fn: ``first_principles.dynamics``.

@@ -10,10 +10,10 @@ from crazysim.rotation import add_cross, cross, dot, matvec, multiply
 MAX_EXPLICIT_ANGLE = 0.04
 """Rotation per step, rad, up to which ``stable_angular_acceleration`` is the exact derivative.
 
-20 rad/s at 500 Hz. A free wobble then grows by at most 0.04^2 / 2 of its size per step.
+This is 20 rad/s at 500 Hz. A free wobble then grows by at most 0.04^2 / 2 of its size per step.
 """
 MIN_STABLE_ANGLE = 0.06
-"""Rotation per step, rad, from which ``stable_angular_acceleration`` lets no free wobble grow."""
+"""Rotation per step, rad, above which no free wobble grows with ``stable_angular_acceleration``."""
 
 
 def linear_acceleration(force: Array, mass: Array, gravity_vec: Array) -> Array:
@@ -51,14 +51,14 @@ def angular_acceleration(torque: Array, ang_vel: Array, J: Array, J_inv: Array, 
 def stable_angular_acceleration(
     torque: Array, ang_vel: Array, J: Array, J_inv: Array, rotor_momentum: Array, dt: float
 ) -> Array:
-    """Return the angular acceleration for one Euler step, with a gyroscopic torque that cannot feed a wobble.
+    """Return the angular acceleration for one Euler step, with a gyroscopic torque that does not amplify a wobble.
 
     A body that spins wobbles at a frequency k below its spin rate (plus what its rotors add). An explicit Euler step
     of the wobble, ``z = i k dt``, multiplies its size by ``|1 + z| = sqrt(1 + (k dt)^2)``: at 60 rad/s and 500 Hz a
-    quadrotor gains a factor of 175 in 2 s. Here the gyroscopic torque is evaluated where it would itself take the body
-    within ``theta dt``, so that the factor is ``|1 + z + theta z^2|``. With ``theta = 1/2`` that is Heun's method,
-    whose factor exceeds one in fourth order only. With ``theta = (1 + x^2) / 2`` at a rotation of ``x = |w| dt`` per
-    step it stays at most one up to ``k dt = 1``, and the loss of energy is of fourth order.
+    quadrotor gains a factor of 175 in 2 s. Here the gyroscopic torque is evaluated at the angular velocity to which it
+    alone would lead after ``theta dt``, so the factor is ``|1 + z + theta z^2|``. With ``theta = 1/2`` it is Heun's
+    method, whose factor exceeds one in fourth order only. With ``theta = (1 + x^2) / 2`` at a rotation of
+    ``x = |w| dt`` per step it stays at most one up to ``k dt = 1``, and the loss of energy is of fourth order.
 
     Up to ``MAX_EXPLICIT_ANGLE`` theta is zero and the result equals ``angular_acceleration``. From ``MIN_STABLE_ANGLE``
     on it has the value above. In between it rises with the square of the rate.
@@ -87,10 +87,10 @@ def stable_angular_acceleration(
 def free_rotation(quat: Array, ang_vel: Array, inertia: Array, dt: float) -> tuple[Array, Array]:
     """Return attitude and angular velocity of a free body after a step in which it turns about its principal axes.
 
-    The kinetic energy is a sum of one part for each principal axis, and under one part alone the body turns about that
-    axis at the constant rate ``H_k / J_k``. The turns follow each other as x, y, z, y, x, where all but z take half the
-    step (McLachlan 1993; Touma and Wisdom 1994). Order 2, explicit, and symplectic: the angular momentum in the world
-    frame is kept to rounding at any rate, so that the energy is bounded, and its error does not grow.
+    The kinetic energy has one term for each principal axis. Under one term alone, the body turns about that axis at the
+    constant rate ``H_k / J_k``. The turns follow each other as x, y, z, y, x, where all but z take half the step
+    (McLachlan 1993; Touma and Wisdom 1994). The method is of order 2, explicit and symplectic. It conserves the angular
+    momentum in the world frame up to rounding at any rate, so the energy is bounded, and its error does not grow.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)

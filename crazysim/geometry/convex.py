@@ -29,12 +29,12 @@ from crazysim.geometry.vector import Vector, axis_vector, normalize, rounding_ma
 BestDirection = tuple[Array, Vector]
 """Largest gap so far, m (...), and its direction."""
 SupportPoint = tuple[Vector, list[Array]]
-"""Support point of the Minkowski difference, m, and the point of the segment or box it comes from, in its frame, m."""
+"""Support point of the Minkowski difference, m, and its point of the segment or box, in the frame of the latter, m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapePair:
-    """Segment or box, and another convex shape whose frame all vectors are in."""
+    """Segment or box, and another convex shape. All vectors are in the frame of the other shape."""
 
     other: Shape
     """Other shape: a box, cylinder, ellipsoid or mesh."""
@@ -53,7 +53,7 @@ class ShapePair:
         return out
 
     def support_coordinates(self, n: Vector) -> list[Array]:
-        """Return the support point of the segment or box against a direction, in its own frame, m. (...) each"""
+        """Return the support point of the segment or box opposite to a direction, in its own frame, m. (...) each"""
         return [-segment_support_point(half, edge.dot(n)) for edge, half in zip(self.edges, self.half, strict=True)]
 
     def point_at(self, coordinates: list[Array]) -> Vector:
@@ -64,7 +64,7 @@ class ShapePair:
         return point
 
     def support_point(self, n: Vector) -> SupportPoint:
-        """Return the support point of the Minkowski difference against a direction."""
+        """Return the support point of the Minkowski difference opposite to a direction."""
         coordinates = self.support_coordinates(n)
         return self.point_at(coordinates) - support.support_point(self.other, n), coordinates
 

@@ -19,8 +19,8 @@ Hit = tuple[Array, Vector]
 def field_ray(shape: Shape, origin: Array, direction: Array) -> tuple[Array, Array]:
     """Return the distance along rays to a height field, and its outward normal at the hit.
 
-    As in MuJoCo, a height field is a box up to z = 0 with a surface above it and walls between. A ray from inside ends
-    on the surface, on a wall, or at z = 0, even where the ground continues below.
+    As in MuJoCo, a height field is a box up to z = 0, a surface above it, and walls between them. A ray from inside
+    ends on the surface, on a wall, or at z = 0, even though the ground continues below.
 
     Args:
         shape: Height field.
@@ -52,7 +52,7 @@ def _nearer_hit(a: Hit, b: Hit) -> Hit:
 def _face_hits(
     half: tuple[float, float], origin: Vector, direction: Vector
 ) -> list[tuple[Array, Vector, Array, Array]]:
-    """Return for each of the four walls: distance, outward normal, and the x and y of the hit."""
+    """Return the distance, outward normal, and x and y of the hit, for each of the four walls."""
     zero = jnp.zeros_like(origin.x)
     out = []
     for side in (-1.0, 1.0):

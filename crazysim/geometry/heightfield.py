@@ -1,7 +1,7 @@
 """Signed distances to a height field: the solid below triangles over a grid, with walls and a bottom.
 
-Only the triangles of the cells near a point are examined, independent of the size of the grid; their indices depend on
-the data.
+Only the triangles of the cells near a point are examined, so the cost does not depend on the size of the grid. Their
+indices depend on the data.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from crazysim.geometry.vector import Vector, to_vector
 from crazysim.rotation import safe_clip, safe_sqrt
 
 OUTSIDE_DISTANCE = 1e3
-"""Distance of points beyond the border of a field, m: without contact, and finite, as solvers need it."""
+"""Distance assigned to points beyond the border of a field, m: too large for a contact, but finite for solvers."""
 
 
 def cell_sides(shape: Shape) -> tuple[float, float]:
@@ -60,8 +60,8 @@ def drone_to_field(half: tuple[float, ...], shape: Shape, pos: Array, rot: Array
     """Return the signed distance from a box or a segment to the ground, m. (...)
 
     For separated shapes the nearest points are a corner of the box and a point of the ground, or a point of the box
-    and one on an edge of the ground. The result is exact up to the diagonal of the box, and an upper bound beyond. For
-    overlapping shapes the depth is the larger of the depths of the deepest corner and edge, which is not the
+    and one on an edge of the ground. The result is exact up to half the diagonal of the box, and an upper bound beyond.
+    For overlapping shapes, the depth is the larger of the depths of the deepest corner and edge, which is not the
     shortest translation out of all triangles at once.
 
     Args:
@@ -180,8 +180,8 @@ def surface_at(heights: Array, half: Array, point: Array) -> tuple[Array, Array,
 def field_gap(shape: Shape, point: Array) -> tuple[Array, Array]:
     """Return the distance of a point to the plane of the triangle below it, m (...), and the plane's normal (..., 3).
 
-    That is the signed distance to the ground near a surface without sharp edges, for a small part of the cost of
-    ``field_distance``. Beyond the border, and below the ground's bottom, it is ``OUTSIDE_DISTANCE``.
+    Near a surface without sharp edges this is the signed distance to the ground, at a small fraction of the cost of
+    ``field_distance``. Beyond the border and below the bottom of the ground, it is ``OUTSIDE_DISTANCE``.
     """
     half = jnp.asarray(shape.size[:2], point.dtype)
     height, normal, inside = surface_at(jnp.asarray(shape.array("heights"), point.dtype), half, point)

@@ -1,7 +1,7 @@
 """Contact manifolds: the points at which two balls or boxes touch, with normals and gaps.
 
-For one pair, on small arrays; ``jax.vmap`` takes many. The number of points depends on the kinds of the pair only, and
-points that do not exist have a large gap.
+The functions take one pair, as small arrays; use ``jax.vmap`` for many. The number of points depends only on the kinds
+of the two bodies, and points that do not exist have a large gap.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ from crazysim.geometry.heightfield import OUTSIDE_DISTANCE
 from crazysim.geometry.small_matrices import matmul, matvec
 
 N_BOX_POINTS = 13
-"""Number of points of two boxes."""
+"""Number of contact points between two boxes."""
 MIN_EDGE_SINE = 1e-3
-"""Sine of the angle of two edges below which they span no separating axis."""
+"""Sine of the angle between two edges below which they span no separating axis."""
 EDGE_SHARE, EDGE_BIAS = 0.95, 0.01
-"""An axis of two edges is taken where its overlap is below this share of the best face's, by more than this share of
-the smaller box: faces have several points, which rest more steadily."""
+"""An axis of two edges is chosen if its overlap is less than ``EDGE_SHARE`` times the overlap of the best face minus
+``EDGE_BIAS`` times the smallest half length. Faces are preferred because their several points rest more steadily."""
 FACE_BIAS = 1e-3
-"""A face of the first box is taken unless one of the second has less overlap by this share of the smaller box: between
-aligned boxes rounding would choose, and impulses of the last step would belong to other points."""
+"""A face of the first box is chosen unless one of the second has less overlap by this fraction of the smallest half
+length. Otherwise rounding would choose between aligned boxes, and impulses of the last step would not match the
+points."""
 FACE_SHARE = 1 - 1e-4
-"""Share of a face within which the corners of the other are points of their own; beyond, its clipped edges are, up to
-as far outside of the face."""
+"""Fraction of a face within which the corners of the other face are separate points. Closer to the border, the clipped
+edges give the points; they are clipped at ``2 - FACE_SHARE`` times the half lengths of the face."""
 
 
 class Manifold(NamedTuple):
@@ -78,9 +79,9 @@ def ball_box_contacts(radius: Array, pos: Array, size: Array, pos_box: Array, ro
 def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b: Array, rot_b: Array) -> Manifold:
     """Return the contact points of two boxes.
 
-    They are separated by the axis of least overlap among the normals of their faces and the products of their edges
-    (Gottschalk, Lin and Manocha 1996). On a face the nearest face of the other box is clipped against it, which gives
-    up to twelve points; two edges meet at one.
+    The contact normal is the axis of least overlap among the normals of their faces and the cross products of their
+    edges (Gottschalk, Lin and Manocha 1996). For a face, the nearest face of the other box is clipped against it, which
+    gives up to twelve points. Two edges meet at one point.
 
     Args:
         half_a: Half lengths of the first box, m. (3,)
@@ -109,7 +110,8 @@ def box_contacts(half_a: Array, pos_a: Array, rot_a: Array, half_b: Array, pos_b
     edges = jnp.where(spans, jnp.abs(jnp.sum(axes * offset, axis=-1)) - reach, -OUTSIDE_DISTANCE).reshape(-1)
     pair = jnp.argmax(lax.stop_gradient(edges))
     by_edge = edges[pair] > EDGE_SHARE * faces[best] + EDGE_BIAS * smaller
-    # Apart, the axis of largest distance counts, face or edge; between level faces that touch rounding would choose.
+    # If the boxes are apart, the axis with the largest distance counts, face or edge. Without the bias, rounding would
+    # choose between level faces that touch.
     by_edge = jnp.where(faces[best] > 0, edges[pair] > faces[best] + FACE_BIAS * smaller, by_edge)
 
     is_a = best < 3
@@ -130,7 +132,7 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
     """Return gaps, normal of the face towards the other box, and points of the other's nearest face clipped to it.
 
     Args:
-        face: Half lengths, position and attitude of the box whose face it is.
+        face: Half lengths, position and attitude of the box with the face.
         axis: Axis of the face, 0 to 2.
         other: The same of the other box.
     """
@@ -160,9 +162,9 @@ def _clip_face(face: tuple[Array, ...], axis: Array, other: tuple[Array, ...]) -
         last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), 1.0))
     exists = first <= last
     valid = [exists, exists & (last < 1)]  # the end of an edge is the beginning of the next
-    # Along an edge that is level to rounding the ends are far away: a lever of kilometres brings any point into reach.
+    # Clip to the edge: for an edge parallel to the border up to rounding, the computed ends can be kilometres away.
     candidates = [ring + jnp.clip(x, 0.0, 1.0)[:, None] * along for x in (first, last)]
-    # Corners of the face below the inside of the other's.
+    # Corners of the face, projected along its normal onto the other's nearest face.
     at = jnp.stack([jnp.stack([x * limit[0], y * limit[1]]) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     det = edge_1[0] * edge_2[1] - edge_1[1] * edge_2[0]
     det = jnp.where(jnp.abs(det) > 1e-12, det, 1e-12)

@@ -41,7 +41,7 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     The error is below 1e-3 m for shapes of up to a few metres that are separated or overlap slightly. The overlap of
     two boxes is exact, by the 15 normals of the separating axis theorem (Gottschalk 1996). The depth of a deep overlap
     with another shape is an upper bound, from the best direction found. The gradient follows the nearest points; deep
-    inside a curved shape its direction has an error of some hundredths.
+    inside a curved shape, its direction has an error of a few hundredths.
 
     Args:
         a: Box, or the core of a capsule, without its radius.
@@ -55,7 +55,7 @@ def convex_distance(a: Shape, b: Shape, pos: Array, rot: Array) -> Array:
     fallback = axis_vector(2, centre.x)
     best, _ = find_separation(fixed, normalize(fixed.centre, fallback), SEPARATION_STEPS)
     gap, n = find_overlap(fixed, a.kind == "box", best)
-    # Separated along the direction found, the shapes have nearest points, at which they touch first.
+    # Once moved apart along the direction found, the shapes have nearest points, at which they would touch first.
     aside = SEPARATION_SHARE * max(half)
     parted = dataclasses.replace(fixed, centre=fixed.centre + n * jnp.where(gap < aside, aside - gap, 0.0))
     (_, m), coordinates = find_separation(parted, n, TOUCH_STEPS)

@@ -121,7 +121,7 @@ def ellipsoid_normal(shape: Shape, point: Components) -> Components:
 
 
 def _mesh(shape: Shape, point: Array) -> Array:
-    """Return the distance to the nearest triangle outside, and to the nearest plane inside, m. (...)"""
+    """Return the distance to the nearest triangle for points outside, and to the nearest plane inside, m. (...)"""
     at = to_vector(point)
     inside = plane_distance(shape.array("normals"), shape.array("offsets"), at)
     triangles = shape.array("vertices")[shape.array("faces")]

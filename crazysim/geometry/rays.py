@@ -176,7 +176,10 @@ def _mesh_line(shape: Shape, origin: Components, direction: Components) -> Inter
 
 
 def first_distance(interval: Interval) -> Array:
-    """Return the distance at which a ray meets what it is in along an interval; infinite where it does not. (...)"""
+    """Return the distance at which a ray first meets the surface of a shape, from the interval of its line. (...)
+
+    It is infinite where the ray misses. A ray from inside meets the surface where it leaves.
+    """
     near, far, meets = interval
     hit = meets & (far >= 0)
     # A miss must not contribute NaN, in gradients either.
@@ -217,7 +220,7 @@ def _capsule_normal(shape: Shape | SizedShapes, point: Array) -> Array:
 
 
 def _box_normal(shape: Shape | SizedShapes, point: Array) -> Array:
-    """Return the normal of the side that a point is nearest to. (..., 3)"""
+    """Return the normal of the side nearest to a point. (..., 3)"""
     x, y, z = (jnp.abs(p) - h for p, h in zip(components(point), shape.size, strict=True))
     of_x = (x >= y) & (x >= z)
     of_y = ~of_x & (y >= z)

@@ -13,9 +13,10 @@ MIN_SQUARED_SINE = 1e-12
 
 
 def segment_to_segment(middle: Components, axis: Components, half: float, other_half: float) -> Array:
-    """Return the distance from a segment to one along z around the origin, m (Ericson 2005, section 5.1.9). (...)
+    """Return the distance from a segment to a segment along z centred at the origin, m. (...)
 
-    For parallel or nearly parallel segments the choice of the nearest points does not change the distance.
+    The method is that of Ericson (2005, section 5.1.9). For parallel or nearly parallel segments, the choice of the
+    nearest points does not change the distance.
 
     Args:
         middle: Centre of the segment, m. 3 of (...)
@@ -29,7 +30,7 @@ def segment_to_segment(middle: Components, axis: Components, half: float, other_
     s = safe_clip(jnp.where(across > MIN_SQUARED_SINE, s, 0.0), -half, half)
     t = safe_clip(cz + s * z, -other_half, other_half)
     s = safe_clip(t * z - (cx * x + cy * y + cz * z), -half, half)
-    # The nearest points of lines are where a small move of either changes nothing: they may count as fixed.
+    # Moving the nearest points along the segments does not change the distance to first order, so they are held fixed.
     x, y, z = (c + s * a for c, a in zip(middle, axis, strict=True))
     return safe_sqrt(x * x + y * y + (z - t) ** 2)
 
@@ -38,9 +39,9 @@ def segment_to_box(middle: Components, axis: Components, half: Array | float, bo
     """Return the signed distance from a segment to a box, m. (...)
 
     Outside, the slope of the squared distance along the segment is increasing and piecewise linear, with kinks at the
-    planes of the sides; its root lies between the last kink of negative and the first of positive slope. Inside, the
-    shortest separating translation is along a face normal of the Minkowski difference: a normal of the box, or a cross
-    product of one of its edges and the segment (Gottschalk 1996).
+    planes of the sides. Its root lies between the last kink with a negative slope and the first with a positive slope.
+    Inside, the shortest separating translation is along a face normal of the Minkowski difference: a normal of the box,
+    or a cross product of one of its edges and the segment (Gottschalk 1996).
 
     Args:
         middle: Centre of the segment in the frame of the box, m. 3 of (...)

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from crazysim.errors import ConfigError
 
 N_SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "box": 3, "cylinder": 2, "ellipsoid": 3, "mesh": 0, "hfield": 4}
-"""Number of entries of the size of each kind."""
+"""Number of entries of ``Shape.size`` for each kind."""
 MAX_HULL_VERTICES = 64
 """Largest number of vertices whose convex hull is computed, by trying every triangle."""
 UNBOUNDED_LENGTH = 1e18
-"""Half length that stands for an unbounded one, m; its square fits into float32."""
+"""Half length that represents an unbounded one, m; its square fits into float32."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Shape:
 
     - ``plane``: none; the half space below z = 0.
     - ``sphere``: radius.
-    - ``capsule``, ``cylinder``: radius, half length along the axis z; without the caps of a capsule.
+    - ``capsule``, ``cylinder``: radius, half length along the axis z, which excludes the caps of a capsule.
     - ``box``: half lengths along x, y and z.
     - ``ellipsoid``: semi-axes along x, y and z.
     - ``mesh``: none; the convex hull of its vertices. Made by ``hull``.
@@ -183,7 +183,7 @@ def bounding_radius(shape: Shape) -> float:
 
 
 def _find_triangles(v: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the triangles of a convex hull, those with no vertex above their plane; flat sides become fans."""
+    """Return the triangles of a convex hull, which have no vertex above their plane; flat sides become fans."""
     if len(v) > MAX_HULL_VERTICES:
         raise ConfigError(
             f"expected faces for more than {MAX_HULL_VERTICES} vertices, got {len(v)} vertices and no faces; pass the "

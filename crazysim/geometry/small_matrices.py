@@ -8,9 +8,10 @@ from jax import Array
 
 
 def solve_symmetric(matrix: Array, b: Array) -> Array:
-    """Return ``x`` of ``matrix x = b``, the matrix symmetric and positive definite, unrolled. (..., n)
+    """Solve ``matrix x = b`` for a symmetric positive definite matrix, unrolled. (..., n)
 
-    Scaled to a unit diagonal first: mass and moments of inertia are four orders apart.
+    The matrix is first scaled to a unit diagonal, because mass and moments of inertia differ by four orders of
+    magnitude.
     """
     n = b.shape[-1]
     scale = [jax.lax.rsqrt(matrix[..., k, k]) for k in range(n)]
@@ -30,9 +31,9 @@ def solve_symmetric(matrix: Array, b: Array) -> Array:
 
 
 def matvec(matrix: Array, vector: Array) -> Array:
-    """Return ``matrix @ vector`` in three operations, which compile sooner than the unrolled form.
+    """Return ``matrix @ vector`` in three operations, which compile faster than the unrolled form.
 
-    Sums of products are as exact on a GPU as elsewhere, where a product of matrices may be rounded to 10 bits.
+    On a GPU, a matrix product may be rounded to 10 bits; sums of products have full precision there.
 
     Args:
         matrix: (..., m, n)
@@ -45,5 +46,5 @@ def matvec(matrix: Array, vector: Array) -> Array:
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` as ``matvec`` does. (..., m, k)"""
+    """Return ``a @ b`` as a sum of products, as in ``matvec``. (..., m, k)"""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)

@@ -17,12 +17,12 @@ from crazysim.geometry.vector import Vector
 
 
 def sharpness(dtype: jnp.dtype) -> float:
-    """Return the inverse of the angle, 1/rad, within which two corners count as equally far."""
+    """Return the inverse of the angle, 1/rad, within which two corners count as tied."""
     return 1e3 if dtype == jnp.float32 else 1e7
 
 
 def segment_support_point(half: float, along: Array) -> Array:
-    """Return the support point of a segment, by the component of the direction along it, m. (...)"""
+    """Return the support point of a segment, m along it, from the component of the direction along it. (...)"""
     return half * jnp.clip(along * sharpness(along.dtype), -1.0, 1.0)
 
 

@@ -1,6 +1,7 @@
 """Vectors as three components, each an array of any shape.
 
-Without an axis of length three all arithmetic is element-wise, which fuses, and a compiler cannot reorder small sums.
+Without an axis of length three, all arithmetic is element-wise: a compiler can fuse it, and cannot reorder the short
+sums over components.
 """
 
 from __future__ import annotations

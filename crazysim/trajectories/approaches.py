@@ -18,7 +18,7 @@ CELLS_PER_BATCH = 500_000
 MAX_TABLE_CELLS = 4_000_000
 """Largest number of cells, of all drones, for which the motion of every drone is computed once and looked up."""
 MIN_CELL_DURATION = 1e-6
-"""Length below which a cell is not split, s: only a jump of a position leads there."""
+"""Length below which a cell is not split, s. Only cells with a jump of a position become so short."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ def closest_approaches(pieces: PieceTable, tolerance: float = 1e-3) -> list[Appr
 
     In a cell of time, the relative motion deviates from its chord by at most ``dt^2 / 8`` times its largest
     acceleration, plus ``dt / 4`` times the jumps of the velocity, plus the jumps of the position. The distance to the
-    chord less this bound is a lower bound of the distance; cells whose bound exceeds the smallest distance found, less
-    the tolerance, are dropped, and the others split. The relative acceleration is bounded by acceleration and jerk in
-    the middle and the largest snaps, so that drones in formation need no short cells.
+    chord minus this bound is a lower bound of the distance. Cells whose lower bound is at least the smallest distance
+    found minus the tolerance are dropped, and the others split. The relative acceleration is bounded by acceleration
+    and jerk in the middle and the largest snaps, so that drones in formation need no short cells.
 
     Args:
         pieces: Trajectories.
-        tolerance: Largest error of a distance, m. The distance is that at the time given, thus never too small.
+        tolerance: Largest error of a distance, m. A distance is evaluated at its ``time``, so it is never too small.
     """
     n = pieces.n_drones
     first, second = np.triu_indices(n, 1)
@@ -93,7 +93,7 @@ class _Motion:
     def in_cells(self, drone: Ints, cell: Ints, dt: float, table: tuple[Floats, ...] | None) -> tuple[Floats, ...]:
         """Return positions at start and end, acceleration and jerk in the middle (..., 3) and bound (...) of each cell.
 
-        It bounds the deviation from the chord, less the part of the derivatives in the middle.
+        The bound is for the deviation from the chord beyond the part due to the derivatives in the middle.
         """
         if table is not None:
             return tuple(x[drone, cell] for x in table)

@@ -46,7 +46,7 @@ def control_points(coefficients: NDArray, degree: int | None = None) -> NDArray:
 
     Args:
         coefficients: Constant term first. (k, n)
-        degree: Degree of the curve, at least ``n - 1``; None for that.
+        degree: Degree of the curve, at least ``n - 1``; None for ``n - 1``.
 
     Returns:
         (degree + 1, k)

@@ -13,11 +13,12 @@ from crazysim.trajectories.interpolation import Floats
 Vectors = tuple[Floats, Floats, Floats]
 
 N_SAMPLES = 65
-"""Number of times at which the deviation of each piece is sampled, and of those around each maximum."""
+"""Number of times at which the deviation is sampled along each piece, and again around each maximum."""
 RADIUS_MARGIN = 0.01
-"""Part of the radius that is kept free, so that the iteration ends; half of it is left at the end."""
+"""Fraction of the radius by which half-spaces are inside the corridor. Curves need only half of it, so that the
+iteration ends."""
 HEIGHT_TOLERANCE = 2e-5
-"""Distance by which a curve may be below the lowest height or above the largest one, m."""
+"""Distance by which a curve may be below the smallest height or above the largest one, m."""
 MAX_ITERATIONS = 100
 """Largest number of rounds; a few are typical."""
 
@@ -31,11 +32,12 @@ def fill_in_corridors(
 ) -> Floats:
     """Return the derivatives at all waypoints that minimise the cost within corridors and between two heights.
 
-    The corridor of a piece contains all points up to its radius from the line segment between its waypoints. Being
-    convex, it is the intersection of half-spaces, as is the space between two heights. In each round, those that touch
-    it where the curve is farthest outside are added to a quadratic program over the free derivatives, until the curve
-    stays inside (cutting planes, Kelley 1960). The program is one of least distance in the metric of the cost, and thus
-    of non-negative least squares (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section 23.4).
+    The corridor of a piece contains all points up to its radius from the line segment between its waypoints. It is
+    convex, and therefore an intersection of half-spaces, as is the space between two heights. Each round adds the
+    half-spaces where the curve is farthest outside to a quadratic program over the free derivatives, until the curve
+    stays inside (cutting planes, Kelley 1960). The program finds the point of least distance in the metric of the cost,
+    which reduces to non-negative least squares (Lawson and Hanson, *Solving Least Squares Problems*, 1974, section
+    23.4).
 
     Args:
         nodes: Derivatives at each waypoint, NaN where free. (n_pieces + 1, k, 3)
@@ -44,7 +46,8 @@ def fill_in_corridors(
         heights: Smallest and largest height, m; infinite for none.
 
     Raises:
-        OutsideError: If fixed derivatives lead out of the corridor, or beyond a height.
+        OutsideError: If fixed derivatives lead out of the corridor or beyond a height, or if the curve is still outside
+            after ``MAX_ITERATIONS`` rounds.
     """
     unit = float(np.mean(durations))
     powers = unit ** np.arange(nodes.shape[1])[:, None]
@@ -76,7 +79,7 @@ def fill_in_corridors(
 
 
 def _height_half_spaces(heights: Floats, limit: float, sign: int) -> tuple[np.ndarray, Floats, Floats, Floats]:
-    """Return the half-spaces that touch a height where curves are farthest beyond it.
+    """Return the half-spaces bounded by a height, at the times at which curves are farthest beyond it.
 
     Args:
         heights: Coefficients of z. (n_pieces, degree + 1)
@@ -124,7 +127,7 @@ def _maxima(value: Callable[[np.ndarray, Floats], Floats], least: Floats) -> tup
     """Return pieces, and times within them, of the local maxima of a quantity along curves. (n,) each
 
     Args:
-        value: Quantity at times within some pieces, (n, n_times) of (n,) and (n, n_times).
+        value: Function from pieces (n,) and times within them (n, n_times) to the quantity (n, n_times).
         least: Value of each piece below which maxima do not count. (n_pieces,)
     """
     samples = np.linspace(0.0, 1.0, N_SAMPLES)

@@ -2,7 +2,7 @@
 
 Curves are fitted piecewise by polynomials of degree 7 that have the curve's position and first three derivatives at
 both ends of each piece, in float64. The remainder of Hermite's interpolation in a piece of length h,
-``p^(8)(s) t^4 (t - h)^4 / 8!``, is at most ``max |p^(8)| (h / 2)^8 / 8!``, which decides the number of pieces.
+``p^(8)(s) t^4 (t - h)^4 / 8!``, is at most ``max |p^(8)| (h / 2)^8 / 8!``, which determines the number of pieces.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from crazysim.trajectories.trajectory import Trajectory
 TOLERANCE = 5e-6
 """Largest error of the position of a fitted curve, m; float32 adds its rounding, 6e-8 of a coordinate."""
 MAX_PIECES = 20_000
-"""Most pieces of a fitted curve."""
+"""Largest number of pieces of a fitted curve."""
 MAX_SIZE = 1e6
 """Largest length, m, number of oscillations, or phase, rad."""
 PERIOD_RANGE = (1e-3, 1e6)
@@ -28,7 +28,7 @@ DEFAULT_PERIOD = 5.0
 """Default period, s."""
 
 Curve = Callable[[np.ndarray, int], np.ndarray]
-"""Times, s (n,), and the order of a derivative to x, y, z, m, and yaw, rad, differentiated as often. (n, 4)"""
+"""Function from times, s (n,), and an order to this derivative of x, y, z, m, and yaw, rad. (n, 4)"""
 
 
 def figure_eight(
@@ -38,13 +38,13 @@ def figure_eight(
     speed: float | None = None,
     height: float = 1.0,
 ) -> Trajectory:
-    """Return a lying figure eight, ``(width/2 sin wt, depth/2 sin 2wt, height)``, that repeats.
+    """Return a horizontal figure eight, ``(width/2 sin wt, depth/2 sin 2wt, height)``, that repeats.
 
     Args:
         width: Size along x, m.
         depth: Size along y, m.
-        period: Period, s; None for 5 s, or for what the speed needs.
-        speed: Largest speed instead, m/s, which is reached in the middle.
+        period: Period, s; None for 5 s, or for the period that ``speed`` requires.
+        speed: Largest speed, m/s, instead of the period; it is reached in the middle.
         height: Height, m.
     """
     return lissajous((width / 2, depth / 2, 0.0), (1, 2, 1), period=period, speed=speed, center=(0.0, 0.0, height))
@@ -64,8 +64,8 @@ def lissajous(
         amplitudes: Half of the size along each axis, m. (3,)
         frequencies: Oscillations along each axis in one period, whole numbers. (3,)
         phases: Phase of each oscillation, rad. (3,)
-        period: Period, s; None for 5 s, or for what the speed needs.
-        speed: Upper bound of the speed instead, m/s, as if all axes were fastest at the same time.
+        period: Period, s; None for 5 s, or for the period that ``speed`` requires.
+        speed: Upper bound of the speed, m/s, instead of the period: the speed if all axes were fastest at once.
         center: Centre, world frame, m. (3,)
     """
     a, k, phi, c = (require_vector(n, x) for n, x in zip(("amplitudes", "frequencies", "phases", "center"),
@@ -92,8 +92,8 @@ def circle(
 
     Args:
         radius: Radius, m.
-        period: Period, s; None for 5 s, or for what the speed needs.
-        speed: Speed instead, m/s.
+        period: Period, s; None for 5 s, or for the period that ``speed`` requires.
+        speed: Speed, m/s, instead of the period.
         height: Height, m.
         along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
     """
@@ -115,8 +115,8 @@ def helix(
         radius: Radius, m.
         climb: Height gained with each turn, m.
         turns: Number of turns.
-        period: Time of one turn, s; None for 5 s, or for what the speed needs.
-        speed: Speed instead, m/s.
+        period: Time of one turn, s; None for 5 s, or for the time that ``speed`` requires.
+        speed: Speed, m/s, instead of the period.
         height: Height of the start, m.
         along: True to turn the drone's x axis along its motion; otherwise the yaw is zero.
     """
@@ -143,13 +143,13 @@ def line(
     Args:
         start: First point, world frame, m. (3,)
         end: Last point, world frame, m. (3,)
-        duration: Time that it takes, s; None for 5 s, or for what the speed needs.
-        speed: Largest speed instead, m/s, which is reached in the middle.
+        duration: Duration, s; None for 5 s, or for the duration that ``speed`` requires.
+        speed: Largest speed, m/s, instead of the duration; it is reached in the middle.
         yaw: Yaw, rad.
     """
     a, b = require_vector("start", start), require_vector("end", end)
-    # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1 with three derivatives of zero at both; its slope is at most
-    # 140 (1/2)^6 = 35/16.
+    # u^4 (35 - 84 u + 70 u^2 - 20 u^3) goes from 0 to 1, with three derivatives equal to zero at both ends. Its slope
+    # is at most 140 (1/2)^6 = 35/16.
     time = _period(duration, speed, 35 / 16 * float(np.linalg.norm(b - a)), "duration")
     c = np.zeros((1, 4, 8))
     c[0, :3] = np.outer(b - a, [0, 0, 0, 0, 35, -84, 70, -20]) / time ** np.arange(8)
@@ -163,7 +163,7 @@ def hover(pos: ArrayLike = (0.0, 0.0, 1.0), yaw: float = 0.0, duration: float = 
     Args:
         pos: The point, world frame, m. (3,)
         yaw: Yaw, rad.
-        duration: Time until what comes next with ``then``, s.
+        duration: Duration, s, after which a trajectory appended with ``then`` starts.
     """
     _period(duration, None, 0.0, "duration")
     return Trajectory.of_pieces(
@@ -177,7 +177,7 @@ def fit_curve(curve: Curve, duration: float, eighth: float, repeats: bool = Fals
     Args:
         curve: The curve with its derivatives up to the third.
         duration: Length of the curve, s.
-        eighth: Upper bound of its eighth derivative, m/s^8.
+        eighth: Upper bound of the eighth derivative of the curve, m/s^8.
         repeats: True to start again after the end.
     """
     longest = 2 * (TOLERANCE * math.factorial(8) / eighth) ** (1 / 8) if eighth > 0 else math.inf
@@ -189,7 +189,8 @@ def fit_curve(curve: Curve, duration: float, eighth: float, repeats: bool = Fals
     n = max(1, math.ceil(duration / longest))
     h = duration / n
     knots = np.linspace(0.0, duration, n + 1)
-    # Derivatives by u = t / h over k!: the first four coefficients at the start, four conditions at the end.
+    # Derivatives with respect to u = t / h, divided by k!: at the start they are the first four coefficients, at the
+    # end they give four conditions for the others.
     at_knots = np.stack([curve(knots, k) * h**k / math.factorial(k) for k in range(4)], axis=-1)
     binomials = np.array([[math.comb(j, k) for j in range(8)] for k in range(4)], float)
     rest = at_knots[1:] - at_knots[:-1] @ binomials[:, :4].T
@@ -198,7 +199,7 @@ def fit_curve(curve: Curve, duration: float, eighth: float, repeats: bool = Fals
 
 
 def _period(period: float | None, speed: float | None, length: float, name: str = "period") -> float:
-    """Return the time of something that has this length, m, for the largest speed of a constant rate."""
+    """Return the period, s: the given one, the default, or ``length`` over ``speed``, where ``length`` is in m."""
     if period is not None and speed is not None:
         raise ConfigError(f"expected {name} or speed, got both: {period!r} s and {speed!r} m/s. Leave one out.")
     if speed is None:
@@ -222,7 +223,7 @@ def require_positive(name: str, value: float) -> float:
 
 
 def require_vector(name: str, value: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[np.float64]:
-    """Return a setting as numbers of some shape."""
+    """Return a setting as an array of finite numbers of a given shape."""
     array = np.asarray(value)
     if array.shape != shape or array.dtype.kind not in "iuf" or not np.all(np.abs(array.astype(float)) <= MAX_SIZE):
         kind = "3 finite numbers" if shape else "a finite number"

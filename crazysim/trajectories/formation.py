@@ -1,4 +1,4 @@
-"""Formations: places of several drones, for starts, targets and offsets of trajectories. (n, 3) each"""
+"""Formations: places of several drones, to use as starts, targets or offsets of trajectories. (n, 3) each"""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def circle(
 
     Args:
         n: Number of places.
-        spacing: Distance between neighbours, m; None for 1 m, or for what the radius gives.
-        radius: Radius instead, m.
+        spacing: Distance between neighbours, m; None for 1 m, or for the distance that ``radius`` gives.
+        radius: Radius, m, instead of the spacing.
         center: Centre, world frame, m. (3,)
         yaw: Angle by which the circle is turned, rad.
     """
@@ -76,7 +76,7 @@ def matched(starts: ArrayLike, targets: ArrayLike) -> np.ndarray:
     concurrent assignment and planning of trajectories for multiple robots", IJRR 2014).
 
     Args:
-        starts: Places that the drones start from, m. (n, 3)
+        starts: Places from which the drones start, m. (n, 3)
         targets: Places to fly to, in any order, m. (n, 3)
     """
     a, b = np.asarray(starts, float), np.asarray(targets, float)

@@ -1,4 +1,4 @@
-"""Piecewise polynomials through waypoints that minimise the square of a derivative, in float64 on the host.
+"""Piecewise polynomials through waypoints that minimise the integral of a squared derivative, in float64 on the host.
 
 A piece of degree 2k - 1 is determined by the values of its first k derivatives, the zeroth included, at both ends
 (Hermite form). The integral of the squared k-th derivative is then a quadratic form of the derivatives at the
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 @functools.cache
 def hermite_basis(order: int) -> Floats:
-    """Return the polynomials on [0, 1] that have one derivative 1 at one end and all others zero.
+    """Return the polynomials on [0, 1] with one of the first k derivatives at the ends equal to 1 and all others zero.
 
     ``u^j / j! (1 - u)^k sum_i C(k - 1 + i, i) u^i`` for derivative j at 0, with i below k - j; mirrored for 1.
 
@@ -30,14 +30,15 @@ def hermite_basis(order: int) -> Floats:
         order: Number k of derivatives at each end, the zeroth included.
 
     Returns:
-        Coefficients, constant term first, of each polynomial: derivatives 0 to k - 1 at 0, then those at 1. (2k, 2k)
+        Coefficients, constant term in the first row. Each column is a polynomial: first for derivatives 0 to k - 1 at
+        0, then for derivatives 0 to k - 1 at 1. (2k, 2k)
     """
     return np.array(_exact_basis(order), float)
 
 
 @functools.cache
 def _exact_basis(order: int) -> list[list[Fraction]]:
-    """Return the rows of ``hermite_basis``, transposed: polynomials as columns."""
+    """Return the rows of ``hermite_basis`` as exact fractions; each column is a polynomial."""
     k = order
     columns = []
     for j in range(k):
@@ -69,7 +70,7 @@ def unit_cost(order: int) -> Floats:
 
 
 def _exponents(order: int) -> NDArray[np.int64]:
-    """Return the powers of the duration by which ``unit_cost`` is scaled. (2k, 2k)"""
+    """Return the exponents of the duration in the factors that scale ``unit_cost``. (2k, 2k)"""
     j = np.tile(np.arange(order), 2)
     return 1 - 2 * order + j[:, None] + j
 
@@ -132,7 +133,7 @@ def derivative_cost(nodes: Floats, durations: Floats) -> float:
 def cost_gradient(nodes: Floats, durations: Floats) -> Floats:
     """Return the derivative of the minimum of the cost with respect to the durations. (n_pieces,)
 
-    At a minimum over the free derivatives it is the partial derivative, with those held (envelope theorem).
+    At a minimum over the free derivatives, it equals the partial derivative with these held fixed (envelope theorem).
 
     Args:
         nodes: Derivatives at the minimum, as from ``fill_derivatives``. (n_pieces + 1, k, n_axes)
@@ -150,7 +151,7 @@ def end_derivatives(nodes: Floats) -> Floats:
 
 
 def unit_coefficients(nodes: Floats, durations: Floats) -> Floats:
-    """Return the polynomials of each piece's time divided by its length, constant term first.
+    """Return the polynomials in each piece's time divided by its length, constant term first.
 
     Args:
         nodes: Derivatives at the waypoints, without NaN. (n_pieces + 1, k, n_axes)

@@ -1,4 +1,4 @@
-"""Limits of trajectories: what a drone and a table may do, and the check that they do."""
+"""Limits of single trajectories and of several flown together, and a check against these limits."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from crazysim.trajectories.piece_table import PieceTable
 from crazysim.trajectories.trajectory import Trajectory
 
 LIMIT_TOLERANCE = 1e-4
-"""Part of a limit by which a value may exceed it, of 1 m for heights below that: derivatives of polynomials in float32
-are that exact."""
+"""Fraction of a limit by which a value may exceed it; height limits below 1 m count as 1 m. It allows for the errors of
+derivatives of polynomials in float32."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a trajectory and of a table; None for no limit."""
+    """Limits of trajectories, and of the distance between drones; None for no limit."""
 
     speed: float | None = setting(default=None, positive=True)
     """Largest speed, m/s."""
@@ -73,7 +73,7 @@ class Limits:
         return {field.name: getattr(self, field.name) for field in fields if getattr(self, field.name) is not None}
 
     def of_airframe(self, airframe: AirframeSource) -> Limits:
-        """Return these limits with the thrusts of an airframe where there are none.
+        """Return these limits with the thrusts of an airframe where a thrust limit is None.
 
         Args:
             airframe: Name of a built-in airframe, path, dict or airframe.
@@ -128,7 +128,7 @@ class Report:
     closest: tuple[Approach, ...]
     """Closest approach of every pair, nearest pair first; empty for one drone."""
     peaks: Mapping[str, Peak]
-    """Largest value of each quantity, and smallest thrust, of every drone, with its time."""
+    """Largest value of each quantity of every drone, with its time; the smallest for ``min_thrust`` and ``floor``."""
     names: tuple[str, ...]
     """Names of the drones. (n_drones,)"""
     duration: float
@@ -178,9 +178,10 @@ def check(
             trajectory with several ``starts`` is flown by as many drones.
         limits: Limits.
         airframe: Airframe whose thrusts are limits where ``limits`` has none; None for no such limits.
-        starts: Start of each drone, s, as in ``Follow``: one that is negative has begun before time zero. () or
+        starts: Start of each drone, s, as in ``Follow``. A negative start means that it began before time zero. () or
             (n_drones,)
-        duration: Duration, s; None for the time at which the last drone ends. A trajectory that repeats counts once.
+        duration: Duration, s; None for the time at which the last drone ends, where only the first round of a
+            repeating trajectory counts.
         names: Names of the drones for the report; None for their numbers.
         tolerance: Largest error of a distance, m.
     """

@@ -15,11 +15,11 @@ from crazysim.trajectories.piece_table import Floats, Ints, PieceTable
 N_INTERVALS = 64
 """Number of intervals into which each piece is divided by the samples."""
 REFINED_PART = 0.05
-"""Part of the range of the samples by which one may lie below the largest and still be refined."""
+"""Fraction of the range of the samples by which a local maximum may be below the largest one and still be refined."""
 N_SECTIONS = 40
-"""Golden sections: they shorten two intervals to 1e-10 of a piece."""
+"""Number of golden sections. They shorten two intervals to about 1e-10 of a piece."""
 BATCH_SIZES = (64, 4096)
-"""Numbers of times at which rates are computed at once, few or many, so that two compilations serve all."""
+"""Numbers of times, few or many, at which rates are computed at once, so that two compilations suffice."""
 PIECES_PER_BATCH = 2048
 """Number of pieces that are sampled at once, which bounds the memory."""
 
@@ -31,7 +31,7 @@ class Quantity:
     unit: str
     """Unit."""
     orders: tuple[int, ...]
-    """Orders of the derivatives that it is computed from."""
+    """Orders of the derivatives from which it is computed."""
     compute: Callable[..., Floats]
     """Function of these derivatives of x, y, z and yaw, (..., 4) each. (...)"""
     sign: int = 1
@@ -137,14 +137,14 @@ def _peak(table: PieceTable, quantity: Quantity) -> Peak:
 
 
 def _candidates(samples: Floats, threshold: Floats) -> tuple[Ints, Ints]:
-    """Return piece and sample of the local maxima of each piece above its threshold, plateaus by their first sample."""
+    """Return piece and sample of the local maxima of pieces above their thresholds; a plateau by its first sample."""
     padded = np.pad(samples, ((0, 0), (1, 1)), constant_values=-np.inf)
     is_maximum = (samples > padded[:, :-2]) & (samples >= padded[:, 2:])
     return np.nonzero(is_maximum & (samples >= threshold[:, None]))  # type: ignore[return-value]
 
 
 def _golden_sections(function: Callable[[Floats], Floats], low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return the maxima of a function in intervals in which it has one, and their arguments. (n,) each"""
+    """Return the maxima of a function in intervals with one maximum each, and their arguments. (n,) each"""
     ratio = (np.sqrt(5) - 1) / 2
     left, right = high - ratio * (high - low), low + ratio * (high - low)
     at_left, at_right = function(left), function(right)

@@ -31,17 +31,17 @@ class PieceTable:
     length: Floats
     """Duration of each piece, s. (n_pieces,)"""
     coefficients: Floats
-    """Coefficients of x, y, z, m, and yaw, rad, of a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
+    """Coefficients of x, y, z, m, and yaw, rad, in a piece's time divided by its length. (n_pieces, 4, degree + 1)"""
 
     @staticmethod
     def of(trajectories: Sequence[Trajectory], starts: ArrayLike = 0.0, duration: float | None = None) -> PieceTable:
-        """Return the pieces of trajectories, with those at rest before the start and after the end.
+        """Return the pieces of trajectories, with pieces at rest before their start and after their end.
 
         Args:
             trajectories: Trajectories, one for each drone.
-            starts: Start of each, s; one that is negative has begun before time zero. () or (n_drones,)
-            duration: Duration, s; None for the time at which the last drone ends, where a trajectory that repeats
-                counts once.
+            starts: Start of each, s. A negative start means that it began before time zero. () or (n_drones,)
+            duration: Duration, s; None for the time at which the last trajectory ends, where only the first round of a
+                repeating trajectory counts.
         """
         if not trajectories:
             raise ConfigError("expected at least one trajectory, got none. Pass a list with one per drone.")
@@ -91,7 +91,7 @@ class PieceTable:
         return self._derivatives[order]
 
     def piece(self, drone: Ints, t: NDArray) -> Ints:
-        """Return the piece that each drone is in at a time; where two meet, the later one. (...)"""
+        """Return the piece that contains each drone's time; where two meet, the later one. (...)"""
         t = np.clip(t, 0.0, self.duration)
         index = np.searchsorted(self._keys, np.asarray(drone) * (self.duration + 1) + t, side="right") - 1
         return np.maximum(index, self.first[drone])

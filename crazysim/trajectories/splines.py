@@ -13,7 +13,7 @@ from crazysim.trajectories.bezier import power_coefficients
 from crazysim.trajectories.trajectory import Trajectory
 
 SPLINE_ORDERS = {3: 2, 5: 3, 7: 4}
-"""Degree of a spline and the derivative whose square it minimises."""
+"""Order of the derivative whose squared integral a spline minimises, by the degree of the spline."""
 
 
 def spline(
@@ -64,8 +64,8 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
 
     Args:
         ends: End of each curve, s since the start of the trajectory, ascending. (n_pieces,)
-        control_points: Control points of each curve, the first and the last included: x, y, z, m, and, in all curves
-            or in none, yaw, rad. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
+        control_points: Control points of each curve, including the first and the last: x, y, z, m, and optionally yaw,
+            rad, in all curves or in none. The degrees may differ. n_pieces times (degree + 1, 3) or (degree + 1, 4)
         repeats: True to start again after the end.
     """
     at = np.asarray(ends, float)
@@ -96,7 +96,7 @@ def of_bezier(ends: ArrayLike, control_points: Sequence[ArrayLike], repeats: boo
 
 
 def trajectory_of_unit_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
-    """Return the trajectory of polynomials of each piece's time divided by its length.
+    """Return the trajectory of polynomials in each piece's time divided by its length.
 
     Args:
         durations: Length of each piece, s. (n_pieces,)
@@ -124,7 +124,7 @@ def unwrap_yaw(yaw: ArrayLike, n_points: int) -> NDArray[np.float64]:
 
 
 def require_finite(values: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """Return the values.
+    """Return the values after a check that all are finite.
 
     Args:
         values: Numbers. (...)

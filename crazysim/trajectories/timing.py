@@ -1,4 +1,4 @@
-"""Durations of the pieces of a trajectory: their ratios by the cost, their sum by the limits."""
+"""Durations of the pieces of a trajectory: the cost determines their ratios, the limits their sum."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from crazysim.trajectories.peaks import QUANTITIES, peaks
 from crazysim.trajectories.piece_table import PieceTable
 
 LIMIT_MARGIN = 1e-4
-"""Part of a limit that is left unused, for the rounding of trajectories in float32. Heights, on which
-waypoints may lie, may be exceeded by half of it instead."""
+"""Fraction of a limit that is left unused, for the rounding of trajectories in float32. Height limits may instead be
+exceeded by half of this fraction, since waypoints may lie on them."""
 PRECISION = 1e-5
-"""Relative precision of the factor of time."""
+"""Relative precision of the factor by which durations are scaled."""
 DURATION_FACTOR = 1.25
 """Factor by which the durations are changed until the limits are met, then until they are not."""
 N_STEPS = 50
@@ -28,7 +28,8 @@ N_STEPS = 50
 def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
     """Return the shortest durations from rest to rest over distances at bounded speed and acceleration. (n_pieces,)
 
-    Only the ratios matter, so 1 m/s and one second to speed up serve where there is no limit.
+    Only the ratios matter, so a missing limit of speed is replaced by 1 m/s, and a missing limit of acceleration by one
+    that reaches the speed in one second.
     """
     speed = limits.speed or 1.0
     acceleration = limits.acceleration or speed
@@ -37,10 +38,10 @@ def trapezoid_durations(distances: Floats, limits: Limits) -> Floats:
 
 
 def best_ratios(nodes: Floats, durations: Floats) -> Floats:
-    """Return the durations of the same sum at which the cost is smallest.
+    """Return the durations with the same sum that minimise the cost.
 
-    A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``);
-    it finds a local minimum.
+    A quasi-Newton method over the logarithms of the ratios, with the exact gradient (``interpolation.cost_gradient``),
+    finds a local minimum.
 
     Args:
         nodes: Derivatives at each waypoint, NaN where free. (n_pieces + 1, k, 3)
@@ -72,7 +73,7 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
 
     Args:
         durations: Length of each piece, s. (n_pieces,)
-        coefficients: Coefficients of x, y, z and yaw, of a piece's time divided by its length.
+        coefficients: Coefficients of x, y, z and yaw, in a piece's time divided by its length.
             (n_pieces, 4, degree + 1)
         limits: Limits; the separation concerns several trajectories and is not checked.
     """
@@ -88,8 +89,9 @@ def violated_limits(durations: Floats, coefficients: Floats, limits: Limits) -> 
 def shortest_durations(solve: Callable[[Floats], Floats], durations: Floats, limits: Limits) -> Floats:
     """Return the durations, in the same ratios, at which a trajectory just meets its limits.
 
-    The search starts slow. A smallest thrust can be exceeded at one speed and met again at a higher one, where the
-    thrust turns faster than the drone falls; such speeds are not looked for.
+    The search slows the flight until the limits are met, then speeds it up until they are not. A smallest thrust can be
+    violated at one speed and met again at a higher one, where the thrust turns faster than the drone falls; such speeds
+    are not searched for.
 
     Args:
         solve: Function that returns the coefficients for durations.

@@ -26,7 +26,7 @@ N_DERIVATIVES = 4
 
 
 class Trajectory(PyTree):
-    """Position and yaw of one vehicle as piecewise polynomials of time, with any leading axes for several.
+    """Position and yaw of one vehicle as piecewise polynomials of time; leading axes hold several trajectories.
 
     Each piece is a polynomial of its own time scaled to ``u`` in [0, 1], which suits float32. Before its start a
     trajectory is at rest at its first point; after its end it is at rest at its last point, or starts again.
@@ -35,19 +35,20 @@ class Trajectory(PyTree):
     ends: Array = leaf("shared", 1)
     """End of each piece, s since the start of the trajectory, ascending. Padding repeats the last one. (n_pieces,)"""
     coefficients: Array = leaf("shared", 3)
-    """Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, of the piece's time divided by its
-    length. (n_pieces, 4, degree + 1)"""
+    """Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, as polynomials in the piece's time
+    divided by its length. (n_pieces, 4, degree + 1)"""
     repeats: Array = leaf("shared", 0)
     """True where the trajectory starts again after its end. ()"""
 
     @staticmethod
     def of_pieces(durations: ArrayLike, coefficients: ArrayLike, repeats: bool = False) -> Trajectory:
-        """Return the trajectory of polynomials of the time in seconds, worked out in float64 on the host.
+        """Return the trajectory of polynomials in the time in seconds, computed in float64 on the host.
 
         Args:
             durations: Length of each piece, s. (n_pieces,)
-            coefficients: Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, of the time
-                since its start, s. Without yaw, it is zero. (n_pieces, 4, degree + 1) or (n_pieces, 3, degree + 1)
+            coefficients: Coefficients of x, y, z, m, and yaw, rad, in each piece, constant term first, as polynomials
+                in the time since its start, s. An omitted yaw is zero. (n_pieces, 4, degree + 1) or (n_pieces, 3,
+                degree + 1)
             repeats: True to start again after the end.
         """
         lengths, c = np.asarray(durations, float), np.asarray(coefficients, float)
@@ -77,7 +78,7 @@ class Trajectory(PyTree):
 
     @property
     def n_pieces(self) -> int:
-        """Number of pieces, with padding."""
+        """Number of pieces, including padding."""
         return self.ends.shape[-1]
 
     @property
@@ -104,11 +105,11 @@ class Trajectory(PyTree):
     def evaluate_one(self, index: Array | int, t: ArrayLike) -> Setpoint:
         """Return the setpoint of one of several trajectories at one time, with derivatives up to snap.
 
-        It reads the numbers that it needs and no others, so that many trajectories cost no more than one.
+        It reads only the coefficients of one piece and a few ends, so that its cost hardly depends on the number of
+        trajectories.
 
         Args:
-            index: Index along the one leading axis; the nearest trajectory if there is none of this
-                index. ()
+            index: Index along the one leading axis, clipped to the trajectories that exist. ()
             t: Time since the start of the trajectory, s. ()
         """
         return self.evaluate_at_rate(index, t, 1.0)
@@ -122,8 +123,8 @@ class Trajectory(PyTree):
             index: Index along the one leading axis, as for ``evaluate_one``. ()
             t: Time since the start of the trajectory, at its own speed, s. ()
             rate: Time of the trajectory that passes in one second, s. ()
-            degrees: Degrees of x, y, z and yaw in all pieces if they are known, -1 for zero: whatever is above them is
-                not read; None for the largest. (4,)
+            degrees: Largest degrees of x, y, z and yaw over all pieces, -1 for an axis that is zero; coefficients of
+                higher degrees are ignored. None for ``degree`` on every axis. (4,)
         """
         ends, coefficients = jnp.asarray(self.ends), jnp.asarray(self.coefficients)
         end, repeats = _entry_at(ends, index, ends.shape[1] - 1), _entry_at(jnp.asarray(self.repeats), index)
@@ -146,14 +147,14 @@ class Trajectory(PyTree):
 
         Args:
             t: Time since the start of the trajectory, s. ()
-            order: Highest derivative, at most 4. What is above it is not computed.
+            order: Highest derivative to compute, at most 4.
 
         Returns:
             Values, their first derivatives, and so on. (4,) each
         """
         xp, n = _array_module(self), self.n_pieces
         starts = xp.concatenate([xp.zeros_like(self.ends[:1]), self.ends[:-1]])
-        # One row of a table for each piece: a single lookup, whose parts begin at multiples of four.
+        # One row of a table for each piece, so that a single lookup suffices; its parts begin at multiples of four.
         numbers = [starts, _inverse(xp, self.ends - starts), xp.zeros((2, n), self.ends.dtype)]
         table = xp.concatenate([xp.vstack(numbers).T, self.coefficients.reshape(n, -1)], axis=1)
         local, inside = _local_time(jnp.asarray(t, self.ends.dtype), self.ends[-1], self.repeats)
@@ -163,9 +164,9 @@ class Trajectory(PyTree):
         return _per_second(derivatives, jnp.where(inside, row[1], 0.0))
 
     def degrees(self) -> tuple[int, ...]:
-        """Return the largest degrees of x, y, z and yaw with a coefficient that is not zero, -1 for zero, on the host.
+        """Return the largest degree with a nonzero coefficient of x, y, z and yaw, or -1 for none, on the host.
 
-        With coefficients that are not known yet, as under ``jax.jit``, it is the largest degree for all.
+        If the coefficients are traced, as under ``jax.jit``, it is ``degree`` for every axis.
         """
         if isinstance(self.coefficients, jax.core.Tracer):
             return (self.degree,) * 4
@@ -196,7 +197,7 @@ class Trajectory(PyTree):
     def padded(self, n_pieces: int, degree: int) -> Trajectory:
         """Return the same trajectory with at least this number of pieces and this degree, for one vehicle.
 
-        Further pieces have no length and stay at the last point.
+        Added pieces have no length and stay at the last point.
         """
         xp = _array_module(self)
         more, higher = max(0, n_pieces - self.n_pieces), max(0, degree - self.degree)
@@ -229,15 +230,15 @@ class Trajectory(PyTree):
         )
 
     def then(self, other: Trajectory, transition: float = 0.0) -> Trajectory:
-        """Return this trajectory followed by another one, which starts at this one's end; for one vehicle.
+        """Return this trajectory followed by another one, which starts when this one ends; for one vehicle.
 
-        Without a transition, whatever differs between this one's end and the other one's start jumps: the position, if
-        they are in different places; the velocity, if a drone that rests is to join a curve.
+        Without a transition, any difference between this one's end and the other one's start is a jump: of the position
+        if they are in different places, or of the velocity if a drone at rest is to join a curve.
 
         Args:
             other: The trajectory that follows.
-            transition: Time between the two, s, during which one more piece of degree 7 connects them, with continuous
-                velocity, acceleration and jerk, and turns the shorter way; 0 for none.
+            transition: Time between the two, s, during which an additional piece of degree 7 connects them, with
+                continuous velocity, acceleration and jerk, and yaw turned the shorter way; 0 for none.
         """
         if self.repeats or other.repeats:
             which = "first" if self.repeats else "second"
@@ -308,7 +309,7 @@ def _entry_at(x: Array, *index: Array | int) -> Array:
 
 
 def _local_time(t: Array, end: Array, repeats: Array) -> tuple[Array, Array]:
-    """Return the time between start and end at which a trajectory is at a time, s, and whether it moves. () each"""
+    """Return a time mapped to between the start and end of a trajectory, s, and whether it is under way. () each"""
     local = jnp.where(t < 0, 0.0, t)
     # A remainder by floor is a vector instruction; lax.rem is a call for each number.
     local = local - jnp.where(repeats, end * lax.floor(local / end), 0.0)
@@ -322,11 +323,11 @@ def _inverse(xp: Any, length: Array) -> Array:
 
 
 def _per_second(derivatives: list[Array], rate: Array) -> list[Array]:
-    """Return derivatives by the time of a piece as derivatives by the time in seconds.
+    """Convert derivatives with respect to the scaled time of a piece to derivatives with respect to time in seconds.
 
     Args:
         derivatives: Value, first derivative, and so on. (4,) each
-        rate: Time of the piece that passes in one second, 1/s. ()
+        rate: Scaled time of the piece that passes in one second, 1/s. ()
     """
     factors = itertools.accumulate([rate] * (len(derivatives) - 1), lambda a, b: a * b)
     return [derivatives[0], *(x * factor for x, factor in zip(derivatives[1:], factors, strict=True))]
@@ -342,7 +343,7 @@ def _setpoint(derivatives: list[Array]) -> Setpoint:
 
 
 def _piece(ends: Array, index: Array | int, t: Array) -> Array:
-    """Return the number of ends of a trajectory up to a time, at most the index of its last piece. ()"""
+    """Return the index of the piece at a time: the number of ends up to it, at most the last index. ()"""
     n = ends.shape[1]
     if len(ends) == 1 and n <= MAX_COUNTED_PIECES:
         return jnp.sum(ends[0, :-1] <= t, dtype=jnp.int32)

@@ -18,7 +18,8 @@ from crazysim.trajectories.splines import require_finite, trajectory_of_unit_pie
 from crazysim.trajectories.trajectory import Trajectory
 
 YAW_ORDER = 2
-"""Derivative of the yaw whose square is minimised: the torque depends on the second (Mellinger and Kumar 2011)."""
+"""Order of the yaw derivative whose squared integral is minimised. The torque depends on the second derivative
+(Mellinger and Kumar 2011)."""
 
 
 def minimum_snap(
@@ -40,14 +41,14 @@ def minimum_snap(
 
     Args:
         waypoints: Positions, world frame, m. (n, 3)
-        durations: Time from each waypoint to the next, s. None for the shortest in ratios of least snap that meet the
-            limits. (n - 1,)
-        limits: Limits, needed without durations. The path stays between floor and height; with durations the others are
-            checked. The separation concerns a fleet, which ``check`` compares.
+        durations: Time from each waypoint to the next, s. None for the shortest durations that meet the limits, in
+            ratios that minimise the snap. (n - 1,)
+        limits: Limits, needed without durations. The path stays between floor and height. With durations, the other
+            limits are checked. The separation between drones is not; use ``check`` for it.
         yaw: Yaw at the waypoints, rad: one for all, or one for each, between which the drone turns the shorter way with
             the smallest integral of the squared angular acceleration. () or (n,)
         corridors: Largest distance from the line segment between two waypoints, m, infinite for no bound: one for all
-            or one for each. None for none. () or (n - 1,)
+            or one for each. None for no corridors. () or (n - 1,)
         velocities: Velocities at the waypoints, world frame, m/s, NaN where free. None for rest at both ends and free
             elsewhere. (n, 3)
         accelerations: Accelerations, likewise, m/s^2. (n, 3)
@@ -100,7 +101,7 @@ def smoothest(waypoints: Array, durations: Array, order: int = 4) -> tuple[Traje
     Args:
         waypoints: Positions, world frame, m. (n, 3)
         durations: Time from each waypoint to the next, s. (n - 1,)
-        order: Derivative whose square is minimised: 2, 3 or 4.
+        order: Order of the derivative whose squared integral is minimised: 2, 3 or 4.
 
     Returns:
         The trajectory, and the integral, m^2 / s^(2 order - 1). ()

@@ -16,7 +16,7 @@ LEVEL_DURATION = 0.1
 OUTLIER_DISTANCE = 0.3
 """Distance from the median over ``MEDIAN_DURATION`` beyond which a position is an outlier, m."""
 MEDIAN_DURATION = 0.1
-"""Duration of that median, s: over longer ones fast turns look like outliers."""
+"""Duration over which the median is taken, s; over longer ones, fast turns look like outliers."""
 CUTOFFS = {"translation": 6.0, "rotation": 8.0}
 """Cutoffs of the filters of Crazyflow's identification, Hz."""
 
@@ -93,17 +93,17 @@ def derivatives_svf(data: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
 def state_variable_filter(
     y: ArrayLike, t: ArrayLike, f_c: float = 1.0, N_deriv: int = 2, *, held: bool = False
 ) -> NDArray:
-    """Return a signal through Butterworth low-passes backward and forward in time, and its derivatives.
+    """Filter a signal by a Butterworth low-pass backward and forward in time; return it and its derivatives.
 
-    The low-pass of order ``N_deriv + 2`` is simulated exactly between samples, where the signal is linear, or
-    constant where it is held. Uneven times are resampled.
+    The low-pass of order ``N_deriv + 2`` is simulated exactly for a signal that is linear between samples, or constant
+    if it is held. Signals at uneven times are resampled.
 
     Args:
         y: Signals. (n,) or (n_signals, n)
         t: Times, s. (n,)
         f_c: Cutoff, Hz.
         N_deriv: Number of derivatives.
-        held: True for signals that stay until the next sample.
+        held: True for signals that stay constant until the next sample.
 
     Returns:
         Filtered signals and derivatives, (n_signals, N_deriv + 1, n), without axes of length one.

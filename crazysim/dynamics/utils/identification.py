@@ -23,7 +23,7 @@ RATE_RANGE = (0.5, 500.0)
 BLOCK_DURATION = 5.0
 """Duration of the blocks whose scatter gives the standard deviations, s."""
 EDGE_DURATION = 0.5
-"""Duration at both ends of a log, s, that is left out: filters of 6 Hz start there, with a velocity that they lack."""
+"""Duration at both ends of a log, s, that is omitted: the 6 Hz filters start there at rest, with a wrong velocity."""
 FITTED_MODELS = (Dynamics.so_rpy, Dynamics.so_rpy_rotor, Dynamics.so_rpy_rotor_drag)
 """Models that are fitted."""
 
@@ -39,8 +39,8 @@ def sys_id_translation(
 ) -> dict[str, float]:
     """Return the parameters of the translation of a fitted model.
 
-    For each rate of the lag the others follow by linear least squares of the filtered accelerations; the rate is found
-    by a search. The lag is simulated exactly between samples.
+    The rate of the lag is found by a search. For each rate, the other parameters follow from linear least squares on
+    the filtered accelerations. The lag is simulated exactly between samples.
 
     Args:
         dynamics: ``so_rpy``, ``so_rpy_rotor`` or ``so_rpy_rotor_drag``.
@@ -72,9 +72,9 @@ def sys_id_rotation(
     verbose: int = 0,
     plot: bool = False,
 ) -> dict[str, NDArray]:
-    """Return the parameters of the rotation of the fitted models; roll and pitch share theirs.
+    """Return the parameters of the rotation of the fitted models; roll and pitch have the same values.
 
-    Simulated angles are fitted to the filtered ones by Levenberg and Marquardt's method.
+    Simulated angles are fitted to the filtered ones by the Levenberg-Marquardt method.
 
     Args:
         data: A log from ``derivatives_svf``.
@@ -151,7 +151,7 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
         def slope(x: NDArray, data: list = data) -> NDArray:
             return np.concatenate([np.asarray(_rotation_slope(jnp.asarray(x), *log), np.float64) for log in data])
 
-        # Angles, rates and accelerations obey the equation up to noise, which gives the first guess.
+        # Angles, rates and accelerations satisfy the equation up to noise, so least squares give the first guess.
         columns = [
             np.concatenate([np.asarray(log[key], np.float64)[:, axes].ravel() for log in logs])
             for key in ("SVF_rpy", "SVF_drpy", "SVF_cmd_rpy", "SVF_ddrpy")
@@ -172,7 +172,7 @@ def fit_rotation(logs: Sequence[Mapping[str, ArrayLike]]) -> tuple[dict[str, NDA
 def _terms(
     kind: Dynamics, mass: float, log: Mapping[str, ArrayLike], rate: float, gravity: ArrayLike
 ) -> tuple[NDArray, NDArray]:
-    """Return the acceleration per coefficient, (n, 3, k), and by all forces but gravity, (n, 3)."""
+    """Return the acceleration per coefficient, (n, 3, k), and that by all forces except gravity, (n, 3), m/s^2."""
     time, vel, acc, quat, cmd = (
         np.asarray(log[key], np.float64) for key in ("time", "SVF_vel", "SVF_acc", "SVF_quat", "SVF_cmd_f")
     )
@@ -188,7 +188,7 @@ def _terms(
 
 
 def lag_signal(x: NDArray, dt: float, rate: float | NDArray) -> NDArray:
-    """Return a signal, linear between samples, behind a lag of first order that starts at rest.
+    """Return a signal, linear between samples, after a first-order lag that starts in equilibrium.
 
     Args:
         x: Samples. (n, ...)

@@ -14,9 +14,9 @@ from crazysim.errors import ConfigError, short_repr
 MAX_FILE_BYTES = 256 * 2**20
 """Largest file that is read, bytes."""
 MAX_POINTS = 20_000
-"""Most points of a trajectory."""
+"""Largest number of points of a trajectory."""
 MAX_TIME = 7200.0
-"""Latest time, s: up to there float32 resolves half a millisecond."""
+"""Latest time, s. Up to this time, float32 resolves half a millisecond."""
 MIN_LENGTH = 1e-3
 """Shortest piece, s: the resolution of Skybrush and of the Crazyflie's compressed trajectories."""
 MAX_COORDINATE = 1e5
@@ -24,7 +24,7 @@ MAX_COORDINATE = 1e5
 
 
 def refuse(expected: str, got: str, place: str) -> NoReturn:
-    """Raise the error of a value that is not accepted.
+    """Raise the error for a value that is not accepted.
 
     Args:
         expected: Description of an accepted value.
@@ -35,10 +35,10 @@ def refuse(expected: str, got: str, place: str) -> NoReturn:
 
 
 def parse_json(content: bytes | str, place: str) -> Any:
-    """Return a JSON document.
+    """Return the value of a JSON document.
 
     Raises:
-        ConfigError: If it is none.
+        ConfigError: If the content is not valid JSON.
     """
     try:
         return json.loads(content)
@@ -54,7 +54,7 @@ def require_object(value: object, place: str) -> dict[str, Any]:
 
 
 def require_array(value: object, n_max: int, place: str) -> list[Any]:
-    """Return a value that must be a JSON array of at most some entries."""
+    """Return a value that must be a JSON array of at most ``n_max`` entries."""
     if not isinstance(value, list):
         refuse("an array [...]", short_repr(value), place)
     if len(value) > n_max:
@@ -81,14 +81,14 @@ def require_number(value: object, place: str, low: float = -np.inf, high: float 
 
 
 def require_text(value: object, place: str, n_max: int = 200) -> str:
-    """Return a value that must be a string of at most some characters."""
+    """Return a value that must be a string of at most ``n_max`` characters."""
     if not isinstance(value, str) or len(value) > n_max:
         refuse(f"a text of at most {n_max} characters", short_repr(value), place)
     return value
 
 
 def require_numbers(value: object, lengths: Sequence[int], bound: float, place: str) -> NDArray:
-    """Return a value that must be an array of finite numbers, of one of some lengths, up to a bound in size."""
+    """Return a value that must be an array of finite numbers up to ``bound`` in size, of one of the ``lengths``."""
     if isinstance(value, tuple):
         value = list(value)
     if not isinstance(value, list) or len(value) not in lengths:
@@ -97,7 +97,7 @@ def require_numbers(value: object, lengths: Sequence[int], bound: float, place: 
 
 
 def require_ascending(times: NDArray, least: float, place: str) -> None:
-    """Check that times ascend by a least difference: there are neither overlaps nor pieces without length."""
+    """Check that times ascend by at least ``least``, so that no pieces overlap or have zero length."""
     steps = np.diff(times)
     if len(steps) and steps.min() < least * (1 - 1e-6):
         k = int(np.argmin(steps))

@@ -19,9 +19,9 @@ POLYNOMIAL_HEADER = ",".join(["duration", *(f"{axis}^{k}" for axis in ("x", "y",
 
 
 def load_csv(path: str | Path) -> Trajectory:
-    """Return the trajectory in a CSV file, of one of two kinds that differ in the number of columns.
+    """Return the trajectory in a CSV file. The number of columns determines which of two kinds it is.
 
-    - 33 or 25: Crazyswarm's polynomials. Duration, s, and eight coefficients, constant term first, of the time since
+    - 33 or 25: Crazyswarm's polynomials. Duration, s, and eight coefficients, constant term first, in the time since
       the start of the piece, s, for each of x, y, z, m, and, with 33 columns, yaw, rad.
     - 4 or 5: samples. Time, s, x, y, z, m, and, with 5 columns, yaw, rad. Times count from the first row. Between the
       samples the trajectory is cubic, with velocities by central differences, and at rest at both ends.
@@ -29,7 +29,7 @@ def load_csv(path: str | Path) -> Trajectory:
     Lines that are empty, begin with ``#``, or contain a header of names are ignored.
 
     Raises:
-        ConfigError: If the file does not exist, or a row is invalid, with its line.
+        ConfigError: If the file does not exist, or a row is invalid.
     """
     rows = _parse_table(read_text(path, checks.MAX_FILE_BYTES).splitlines(), str(path))
     return trajectory_of_rows(rows, str(path)) if rows.shape[1] > 5 else _fit_samples(rows, str(path))
@@ -60,7 +60,7 @@ def _parse_table(lines: list[str], place: str) -> NDArray:
 
 
 def _fit_samples(rows: NDArray, place: str) -> Trajectory:
-    """Return the cubic trajectory through samples of time, position and perhaps yaw."""
+    """Return the cubic trajectory through samples of time, position and, optionally, yaw."""
     if not np.all(np.isfinite(rows)) or np.abs(rows[:, 1:]).max() > checks.MAX_COORDINATE:
         checks.refuse(f"finite numbers up to {checks.MAX_COORDINATE:g}", "others", place)
     if len(rows) < 2:
@@ -102,7 +102,7 @@ def save_samples(path: str | Path, times: ArrayLike, pos: ArrayLike, yaw: ArrayL
         path: File to write.
         times: Times, s. (n,)
         pos: Positions, world frame, m. (n, 3)
-        yaw: Yaw, rad; None for none. (n,)
+        yaw: Yaw, rad; None to omit its column. (n,)
 
     Raises:
         ConfigError: If the folder does not exist.

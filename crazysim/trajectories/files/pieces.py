@@ -10,23 +10,23 @@ from crazysim.trajectories.bezier import restrict_interval
 from crazysim.trajectories.trajectory import Trajectory
 
 MAX_JUMPS = np.array([1e-3, 1e-3, 1e-3, np.deg2rad(0.1)])
-"""Largest distance of a piece's beginning from the end of the one before that is no jump: x, y, z, m, and yaw, rad."""
+"""Largest difference between a piece's start and the previous end that is not a jump: x, y, z, m, and yaw, rad."""
 
 ROUNDING = 1e-5
-"""Share of a coordinate that may be rounding of float32."""
+"""Fraction of a coordinate that may be due to float32 rounding."""
 
 
 def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the ends of a trajectory's pieces and their coefficients, in float64.
 
-    Times are the shortest decimals that stand for the trajectory's, so that 0.1 s is written as 0.1.
+    Times are the shortest decimals that represent those of the trajectory, so that 0.1 s is written as 0.1.
 
     Args:
         trajectory: Trajectory of one vehicle.
 
     Returns:
-        Ends, s (n_pieces,), and coefficients of the pieces' times scaled to [0, 1], constant term first, of x, y, z, m,
-        and yaw, rad. (n_pieces, 4, degree + 1)
+        Ends, s (n_pieces,), and coefficients of x, y, z, m, and yaw, rad, constant term first, in the pieces' times
+        scaled to [0, 1]. (n_pieces, 4, degree + 1)
     """
     ends = np.asarray(trajectory.ends)
     if ends.ndim != 1:
@@ -40,14 +40,15 @@ def trajectory_pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
 
 
 def require_no_jumps(ends: NDArray, coefficients: NDArray) -> None:
-    """Check that every piece begins where the one before ends, for formats that hold only where pieces end.
+    """Check that every piece begins where the one before ends, for formats that store only the ends of pieces.
 
     Args:
         ends: End of each piece, s. (n_pieces,)
-        coefficients: Of the pieces' times scaled to [0, 1], of x, y, z, m, and yaw, rad. (n_pieces, 4, degree + 1)
+        coefficients: Coefficients of x, y, z, m, and yaw, rad, in the pieces' times scaled to [0, 1]. (n_pieces, 4,
+            degree + 1)
 
     Raises:
-        ConfigError: If a piece begins more than a millimetre or a tenth of a degree from there.
+        ConfigError: If a piece begins more than a millimetre or a tenth of a degree, plus rounding, from there.
     """
     ends_at = coefficients[:-1].sum(axis=-1)
     jumps = np.abs(coefficients[1:, :, 0] - ends_at)
@@ -67,12 +68,12 @@ def split_pieces(ends: NDArray, coefficients: NDArray, times: NDArray) -> tuple[
 
     Args:
         ends: End of each piece, s. (n_pieces,)
-        coefficients: Of the pieces' times scaled to [0, 1]. (n_pieces, k, degree + 1)
+        coefficients: Coefficients in the pieces' times scaled to [0, 1]. (n_pieces, k, degree + 1)
         times: Times, s. (n,)
     """
     inside = times[(times > 0) & (times < ends[-1])]
     cuts = np.union1d(ends, inside)
-    cuts = cuts[np.diff(cuts, append=np.inf) > 1e-6]  # a cut beside an end is that end
+    cuts = cuts[np.diff(cuts, append=np.inf) > 1e-6]  # cuts within a microsecond are one cut
     cuts[-1] = ends[-1]
     from_cuts = np.concatenate([[0.0], cuts[:-1]])
     starts, lengths = np.concatenate([[0.0], ends[:-1]]), np.diff(ends, prepend=0.0)

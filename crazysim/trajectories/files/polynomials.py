@@ -21,7 +21,7 @@ from crazysim.trajectories.splines import trajectory_of_unit_pieces
 from crazysim.trajectories.trajectory import Trajectory
 
 POLY4D_FLOATS = 33
-"""Numbers of a Poly4D: eight coefficients for each of x, y, z and yaw, and the duration."""
+"""Number of floats in a Poly4D: eight coefficients for each of x, y, z and yaw, and the duration."""
 DISTANCE_UNIT = 1e-3
 """Unit of compressed coordinates, m."""
 ANGLE_UNIT = np.deg2rad(0.1)
@@ -31,12 +31,12 @@ DURATION_UNIT = 1e-3
 MAX_PIECE_DURATION = 65.0
 """Longest compressed piece, s: durations have 16 bits."""
 STORED_DEGREES = (0, 1, 3, 7)
-"""Degree of an axis for each code of two bits; as many control points are stored, all but the first."""
+"""Degree of an axis for each two-bit code. All control points but the first are stored, as many as the degree."""
 AXIS_UNITS = np.array([DISTANCE_UNIT, DISTANCE_UNIT, DISTANCE_UNIT, ANGLE_UNIT])
 
 
 def pack_poly4d(trajectory: Trajectory) -> bytes:
-    """Return a trajectory as uncompressed polynomials: 33 floats a piece, coefficients of the time in seconds.
+    """Return a trajectory as uncompressed polynomials of the time in seconds, 33 floats per piece.
 
     Args:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
@@ -65,10 +65,11 @@ def unpack_poly4d(content: bytes, place: str = "a trajectory memory") -> Traject
 
 
 def trajectory_of_rows(rows: NDArray, place: str) -> Trajectory:
-    """Return the trajectory of rows of duration, s, and coefficients of x, y, z, m, and yaw, rad, per second.
+    """Return the trajectory of rows as ``trajectory_rows`` returns them.
 
     Args:
-        rows: (n_pieces, 33), or (n_pieces, 25) without yaw
+        rows: Duration, s, and coefficients of x, y, z, m, and yaw, rad, for the time in seconds. (n_pieces, 33), or
+            (n_pieces, 25) without yaw.
         place: File, for messages.
     """
     lengths, c = rows[:, 0], rows[:, 1:].reshape(len(rows), -1, 8)
@@ -89,7 +90,7 @@ def trajectory_of_rows(rows: NDArray, place: str) -> Trajectory:
 
 
 def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
-    """Return the pieces of a trajectory, checked to be of a degree that the Crazyflie flies."""
+    """Return the pieces of a trajectory, after a check that the Crazyflie can fly their degree."""
     ends, c = trajectory_pieces(trajectory)
     if c.shape[2] > 8:
         raise ConfigError(
@@ -99,7 +100,7 @@ def _pieces(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
 
 
 def trajectory_rows(trajectory: Trajectory) -> NDArray:
-    """Return duration and coefficients per second of each piece. (n_pieces, 33)"""
+    """Return the duration of each piece, s, and its coefficients for the time in seconds. (n_pieces, 33)"""
     ends, c = _pieces(trajectory)
     lengths = np.diff(ends, prepend=0.0)
     c = np.pad(c, ((0, 0), (0, 0), (0, 8 - c.shape[2]))) / lengths[:, None, None] ** np.arange(8)
@@ -109,15 +110,15 @@ def trajectory_rows(trajectory: Trajectory) -> NDArray:
 def pack_compressed(trajectory: Trajectory) -> bytes:
     """Return a trajectory as compressed polynomials: control points in millimetres and tenths of degrees.
 
-    Every axis of a piece has the lowest of the degrees 0, 1, 3 and 7 that is right within a tenth of a unit. Pieces of
-    more than 65 s are split.
+    Every axis of a piece has the lowest of the degrees 0, 1, 3 and 7 that is accurate to a tenth of a unit. The
+    trajectory is also split every 65 s, because a piece cannot last longer.
 
     Args:
         trajectory: Trajectory of one vehicle, of degree 7 at most.
 
     Raises:
-        ConfigError: If its degree is higher, a piece does not begin where the one before ends, or it leaves the 32.767
-            m and 3276.7 degrees that 16 bits can hold.
+        ConfigError: If its degree is higher, a piece is shorter than 1 ms or does not begin where the one before ends,
+            or a coordinate exceeds the 32.767 m or 3276.7 degrees that 16 bits can hold.
     """
     ends, c = _pieces(trajectory)
     require_no_jumps(ends, c)
@@ -151,11 +152,11 @@ def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Tra
     """Return the trajectory of compressed polynomials.
 
     Args:
-        content: Contents of the memory; bytes after the piece of no duration are ignored.
+        content: Contents of the memory; bytes after a piece of zero duration are ignored.
         place: File, for messages.
 
     Raises:
-        ConfigError: If the contents end within a piece, or have no piece.
+        ConfigError: If the contents end within a piece, have no piece, or are too long.
     """
     try:
         points = np.array(struct.unpack_from("<hhhh", content), float)
@@ -187,7 +188,7 @@ def unpack_compressed(content: bytes, place: str = "a trajectory memory") -> Tra
 
 
 def save_memory(trajectory: Trajectory, path: str | Path, compressed: bool = False) -> None:
-    """Write a trajectory as it is uploaded to the Crazyflie's trajectory memory.
+    """Write a trajectory in the format of the Crazyflie's trajectory memory.
 
     Args:
         trajectory: Trajectory of one vehicle.
