@@ -66,7 +66,7 @@ class Segment:
     """Stages that run together, as a block of scalar operations."""
 
     scope: Literal["drone", "world"]
-    """Whether the block computes on the numbers of one drone or of one world."""
+    """Scope of the block: the numbers of one drone, or of one world."""
     stages: tuple[str, ...]
     """Names of the stages."""
     phase: Phase
