@@ -23,11 +23,11 @@ from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
 
 MIN_SLOT_DEGREE = 7
-"""Least degree of slots that are kept for later trajectories: the degree of minimum snap and of shows."""
+"""Smallest degree of slots that have room for later trajectories: the degree of minimum snap and of shows."""
 DRAWN_TIME = 2.0
 """Time of the path ahead that is drawn, s."""
 N_DRAWN_LINES = 40
-"""Number of lines of that path."""
+"""Number of line segments of that path."""
 PATH_COLOR = (0.1, 0.9, 0.3, 0.8)
 """Colour of paths and setpoints, rgba."""
 
@@ -48,7 +48,8 @@ class FollowData(PyTree):
     rate: Array = leaf("parameter", 1, (1,))
     """Speed at which a drone goes through its trajectory, 1: at 2 it takes half the time. (1,)"""
     degrees: tuple[int, ...] = static()
-    """Largest degrees of x, y, z and yaw in the slots, -1 for zero; no trajectory in them may exceed them. (4,)"""
+    """Largest degrees of x, y, z and yaw in the slots, -1 where all are zero; no trajectory in a slot may exceed them.
+    (4,)"""
 
     @property
     def trajectories(self) -> Trajectory:
@@ -71,17 +72,17 @@ class Follow(Plugin):
     trajectories: Trajectory | Sequence[Trajectory]
     """Trajectories in the first slots: one, a sequence, or one record with a leading axis."""
     index: ArrayLike | None = parameter(default=None, low=0, dtype=np.int32)
-    """Slot that a drone follows; None for drone i the trajectory i modulo their number. (), (n_drones,) or (n_worlds,
-    n_drones)"""
+    """Slot that a drone follows; with None, drone i follows trajectory i modulo the number of trajectories. (),
+    (n_drones,) or (n_worlds, n_drones)"""
     start: ArrayLike = parameter(default=0.0)
     """Time since the reset of the world at which a drone starts, s. A drone with a negative start is in the middle of
     its trajectory at the reset: with -2 and a rate of 1, at 2 s. (), (n_drones,) or (n_worlds, n_drones)"""
     rate: ArrayLike = parameter(default=1.0, positive=True)
     """Speed at which a drone goes through its trajectory, 1. (), (n_drones,) or (n_worlds, n_drones)"""
     n_slots: int | None = setting(default=None, low=1)
-    """Number of slots; None for one of each trajectory. The others hold the first trajectory until ``upload``."""
+    """Number of slots; None for one per trajectory. Additional slots hold the first trajectory until ``upload``."""
     max_pieces: int | None = setting(default=None, low=1)
-    """Most pieces of a trajectory in a slot; None for the most of the given ones."""
+    """Largest number of pieces of a trajectory in a slot; None for the largest number among ``trajectories``."""
     visible: bool = True
     """True to draw the path ahead and the setpoint of every drone."""
     name: str = "follow"
@@ -168,7 +169,7 @@ class Follow(Plugin):
     def upload(self, sim: Simulation, slot: int, trajectory: Trajectory) -> None:
         """Put another trajectory into a slot of a simulation, between two steps and without compiling it again.
 
-        A full reset brings the default data's trajectories back; ``sim.build_default_data()`` makes this one theirs.
+        A full reset restores the trajectories of the default data; ``sim.build_default_data()`` puts this one there.
         """
         with sim.lock:
             sim.data = self.uploaded(sim.data, slot, trajectory)
@@ -180,9 +181,9 @@ class Follow(Plugin):
         start: ArrayLike | None = None,
         rate: ArrayLike | None = None,
     ) -> None:
-        """Give drones other slots, starts or rates; None leaves one unchanged.
+        """Give drones other slots, starts or rates; None leaves them unchanged.
 
-        Nothing is compiled again, except where a number of all drones becomes one per drone.
+        Nothing is compiled again, unless one number for all drones becomes one per drone.
 
         Args:
             sim: The simulation.
@@ -251,7 +252,7 @@ def _replace_slot(old: list[Array], new: list[Array], slot: Array) -> list[Array
 
 @jax.jit
 def _future_paths(record: FollowData, of_drones: list[Array], times: Array) -> Array:
-    """Return the positions of all drones of a world at some times. (n_drones, n_times, 3)"""
+    """Return the positions of all drones of a world at several times. (n_drones, n_times, 3)"""
 
     def of_one(index: Array, start: Array, rate: Array) -> Array:
         vehicle = record.replace(index=index, start=start, rate=rate)

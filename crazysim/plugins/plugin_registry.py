@@ -1,4 +1,4 @@
-"""The plugins of a simulation: added, replaced and removed here, and nowhere else."""
+"""Registry of a simulation's plugins, the only place where they are added, replaced and removed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class _Installed(NamedTuple):
     stages: dict[str, Callable[..., Any]]
     """The stages by name."""
     replaced: dict[str, tuple[str, Callable[..., Any]]]
-    """Name and function of the stage that each of some stages replaced."""
+    """Name and function of the replaced stage, for each stage that replaced one."""
 
 
 class PluginRegistry(Mapping[str, Plugin]):
@@ -131,7 +131,7 @@ class PluginRegistry(Mapping[str, Plugin]):
             self._installed[name] = self._installed[name]._replace(plugin=plugin)
             self._checked = False
             return plugin
-        # The stages are made for a pipeline without the plugin.
+        # The plugin's stages must be created for a pipeline without the plugin.
         sim.step_pipeline = _remove_stages(dict(sim.step_pipeline), self._installed[name])
         pipeline, installed = _add_stages(dict(sim.step_pipeline), plugin, _placements(plugin, sim))
         pipeline = _with_influences(pipeline, [plugin if p.name == name else p for p in self.values()], plugin)
@@ -147,7 +147,7 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @contextlib.contextmanager
     def _unchanged_on_error(self) -> Iterator[None]:
-        """Leave the simulation and its scene as they were where an error ends the block."""
+        """Restore the simulation and its scene if an error ends the block."""
         sim, installed = self._sim, dict(self._installed)
         data, default, steps, resets = sim.data, sim.default_data, sim.step_pipeline, sim.reset_pipeline
         with sim.scene.unchanged_on_error():
@@ -161,12 +161,12 @@ class PluginRegistry(Mapping[str, Plugin]):
 
     @staticmethod
     def members_of(plugin: Plugin) -> tuple[str, ...]:
-        """Return the names of the members of a population; none of another plugin."""
+        """Return the names of the members of a population; empty for other plugins."""
         return plugin.names if isinstance(plugin, Population) else ()
 
     @property
     def reset_stages(self) -> tuple[str, ...]:
-        """Names of the stages that reset the plugin in the first step of an episode."""
+        """Names of the stages that reset plugins in the first step of an episode."""
         resets = self._sim.reset_pipeline
         return tuple([_reset_stage_name(p) for p in self.values() if _in_reset_pipeline(p) and p.name in resets])
 
@@ -273,7 +273,7 @@ def _with_record(data: SimData, name: str, record: PyTree | None) -> SimData:
 
 
 def _placements(plugin: Plugin, sim: Simulation) -> object:
-    """Return the placements of the stages of a plugin, after the one that resets the episode in its first step."""
+    """Return the placements of a plugin's stages, after the one that resets it in the first step of an episode."""
     placements = plugin.stages(sim)
     if not plugin.resets_episode or not isinstance(placements, (list, tuple)):
         return placements
@@ -333,7 +333,7 @@ def _remove_stages(pipeline: Pipeline, installed: _Installed) -> Pipeline:
 
 
 def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | None = None) -> Pipeline:
-    """Return the pipeline whose integration applies the influences and derivatives of some plugins."""
+    """Return the pipeline whose integration applies the influences and derivatives of plugins."""
     dynamic = tuple(sorted((p for p in plugins if p.is_dynamic), key=lambda p: (p.order, p.name)))
     constraining = [p.name for p in dynamic if p.constrains]
     if len(constraining) > 1:
@@ -353,7 +353,7 @@ def _with_influences(pipeline: Pipeline, plugins: list[Plugin], added: Plugin | 
 
 
 def _have_same_code(before: Plugin, after: Plugin) -> bool:
-    """Return True if two plugins of one class differ in numbers of their records at most."""
+    """Return True if two plugins of one class differ at most in numbers of their records."""
     fixed = [name for name, setting in settings_of(type(before)).items() if not setting.is_parameter]
     return all(_are_equal(getattr(before, name), getattr(after, name)) for name in fixed)
 
@@ -365,12 +365,12 @@ def _are_equal(a: Any, b: Any) -> bool:
         return type(a) is type(b) and np.array_equal(a, b)
     try:
         return bool(a == b)
-    except ValueError:  # sequences of arrays; taken as different, the step is compiled again
+    except ValueError:  # sequences of arrays count as different: the step is compiled again
         return False
 
 
 def _continue_states(record: PyTree | None, before: PyTree | None) -> PyTree | None:
-    """Return a record with the states of the record before, as far as the shapes agree."""
+    """Return a record with the states of the previous record, wherever structure, shape and type agree."""
     if record is None or type(record) is not type(before):
         return record
     states = {}

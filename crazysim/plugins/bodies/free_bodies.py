@@ -29,9 +29,9 @@ from crazysim.scene.contact_report import ObjectSelection
 from crazysim.tables import MASS
 
 MAX_BODIES = 1000
-"""Most bodies in a world."""
+"""Largest number of bodies in a world."""
 START_SPACING = 0.5
-"""Distance of neighbours that start in a row, m."""
+"""Distance between neighbours that start in a row, m."""
 
 
 SURFACE_SETTINGS = ("mass", "friction", "restitution")
@@ -56,7 +56,7 @@ class FreeBodiesData(Members):
     impulse: Array = leaf("member", 1, (3,))
     """Impulse of all contacts in the last step, world frame, N s. (n_worlds, n_members, 3)"""
     press: Array = leaf("world", 1)
-    """Impulses of the last step along the normals of the contact points, N s, with which the next begins.
+    """Impulses of the last step along the normals of the contact points, N s, with which the next step begins.
     (n_worlds, 1, n_contacts)"""
     drag: Array = leaf("world", 2)
     """The same across the normals, world frame, N s. (n_worlds, 1, n_contacts, 3)"""
@@ -91,12 +91,13 @@ class FreeBodies(Population):
     vel: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Velocities at the start, world frame, m/s. (3,), (n_members, 3) or (n_worlds, n_members, 3)"""
     friction: ArrayLike = parameter(default=0.6, low=0.0, high=MAX_FRICTION)
-    """Coulomb's coefficient; of two bodies the larger counts. (), (n_members,) or (n_worlds, n_members)"""
+    """Coulomb's coefficient; the larger one of two bodies is used. (), (n_members,) or (n_worlds, n_members)"""
     restitution: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
-    """Ratio of the speeds after and before a bounce, 0 to 1; of two bodies the larger counts. (), (n_members,) or
+    """Ratio of the speeds after and before a bounce, 0 to 1; the larger one of two bodies is used. (), (n_members,) or
     (n_worlds, n_members)"""
     objects: ObjectSelection = None
-    """Handles, or names of objects that the bodies touch; None for all at the time of adding, () for the ground."""
+    """Handles, or names of objects that the bodies touch; None for all that are in the scene when the plugin is added,
+    () for the ground."""
     drones: bool = True
     """True for contact with drones."""
     softness: float = setting(default=0.03, positive=True, high=MAX_SOFTNESS)
@@ -121,7 +122,7 @@ class FreeBodies(Population):
 
     @property
     def pushes_drones(self) -> bool:
-        """True if the contacts of this plugin are those with drones, so that ``ContactResponse`` leaves them out."""
+        """True if this plugin handles its contacts with drones, so that ``ContactResponse`` leaves them out."""
         return self.drones
 
     @property
@@ -219,7 +220,7 @@ def row_positions(shapes: Sequence[Shape]) -> np.ndarray:
 
 
 def inertia_per_mass(shape: Shape) -> np.ndarray:
-    """Return the moments of inertia of a homogeneous ball or box over its mass, m^2. (3,)"""
+    """Return the moments of inertia of a homogeneous ball or box divided by its mass, m^2. (3,)"""
     if shape.kind == "sphere":
         return np.full(3, 0.4 * shape.size[0] ** 2)
     x, y, z = np.square(shape.size)

@@ -40,11 +40,11 @@ class ContactLogData(PyTree):
 class ContactLog(Plugin):
     """Log of contacts, checked at the end of every step within the compiled step.
 
-    A reset of a world clears its log. ObjectSelection that are added to the scene later are not checked.
+    A reset of a world clears its log. Objects that are added to the scene later are not checked.
     """
 
     objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all at the time of adding, () for none."""
+    """Handles, or names of bodies; None for all that are in the scene when the plugin is added, () for none."""
     floor: bool = True
     """True to check the floor. Drones that start on it touch it at once."""
     drones: bool = True
@@ -65,9 +65,9 @@ class ContactLog(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return a stage of one drone, and one of one world for loads and other objects that plugins move.
+        """Return a stage for one drone, and one for one world with loads and other objects that plugins move.
 
-        Two, because a stage of one world computes everything for all its drones.
+        There are two because a stage for one world computes everything for all its drones.
         """
         names, placements = self._names(sim), []
         movers = moving_plugins(sim.scene.plugins(), names)

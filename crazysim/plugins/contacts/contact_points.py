@@ -27,9 +27,10 @@ from crazysim.scene.collision import CollisionGeom
 from crazysim.scene.contact_report import ObjectSelection, select_bodies
 
 FLAT_KINDS = ("plane", "box", "cylinder")
-"""Kinds with faces, on which a drone stands by its corners."""
+"""Kinds of geoms with flat faces, which the corners of a drone's box touch."""
 PLATE_SHARE = 0.05
-"""Height of the upper and lower plate of a drone's box, as a share of the box; both touch an object along its side."""
+"""Height of the upper and lower plate of a drone's box, as a share of the box's height; both plates touch an object
+beside the drone."""
 
 
 class Carrier(NamedTuple):
@@ -38,9 +39,9 @@ class Carrier(NamedTuple):
     population: str | None
     """Name of the population; None for the static scene and objects."""
     row: int | None
-    """Number among the members or objects; None for the static scene."""
+    """Index among the members or objects; None for the static scene."""
     geoms: tuple[CollisionGeom, ...]
-    """Its geoms, in its frame."""
+    """Geoms of the carrier, in its frame."""
 
 
 class Surface(NamedTuple):
@@ -49,13 +50,13 @@ class Surface(NamedTuple):
     geom: CollisionGeom
     """The geom, in the frame of its carrier."""
     row: int | None
-    """Number of the carrier among the members or objects; None for the static scene."""
+    """Index of the carrier among the members or objects; None for the static scene."""
     population: str | None = None
     """Name of the carrier's population; None for the static scene and objects."""
 
 
 def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection[str] = ()) -> list[Carrier]:
-    """Return the static scene, and chosen objects and members of populations that turn.
+    """Return the static scene, the chosen objects, and the chosen members of populations with an angular velocity.
 
     Objects that other plugins move, such as loads, are left out.
 
@@ -80,7 +81,7 @@ def find_carriers(sim: Simulation, objects: ObjectSelection, without: Collection
 
 
 def find_surfaces(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
-    """Return the surfaces that drones and loads touch, without bodies that push drones themselves.
+    """Return the surfaces that drones and loads touch, without populations that handle contacts with drones themselves.
 
     Args:
         sim: Simulation.
@@ -92,7 +93,7 @@ def find_surfaces(sim: Simulation, objects: ObjectSelection) -> list[Surface]:
 
 
 def is_ground(surface: Surface) -> bool:
-    """Return True for the plane z = 0, at which every load stops without a contact response."""
+    """Return True for the plane z = 0, at which every load stops even without a contact response."""
     geom = surface.geom
     return surface.row is None and geom.shape.kind == "plane" and geom.rot is None and geom.pos[2] == 0
 
@@ -105,7 +106,7 @@ class ContactPoints(NamedTuple):
     normal: Array
     """Outward normal of the surface. (..., n, 3)"""
     point: Array | None
-    """Position on the drone, from its centre of mass, m; None for a load, which is a point mass. (..., n, 3)"""
+    """Position on the drone relative to its centre of mass, m; None for a load, which is a point mass. (..., n, 3)"""
     vel: Array
     """Velocity of the surface, m/s. (..., n, 3)"""
 
@@ -177,7 +178,7 @@ def load_points(data: SimData, body: LoadBody, shape: Shape, surfaces: list[Surf
 def _height_above_field(
     data: SimData, geom: CollisionGeom, points: Array, into: Callable, back: Callable
 ) -> tuple[Array, Array]:
-    """Return the distance of points to the plane below them of a height field, m, and its normal, world frame."""
+    """Return the distance of points to the plane of a height field below them, m, and its normal, world frame."""
     terrain = data.plugins.get(geom.name)
     if isinstance(terrain, TerrainData):
         return terrain.gap_at(points)
@@ -197,9 +198,9 @@ def _nearest_plate_point(
 ) -> ContactPoints:
     """Return the point of a plate that is nearest to a geom.
 
-    The gradient of the gap with respect to the drone's position is the normal, and that with respect to its attitude is
-    the lever times the normal, which is all that turns the drone. The position along the normal affects friction only;
-    the plate's face is used.
+    The gradient of the gap with respect to the drone's position is the normal. The gradient with respect to its
+    attitude is the cross product of the lever and the normal, which determines the torque of a normal force. The
+    position along the normal affects friction only; the point is put on the plate's face.
     """
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
@@ -234,9 +235,9 @@ def _distance_and_slopes(shape: Shape, other: Shape, pos: Array, rot: Array) -> 
 
 
 def _geom_frame(data: SimData, surface: Surface) -> tuple[Callable, Callable, Callable | None]:
-    """Return functions that take points and directions into a geom's frame, and directions back, and its velocity.
+    """Return functions that transform points and directions into a geom's frame, and directions back, and its velocity.
 
-    The last one takes points in the world frame; it is None for a fixed surface.
+    The velocity is a function of points in the world frame; it is None for a fixed surface.
     """
     geom, row = surface.geom, surface.row
     dtype = data.states.pos.dtype

@@ -47,7 +47,7 @@ class DroneCollisionsData(PyTree):
 class DroneCollisions(Plugin):
     """Drones of a world that push each other where their collision boxes meet.
 
-    All pairs are checked: it is for small swarms. Momentum and angular momentum are kept.
+    All pairs are checked, which suits small swarms only. Momentum and angular momentum are conserved.
     """
 
     friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))

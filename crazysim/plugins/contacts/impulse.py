@@ -15,7 +15,8 @@ from crazysim.plugins.contacts.contact_points import ContactPoints
 BOUNCE_SPEED = 0.1
 """Approach speed below which nothing bounces, m/s: five steps of free fall at 500 Hz."""
 PENALTY_STIFFNESS = 300.0
-"""Penalty on the speed into a surface, in masses: costs a third of a percent of a bounce, solvable in float32."""
+"""Penalty on the speed into a surface, as a multiple of the mass: a bounce loses a third of a percent of its speed to
+it, and the linear systems can be solved in float32."""
 STICKING_SPEED = 1e-4
 """Slip speed treated as zero, m/s."""
 MAX_PUSH_SPEED = 0.25
@@ -38,15 +39,16 @@ def velocity_after_contact(
 ) -> Array:
     """Return the velocity of a body after the impulses of the surfaces that it touches. (..., 6) or (..., 3)
 
-    First compression: the velocity u = (vel, ang_vel) that minimises the kinetic energy of the change, plus a stiff
-    penalty on the speed into a surface and on slip; the penalty on slip grows no faster than the friction force allows
-    (iteratively reweighted least squares). Every iteration solves one linear system of six unknowns, or of three for a
-    load. Then restitution: a share of the normal impulses again (Poisson). Energy that friction and bounces at several
-    points would create (Kane 1984), or points that push against each other, is removed.
+    In the compression phase, the velocity u = (vel, ang_vel) minimises the kinetic energy of the change plus stiff
+    penalties on the speed into a surface and on slip. The penalty on slip grows no faster than the friction force
+    allows (iteratively reweighted least squares). Every iteration solves one linear system of six unknowns, or of three
+    for a load. In the restitution phase, a fraction of the normal impulses is applied again (Poisson). Finally, the
+    function removes the energy that friction combined with bounces at several points (Kane 1984), or points that push
+    against each other, would create.
 
     Args:
         points: Contact points, in the frame of the velocity.
-        before: Velocity, m/s, and for a drone angular velocity, rad/s. (..., 6) or (..., 3)
+        before: Velocity, m/s, followed by the angular velocity, rad/s, for a drone. (..., 6) or (..., 3)
         mass: Mass, kg. (..., 1)
         inertia: Mass and moment of inertia, as ``inertia_matrix`` returns them. (..., 6, 6) or (..., 3, 3)
         material: Parameters of the contact.
@@ -73,7 +75,8 @@ def velocity_after_contact(
         pressed = active & (out < target_speed)
         push = jnp.where(pressed, stiff * (target_speed - out), 0.0)
         w_n = jnp.where(pressed, stiff, 0.0)
-        # The first push stops the whole fall at every point: the friction force is known from the second on.
+        # In the first iteration every point by itself stops the whole fall: the normal force, and so the friction
+        # force, is known only from the second on.
         w_t = jnp.where(k == 0, 0.0, jnp.minimum(w_n, material.friction * push / (aside + STICKING_SPEED)))
         w_rest = w_n - w_t
         steep = jnp.sum(w_rest[..., None, None] * row[..., None] * row[..., None, :], axis=-3)
@@ -105,7 +108,7 @@ def velocity_after_contact(
 
 
 def inertia_matrix(mass: Array, inertia: Array | None = None) -> Array:
-    """Return mass and moment of inertia as one matrix; of a point mass without. (..., 6, 6) or (..., 3, 3)"""
+    """Return mass and moment of inertia as one matrix; for a point mass, the mass alone. (..., 6, 6) or (..., 3, 3)"""
     upper = mass[..., None] * jnp.eye(3, dtype=mass.dtype)
     if inertia is None:
         return upper
@@ -115,7 +118,7 @@ def inertia_matrix(mass: Array, inertia: Array | None = None) -> Array:
 
 
 def _with_torque(force: Array, p: Array | None) -> Array:
-    """Return forces at points with their torques, or alone for a point mass. (..., n, 6) or (..., n, 3)"""
+    """Return forces at points followed by their torques; forces alone for a point mass. (..., n, 6) or (..., n, 3)"""
     return force if p is None else jnp.concatenate([force, rotation.cross(p, force)], axis=-1)
 
 

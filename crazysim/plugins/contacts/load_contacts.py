@@ -38,7 +38,7 @@ def load_plugins(sim: Simulation) -> list[CollidingPlugin]:
 
 
 def load_names(sim: Simulation, plugins: Sequence[CollidingPlugin]) -> set[str]:
-    """Return the names of the loads and hooks of some plugins in the scene."""
+    """Return the names of the plugins' loads and hooks in the scene."""
     kinds = {kind for p in plugins for kind in p.solid_kinds}
     return {name for name in (sim.data.objects.names if plugins else ()) if name.rpartition(":")[0] in kinds}
 
@@ -46,10 +46,10 @@ def load_names(sim: Simulation, plugins: Sequence[CollidingPlugin]) -> set[str]:
 def stop_loads(
     data: SimData, collider: Collider, surfaces: list[Surface], material: Material, iterations: int
 ) -> SimData:
-    """Return the data with the velocities of bodies after the impulses of surfaces; of one drone or one world.
+    """Return the data of one drone or one world with the velocities of bodies after the impulses of surfaces.
 
-    The velocity after contact does not depend on the mass. What the impulse does to a drone on a taut link follows in
-    the next step, from the constraint.
+    The velocity after contact does not depend on the mass. The effect of the impulse on a drone with a taut link
+    follows in the next step, from the constraint.
     """
     body = collider.body(data)
     # A load of a whole world takes the material of its first drone.
@@ -63,10 +63,10 @@ def stop_loads(
 def hit_drones(data: SimData, collider: Collider, material: Material, boxes: DroneBoxes) -> tuple[SimData, Array]:
     """Return one world after the impulses between loads or hooks and drones, and the impulses on the drones, N s.
 
-    The impulse acts at the load's centre, on both: momentum and angular momentum are kept. First the normal impulse,
-    with restitution, then friction, limited by Coulomb's law and by what stops the slip. Where a body has several
-    contacts, each counts by its share, so that together they create no energy. A load and a drone that a rod joins do
-    not touch.
+    The impulse acts at the load's centre, on both, which conserves momentum and angular momentum. The normal impulse,
+    with restitution, is computed first, and then friction, limited by Coulomb's law and by the impulse that stops the
+    slip. Each impulse is divided by the larger number of contacts of its two bodies, so that together they create no
+    energy. A load and a drone that a rod joins do not touch.
 
     Args:
         data: One world.
@@ -93,7 +93,7 @@ def hit_drones(data: SimData, collider: Collider, material: Material, boxes: Dro
     touches = touches if body.exists is None else touches & body.exists[:, None]
 
     def response(change: Array) -> Array:
-        """Return the change of the relative velocity at the lever where the load's velocity changes, m/s."""
+        """Return the change of the relative velocity at the lever for a change of the load's velocity, m/s."""
         ang_vel_change = rotation.matvec(p.J_inv, rotation.cross(lever, change))
         return change + mass * (change / p.mass + rotation.cross(ang_vel_change, lever))
 
@@ -127,7 +127,7 @@ def velocity_change(
     pushed_out = jnp.clip(-gap[..., None] / material.softness, 0.0, MAX_PUSH_SPEED)
     target_speed = jnp.where(out < -BOUNCE_SPEED, -material.restitution * out, pushed_out)
     response_along = response(normal)
-    # At least one, except where the normal is zero: between balls with one centre.
+    # The product is at least one, except where the normal is zero, between balls with the same centre.
     speed = jnp.maximum(target_speed - out, 0.0) / jnp.maximum(rotation.dot(normal, response_along), 1.0)
     vel = vel + speed * response_along
     slip = vel - rotation.dot(vel, normal) * normal
@@ -152,9 +152,9 @@ def hit_each_other(data: SimData, colliders: Sequence[Collider], material: Mater
     """Return one world after the impulses of loads and hooks on each other.
 
     They are point masses, so an impulse changes velocities only. Momentum is conserved. The impulse has a
-    normal part with restitution, and friction, limited by Coulomb's law and by what stops the slip. Where a body has
-    several contacts, each counts by its share, so that together they create no energy. What the impulse does to a
-    drone on a taut link follows in the next step, from the constraint.
+    normal part with restitution, and friction, limited by Coulomb's law and by the impulse that stops the slip. Each
+    impulse is divided by the larger number of contacts of its two bodies, so that together they create no energy. The
+    effect of the impulse on a drone with a taut link follows in the next step, from the constraint.
 
     Args:
         data: One world.

@@ -18,20 +18,20 @@ from crazysim.plugins.contacts.solver import Contacts
 from crazysim.scene.collision import CollisionGeom
 
 GapFn = Callable[[Array], tuple[Array, Array]]
-"""From points (n, 3) to gaps (n,) and normals (n, 3)."""
+"""Function that maps points (n, 3) to gaps (n,) and normals (n, 3)."""
 CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-"""Corners of a box of half lengths one. (8, 3)"""
+"""Corners of a box whose half lengths are one. (8, 3)"""
 
 
 class Solids(NamedTuple):
     """Balls and boxes of a world: shapes and owners are static, poses are data."""
 
     body: np.ndarray
-    """Number of the body that carries each. (n,)"""
+    """Index of the body that carries each solid. (n,)"""
     is_ball: np.ndarray
     """True for balls. (n,)"""
     size: np.ndarray
-    """Half lengths of boxes, and the radius of balls three times, m. (n, 3)"""
+    """Half lengths of each box, or the radius of a ball, repeated three times, m. (n, 3)"""
     pos: Array
     """Positions of the centres, world frame, m. (n, 3)"""
     rot: Array
@@ -39,18 +39,18 @@ class Solids(NamedTuple):
 
 
 class PairContacts(NamedTuple):
-    """Contact points of some pairs, of each the same number."""
+    """Contact points of pairs of bodies, with the same number of points for every pair."""
 
     first: np.ndarray
-    """Numbers of the first bodies. (n_pairs,)"""
+    """Indices of the first bodies. (n_pairs,)"""
     second: np.ndarray
-    """Numbers of the second bodies. (n_pairs,)"""
+    """Indices of the second bodies. (n_pairs,)"""
     points: Manifold
     """Gaps (k,), normals (k, 3) and points (k, 3), sorted by pair."""
 
 
 def contacts_between(solids: Solids, pairs: np.ndarray) -> list[PairContacts]:
-    """Return the contact points of pairs of solids. (n_pairs, 2)"""
+    """Return the contact points of solids by kind of pair, for pairs of indices (n_pairs, 2)."""
     contacts = []
     kinds = solids.is_ball[pairs]
     for first, second in ((True, True), (True, False), (False, True), (False, False)):
@@ -80,9 +80,9 @@ def contacts_on_surface(
 
     Args:
         solids: The solids.
-        number: Number of the solid.
+        number: Index of the solid.
         geom: The geom.
-        carrier: Number of the body that carries it.
+        carrier: Index of the body that carries it.
         pose: Position, m (3,), and rotation matrix (3, 3) of the geom, world frame.
     """
     (surface_pos, surface_rot), shape = pose, geom.shape
@@ -114,7 +114,7 @@ def contacts_on_ground(solids: Solids, number: int, carrier: int, gap_at: GapFn)
 
 
 def join_contacts(pairs: list[PairContacts], friction: Array, restitution: Array) -> Contacts:
-    """Return all contact points, each with the larger friction and restitution of its two bodies, as MuJoCo combines.
+    """Return all contact points, each with the larger friction and the larger restitution of its two bodies.
 
     Args:
         pairs: Contact points of pairs of bodies.
@@ -143,7 +143,7 @@ def _distance_and_normal(shape: Shape, point: Array) -> tuple[Array, Array]:
 
 
 def _nearest_point(box: Shape, pos: Array, rot: Array, shape: Shape, at: Array, turn: Array) -> Manifold:
-    """Return the nearest point of a box and a shape; the gradient of the gap is the normal, and the lever times it."""
+    """Return the contact at a box's point nearest to a shape; normal and torque are the gradient of the gap."""
 
     def gap_at(move: Array, turn_offset: Array) -> Array:
         spun = rot + jnp.stack([rotation.cross(turn_offset, rot[:, k]) for k in range(3)], axis=-1)

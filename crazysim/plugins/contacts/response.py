@@ -52,12 +52,13 @@ class ContactResponse(Plugin):
     Drones do not push each other (``DroneCollisions``), and objects do not move; drones ride on members of populations,
     such as cars, that are in the scene when the plugin is added. The centre of a drone that stands on the floor is half
     the height of its collision box above the floor. Loads and empty hooks that are in the scene when the plugin is
-    added are stopped by all objects except the flat floor, where they also stop without this plugin. If they are among
-    ``objects``, they exchange impulses with drones and with each other.
+    added are stopped by all objects except the flat floor, which stops them even without this plugin. Loads and hooks
+    that are among ``objects`` exchange impulses with drones and with each other.
     """
 
     objects: ObjectSelection = None
-    """Handles, or names of bodies; None for all at the time of adding, () for the floor alone."""
+    """Handles, or names of bodies; None for all that are in the scene when the plugin is added, () for the floor
+    alone."""
     friction: float = parameter(default=0.6, low=0.0, high=MAX_FRICTION, shapes=((),))
     """Coulomb's coefficient."""
     restitution: float = parameter(default=0.2, low=0.0, high=1.0, shapes=((),))

@@ -1,4 +1,4 @@
-"""Contact of free bodies within a step: the solids, and the changes by their impulses."""
+"""Contacts of free bodies: the solids that can touch, and the states after their impulses."""
 
 from __future__ import annotations
 
@@ -32,16 +32,17 @@ from crazysim.plugins.effects.ground import TerrainData
 from crazysim.scene.collision import CollisionGeom
 
 MAX_CONTACTS = 250_000
-"""Most contact points in a world, as many as 250 drones or boxes have."""
+"""Largest number of contact points in a world, about as many as the pairs of 250 drones or boxes have."""
 EXACT_KINDS = ("sphere", "box")
-"""Kinds of geoms that touch balls and boxes as bodies do; others touch their corners and nearest point."""
+"""Kinds of geoms that touch balls and boxes in the same way as bodies do; geoms of other kinds touch only their corners
+and nearest point."""
 
 
 class BodyContacts:
     """Contacts of the free bodies of a simulation."""
 
     def __init__(self, sim: Simulation, plugin: Any):
-        """Collect the present solids of the scene."""
+        """Collect the solids that are in the scene now."""
         self.plugin, self.shapes = plugin, plugin.shapes
         self.n_drones = sim.n_drones if plugin.drones else 0
         self.boxes = drone_box_extents(sim)
@@ -95,7 +96,7 @@ class BodyContacts:
         return data
 
     def _bodies(self, data: SimData, record: Any) -> Bodies:
-        """Return the bodies: free bodies, drones, then bodies that are not pushed."""
+        """Return the bodies: free bodies, drones, then carriers, which impulses do not move."""
         dtype = record.pos.dtype
         rows = [(record.pos, record.vel, rotation.rotate(record.quat, record.ang_vel), 1 / record.mass[:, 0],
                  _rotate_diagonal(record.quat, 1 / record.inertia))]  # fmt: skip
@@ -154,11 +155,11 @@ class BodyContacts:
 
 
 def require_few_contacts(n_contacts: int, among: str) -> int:
-    """Return a number of contact points.
+    """Return the number of contact points, or raise an error if it is too large.
 
     Args:
         n_contacts: Number of contact points in a world.
-        among: Bodies that they are of, for the message.
+        among: Bodies to which they belong, for the message.
     """
     if n_contacts > MAX_CONTACTS:
         raise ConfigError(
@@ -174,7 +175,7 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
     Args:
         states: Record with ``pos``, ``quat``, ``vel`` and ``ang_vel``. (n, ...)
         solved: Bodies after contact.
-        rows: Their numbers among these.
+        rows: Rows of these states among the solved bodies.
     """
     ang_vel, angle = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.turned))
     quat = rotation.turn(states.quat, angle, 1.0)
@@ -196,7 +197,7 @@ def drone_box_extents(sim: Simulation) -> np.ndarray:
 
 
 def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
-    """Return positions, m (n, 3), and attitudes (n, 3, 3) of the drones' collision boxes; of one world.
+    """Return positions, m (n, 3), and attitudes (n, 3, 3) of the collision boxes of one world's drones.
 
     Args:
         data: One world.
@@ -207,7 +208,7 @@ def drones_as_boxes(data: SimData, boxes: np.ndarray) -> tuple[Array, Array]:
 
 
 def _carrier_motion(data: SimData, carrier: Carrier) -> tuple[Array, Array, Array, Array]:
-    """Return position, attitude, velocity, world frame, and angular velocity, body frame, of a carrier."""
+    """Return position, attitude and velocity, world frame, and angular velocity, body frame, of a carrier."""
     dtype = data.states.pos.dtype
     zero = jnp.zeros(3, dtype)
     if carrier.population is not None:

@@ -1,8 +1,9 @@
 """Impulses at the contacts of several bodies, for one world.
 
 Projected Jacobi iterations with momentum (Nesterov's method, as Mazhar et al. 2015 use it for contact), preconditioned
-by shares of the bodies' masses, one for each contact (mass splitting: Tonge, Benevolenski and Voroshilov 2012), so that
-all contacts act at once. Impulses act on both bodies at one point: momentum and angular momentum are kept.
+by mass splitting (Tonge, Benevolenski and Voroshilov 2012): each contact gets a share of the masses of its bodies, so
+that all contacts act at once. An impulse acts on both bodies at the same point, which conserves momentum and angular
+momentum.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from crazysim.geometry.small_matrices import matmul, matvec
 from crazysim.plugins.contacts.impulse import BOUNCE_SPEED, MAX_PUSH_SPEED
 
 MAX_ACTING_GAP = 1e-3
-"""Gap up to which a contact may act in a step beyond the distance of approach, m."""
+"""Largest gap at which a contact may act in a step, in addition to the distance of approach, m."""
 
 
 class Bodies(NamedTuple):
@@ -41,13 +42,13 @@ class Contacts(NamedTuple):
     """Contact points between pairs of bodies, world frame; the points of a pair are neighbours."""
 
     first: np.ndarray
-    """Number of the body that the normals point to. (n_pairs,)"""
+    """Index of the body that the normals point to. (n_pairs,)"""
     second: np.ndarray
-    """Number of the body that they point from. (n_pairs,)"""
+    """Index of the body that the normals point from. (n_pairs,)"""
     n_points: np.ndarray
     """Number of points of each pair, ascending. (n_pairs,)"""
     gap: Array
-    """Distance, m, negative where they overlap. (k,)"""
+    """Distance, m, negative where the bodies overlap. (k,)"""
     normal: Array
     """Unit normal. (k, 3)"""
     point: Array
@@ -72,20 +73,20 @@ class Impulses(NamedTuple):
     press: Array
     """Along the normals, N s. (k,)"""
     drag: Array
-    """Across them, world frame, N s. (k, 3)"""
+    """Across the normals, world frame, N s. (k, 3)"""
 
 
 class SolvedBodies(NamedTuple):
     """Bodies after contact."""
 
     bodies: Bodies
-    """The bodies with other velocities and positions."""
+    """The bodies with their new velocities and positions."""
     turned: Array
     """Rotations that remove overlaps, world frame, rad. (n, 3)"""
     at: Impulses
     """Impulses at the contacts, with which the next step begins."""
     impulse: Array
-    """Their sum on each body, world frame, N s. (n, 3)"""
+    """Sum of the impulses on each body, world frame, N s. (n, 3)"""
 
 
 def solve_contacts(
@@ -93,18 +94,19 @@ def solve_contacts(
 ) -> SolvedBodies:
     """Return the bodies after contact.
 
-    At every contact the speed of separation becomes at least the one that closes a gap within the step, and
-    ``restitution`` times the speed of an approach faster than 0.1 m/s. Friction opposes slip up to Coulomb's limit.
-    Where impacts of several bodies with restitution and friction would gain energy (Kane 1984), or too few iterations
-    would, all impulses are scaled to keep it.
+    At every contact the bodies approach at most fast enough to close the gap within the step. After an impact faster
+    than 0.1 m/s they separate with at least ``restitution`` times the speed of approach. Friction opposes slip up to
+    Coulomb's limit. Where impacts of several bodies with restitution and friction (Kane 1984), or too few iterations,
+    would add energy, all impulses are scaled down to conserve it.
 
-    Overlaps are removed within ``softness`` seconds, at up to 0.25 m/s, by moving the bodies. That changes no velocity,
-    so that it does not feed the motion of a stack.
+    Overlaps are removed within ``softness`` seconds, at up to 0.25 m/s, by moving the bodies without changing their
+    velocities, so that this does not drive the motion of a stack.
 
     Args:
         bodies: The bodies.
         contacts: The contacts, each with at least one body that can be pushed.
-        before: Initial impulses. The impulses of the last step bring bodies at rest to rest at once.
+        before: Initial impulses. With the impulses of the last step, bodies at rest stay at rest from the first
+            iteration on.
         dt: Step, s.
         softness: Time constant with which an overlap is pushed out, s.
         iterations: Iterations of the solver.
@@ -124,7 +126,7 @@ def solve_contacts(
         return between[pair] + rotation.cross((ang_vel[a] - ang_vel[b])[pair], arm)
 
     def change(impulse: Array) -> tuple[Array, Array]:
-        """Return the changes of the velocities by impulses on the first bodies, and against the second."""
+        """Return the changes of the velocities by impulses on the first bodies and opposite ones on the second."""
         force, torque = contacts.sum_pairs(impulse), contacts.sum_pairs(rotation.cross(arm, impulse))
         against = torque + rotation.cross(offset, force)
         force, torque = (
@@ -176,7 +178,7 @@ def solve_contacts(
     share = _energy_share(total, start, slip(vel, ang_vel))
     impulses, total, vel, ang_vel = jax.tree.map(lambda x: share * x, (impulses, total, vel, ang_vel))
 
-    # One step down the gradient, as far as the overlaps shrink; the next time step continues.
+    # One gradient step with exact line search reduces the overlaps; the next time step continues.
     leaves = out + rotation.dot(slip(vel, ang_vel), normal)[:, 0]
     push = jnp.minimum(jnp.maximum(-contacts.gap, 0.0) / softness, MAX_PUSH_SPEED) - jnp.maximum(leaves, 0.0)
     push = jnp.maximum(push, 0.0)
@@ -191,14 +193,15 @@ def solve_contacts(
 def _shared_response(
     bodies: Bodies, sum_of: Array, contacts: Contacts, normal: Array, turn: Array, along: Array, across: Array
 ) -> Array:
-    """Return for each body the ratio of the responses of its contacts to all impulses and to their own alone. (n,)
+    """Return for each body its contacts' response to all impulses, divided by their response to their own one. (n,)
 
-    It is a bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, at most a quarter above it. ``M`` is the inertia
-    of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` holds the inverse responses.
+    It is an upper bound of the largest eigenvalue of ``M^-1 sum(B W B^T)``, too large by at most a quarter. ``M`` is
+    the inertia of the body, ``B`` maps the impulse at a contact to force and torque, and ``W`` holds the inverse
+    responses.
 
     Args:
         bodies: The bodies.
-        sum_of: One where a pair is of the body. (n, n_pairs)
+        sum_of: 1 where a pair contains the body, and else 0. (n, n_pairs)
         contacts: The contacts.
         normal: Normals. (k, 3)
         turn: Torque of impulses about the body. (k, 3, 3)
@@ -223,8 +226,8 @@ def _shared_response(
 def _energy_share(impulse: Array, before: Array, change: Array) -> Array:
     """Return the share of impulses, at most one, with which they add no kinetic energy. ()
 
-    The energy that they add, in the frame of immovable bodies, is the sum of their products with the means of the
-    contacts' velocities before and after them.
+    The energy that the impulses add, in the frame of immovable bodies, is the sum of the products of each impulse with
+    the mean of the contact's velocities before and after it.
 
     Args:
         impulse: Impulses on the first bodies, N s. (k, 3)
@@ -237,5 +240,5 @@ def _energy_share(impulse: Array, before: Array, change: Array) -> Array:
 
 
 def _sum_for_bodies(sums: Array, values: Array) -> Array:
-    """Return the sums of the pairs' values for every body; by components, as a GPU may round products. (n, m)"""
+    """Sum the pairs' values for every body, element-wise because a GPU may round matrix products. (n, m)"""
     return jnp.sum(sums[:, :, None] * values[None], axis=1)

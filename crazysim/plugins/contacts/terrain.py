@@ -28,11 +28,11 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_FILE_BYTES = 256 * 2**20
 """Largest file of an image, bytes."""
 MAX_PIXELS = 2**24
-"""Most pixels of an image: 4096 x 4096. It takes 0.5 GB."""
+"""Largest number of pixels of an image, 4096 x 4096, which take 0.5 GB."""
 BASE_THICKNESS = 1.0
 """Thickness of the ground below the lowest height, m."""
 MIN_HEIGHT_RANGE = 1e-3
-"""Least range of heights of a height field of MuJoCo, m: a flat terrain is given one."""
+"""Smallest range of heights of a MuJoCo height field, m, which flat terrain gets too."""
 
 
 class Terrain(Plugin):

@@ -26,12 +26,12 @@ from crazysim.plugins.effects.moving_air import require_rotors
 from crazysim.pytree import PyTree, leaf
 
 NOMINAL_VOLTAGE = 3.7
-"""Nominal voltage of a lithium-polymer cell, V, as printed on cells: assumed for full rotor speed where an airframe has
-no table ``[battery]``."""
+"""Nominal voltage of a lithium-polymer cell, V, as printed on cells; the voltage assumed for full rotor speed if an
+airframe has no table ``[battery]``."""
 
 
 MAX_CELLS = 100
-"""Most cells in series, as of airframes."""
+"""Largest number of cells in series, the same limit as in airframes."""
 
 
 class BatteryData(PyTree):
@@ -58,15 +58,15 @@ class BatteryData(PyTree):
     n_cells: Array = leaf("parameter", 1, (1,))
     """Number of cells in series. (1,)"""
     command_voltage: Array | None = leaf("parameter", 1, (1,))
-    """Voltage at which the rotors turn as commanded, V; None if they do at any. (1,)"""
+    """Voltage at which the rotors turn as commanded, V; None if they do so at any voltage. (1,)"""
 
 
 class Battery(Plugin):
-    """Batteries: rotors draw power, the voltage sags, and the largest rotor speed with it; needs rotors.
+    """Batteries that the rotors discharge, with a voltage that limits the rotor speed; needs rotors.
 
-    The no-load speed of a DC motor is proportional to its voltage, and so is taken to be the largest rotor speed below
-    ``full_speed_voltage``. An empty battery turns no rotor. Parameters are for all drones, (), or for each,
-    (n_worlds, n_drones).
+    The voltage sags under load. The no-load speed of a DC motor is proportional to its voltage; the largest rotor speed
+    is assumed to be so too below ``full_speed_voltage``. An empty battery stops the rotors. Each parameter is one
+    number for all drones, (), or one number per drone, (n_worlds, n_drones).
     """
 
     capacity: ArrayLike | None = parameter(default=None, positive=True)
@@ -80,8 +80,8 @@ class Battery(Plugin):
     base_power: ArrayLike = parameter(default=0.0, low=0.0)
     """Electric power of everything but the motors, W."""
     full_speed_voltage: ArrayLike | None = parameter(default=None, positive=True)
-    """Least voltage at which the rotors reach the airframe's largest speed, V; None for that of the airframe's table
-    ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
+    """Least voltage at which the rotors reach the airframe's largest speed, V; None for the value in the airframe's
+    table ``[battery]`` (2.8 to 3.4 V for Crazyflies), or else 3.7 V per cell."""
     charge: ArrayLike = parameter(default=1.0, low=0.0, high=1.0)
     """State of charge at the beginning of an episode, 0 to 1."""
     command_voltage: ArrayLike | None = parameter(default=None, positive=True)
@@ -121,7 +121,7 @@ class Battery(Plugin):
         )
 
     def _own_or_airframe_value(self, sim: Simulation, key: str) -> ArrayLike:
-        """Return a setting, or else the airframes' number."""
+        """Return the setting ``key``, or the airframes' value if the setting is None."""
         value = getattr(self, key)
         return airframe_numbers(sim, lambda a: a.value(f"battery.{key}", ())) if value is None else value
 
@@ -192,8 +192,8 @@ def open_circuit_voltage(charge: Array, n_cells: Array) -> Array:
 def voltage_under_load(power: Array, open_circuit: Array, resistance: Array) -> tuple[Array, Array]:
     """Return the voltage, V, and current, A, of a source with internal resistance that supplies a power.
 
-    The upper root of ``V = V_0 - R P / V``. The source supplies ``V_0^2 / (4 R)`` at most, at half the open-circuit
-    voltage; larger loads get that.
+    The voltage is the larger root of ``V = V_0 - R P / V``. The source supplies ``V_0^2 / (4 R)`` at most, at half the
+    open-circuit voltage; larger loads get that much power.
 
     Args:
         power: Power of the load, W. (..., 1)

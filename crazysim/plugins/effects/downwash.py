@@ -34,7 +34,7 @@ Turbulent Flows, 2000, table 5.1)."""
 
 
 class DownwashData(MovingAir):
-    """Velocity of the air from the other drones of its world at every drone."""
+    """Velocity of the air at every drone in the jets of the other drones of its world."""
 
     diameter: Array = leaf("parameter", 1, (1,))
     """Diameter of the fully contracted jet of a drone, m. (1,)"""
@@ -75,7 +75,7 @@ class Downwash(Plugin):
     def sum_jets(self, data: SimData) -> SimData:
         """Add up the jets of all drones of the world at one drone; a jet does not act on its own drone.
 
-        They are added up at its load too, where the jet of the drone above counts.
+        Jets are also added up at the drone's load, on which the jet of its own drone does act.
         """
         record, s = self.read(data), data.states
         bodies = {name: x for name, x in data.plugins.items() if isinstance(x, BodiesInAir) and x.air_vel is not None}
@@ -94,7 +94,7 @@ class Downwash(Plugin):
 
 
 def stream_diameter(sim: Simulation, radius: Array) -> Array:
-    """Return the diameter of the contracted stream of drones with propellers of a radius, m. (1,) or one per drone"""
+    """Return the diameter of each drone's contracted stream, m, for a propeller radius, m. (1,) or one per drone"""
     factor = np.sqrt(2 * airframe_numbers(sim, lambda airframe: airframe.n_rotors))
     factor = factor[..., None] if factor.ndim else factor
     return device_array(factor * np.asarray(radius), radius.dtype)
@@ -153,7 +153,7 @@ def jet_speed(offset: Array, axis: Array, source: JetSource) -> Array:
     """
     below = -rotation.dot(offset, axis)
     off_axis = offset + below * axis
-    # Only below: above, the distance to the virtual origin would pass through zero.
+    # Clamped to zero above the rotors, where the distance to the virtual origin would pass through zero.
     down = jnp.where(below < 0, 0.0, below)
     q = down + source.origin
     w = q / (q * q + (math.sqrt(2) - 1) / SPREAD**2 * rotation.dot(off_axis, off_axis))

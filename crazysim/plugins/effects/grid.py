@@ -18,7 +18,8 @@ from crazysim.storage import read_text
 from crazysim.tables import ANY_NUMBER, MAX_NUMBER, POSITIVE, read_numbers
 
 MAX_FUSED_VALUES = 400_000
-"""Most numbers of a table that a fused kernel reads; compiling the step takes 8 µs for each."""
+"""Largest number of values of a table that a fused kernel reads; each value adds 8 µs to the compilation of the
+step."""
 WHY_UNFUSED = f"its table has more than {MAX_FUSED_VALUES:,} numbers"
 """Reason why a stage that reads a table is not fused."""
 MAX_FILE_BYTES = 2**30
@@ -33,16 +34,16 @@ class Grid(NamedTuple):
     values: ArrayLike
     """Values. (n_x, n_y, n_z) or (n_x, n_y, n_z, k)"""
     origin: ArrayLike = (0.0, 0.0, 0.0)
-    """Position of the node of the smallest x, y and z, m. (3,)"""
+    """Position of the node with the smallest x, y and z, m. (3,)"""
     spacing: ArrayLike = 1.0
     """Distance between neighbouring nodes, m: () or (3,)."""
 
     def checked(self, name: str, k: int | None = None) -> Grid:
-        """Return the grid as arrays of the host, with one spacing for each axis.
+        """Return the grid as checked NumPy arrays, with one spacing per axis.
 
         Args:
             name: Name in messages.
-            k: Length of a vector; None for a grid of numbers.
+            k: Length of the vector at each node; None for a grid of scalars.
         """
         values, origin, spacing = (
             read_numbers(f"{what} of {name}", getattr(self, what), POSITIVE if what == "spacing" else ANY_NUMBER)
@@ -64,10 +65,10 @@ class Grid(NamedTuple):
 
 
 def interpolate(values: Array, position: Array) -> Array:
-    """Return values between the nodes of a grid, linear along each axis (trilinear along three).
+    """Return values between the nodes of a grid, linear along each axis (trilinear with three axes).
 
-    A position outside takes the value of the nearest position inside. The gradient with respect to the position is that
-    within the cell, and zero outside.
+    A position outside takes the value of the nearest position inside. The gradient with respect to the position is the
+    gradient within the cell; outside the grid it is zero.
 
     Args:
         values: Values at the nodes. (n_1, ..., n_d, *core)
@@ -146,7 +147,7 @@ def load_wind_grid(path: str | Path) -> Grid:
         )
     axes, indices = zip(*(_nodes(table[:, k]) for k in range(3)), strict=True)
     shape = tuple(map(len, axes))
-    is_full = len(table) == math.prod(shape)  # before anything of that size is allocated
+    is_full = len(table) == math.prod(shape)  # checked before an array of that size is allocated
     values = np.full((*shape, 3), np.nan) if is_full else np.array(np.nan)
     if is_full:
         values[indices] = table[:, 3:]
@@ -168,7 +169,7 @@ def load_wind_grid(path: str | Path) -> Grid:
 
 
 def _nodes(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct coordinates along an axis, in order, and the index of each point's."""
+    """Return the distinct coordinates along an axis, in order, and the index of each point's coordinate among them."""
     order = np.sort(coordinates)
     size = max(order[-1] - order[0], 1e-9)
     axis = order[np.concatenate([[True], np.diff(order) > 1e-6 * size])]

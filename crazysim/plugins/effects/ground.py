@@ -23,11 +23,11 @@ class TerrainData(PyTree):
     below: Array = leaf("drone", 1)
     """Height of the ground below the drone after the last step, world frame, m. (n_worlds, n_drones, 1)"""
     floor: bool = static()
-    """True where a flat floor at z = 0 surrounds the terrain; False where its border extends outwards without end."""
+    """True if a flat floor at z = 0 surrounds the terrain; False if its border extends outwards without end."""
 
     @jit_unless_traced()
     def surface_at(self, pos: Array) -> tuple[Array, Array]:
-        """Return height and normal of the ground at a position; its z does not count.
+        """Return height and normal of the ground at a position, whose z is ignored.
 
         The surface is linear on the two triangles of each cell, as MuJoCo draws and collides it: contacts, rays and
         images have the same ground.
@@ -61,9 +61,9 @@ class TerrainData(PyTree):
 
 @jit_unless_traced()
 def ground_at(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return height and normal of the ground at a position; its z does not count; flat and zero without terrain.
+    """Return height and normal of the ground at a position, whose z is ignored; zero and upwards without terrain.
 
-    Where terrains overlap, the highest counts.
+    Where terrains overlap, the highest one is used.
 
     Args:
         data: Simulation, one world or one drone of it.

@@ -17,7 +17,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 
 
 class GroundEffectData(PyTree):
-    """Parameters of the gain in thrust; none changes with time."""
+    """Parameters of the gain in thrust, constant in time."""
 
     propeller_radius: Array = leaf("parameter", 1, (1,))
     """Radius of a propeller, m. (1,)"""
@@ -61,7 +61,7 @@ def rotor_positions(sim: Simulation) -> Array:
 
 
 def thrust_gain(height: Array, upright: Array, radius: Array) -> Array:
-    """Return the ratio of the thrust of rotors near the ground to that far from it, at the same speed.
+    """Return the ratio of the rotors' thrust near the ground to their thrust far from it, at the same speed.
 
     ``1 / (1 - (R / 4 z)^2)`` (Cheeseman and Bennett 1955, ARC R&M 3021, for hover). Their image source has a pole at
     z = R / 4; ``z^2 + R^2 / 4`` replaces ``z^2`` here, so that the ratio is at most 4/3, on the floor. At z = R it is

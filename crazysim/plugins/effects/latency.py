@@ -20,7 +20,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf
 
 MAX_DELAY = 100_000
-"""Longest delay, steps: the queue of each drone has a row for each."""
+"""Longest delay, steps; the queue of each drone has one row more than that."""
 
 
 class LatencyData(PyTree):
@@ -37,17 +37,17 @@ class LatencyData(PyTree):
 class Latency(Plugin):
     """Commands of the simulation's own level that arrive late.
 
-    A command that is sent before step i is the staged command of the controller at step i + delay; with rotor commands
-    it is the command of the motors in that step. Until the first command arrives, the one that was staged when the
-    plugin was added (after a reset, that of the default data) stays in force.
+    A command that is sent before step i reaches the controller at step i + delay; a rotor command reaches the motors in
+    that step. Until the first command arrives, the command that was staged when the plugin was added stays in force
+    (after a reset, the command of the default data).
     """
 
     delay: ArrayLike = parameter(low=0, high=MAX_DELAY, dtype=np.int32)
-    """Delay, steps, whole numbers. () or (n_worlds, n_drones)"""
+    """Delay, a whole number of steps. () or (n_worlds, n_drones)"""
     max_delay: int | None = setting(default=None, low=0, high=MAX_DELAY)
-    """Largest delay that the record can take later on, steps; None for the largest of ``delay``."""
+    """Largest delay to which the record can be changed later, steps; None for the largest value of ``delay``."""
     name: str = "latency"
-    order: ClassVar[int] = -1  # a late command is limited as any other
+    order: ClassVar[int] = -1  # before the effects that limit commands, so that they limit a late one too
 
     def record(self, sim: Simulation) -> LatencyData:
         return self._filled_queue(sim, sim.data)

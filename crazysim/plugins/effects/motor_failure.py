@@ -20,21 +20,21 @@ from crazysim.pytree import PyTree, leaf, select_worlds
 
 
 class MotorFailureData(PyTree):
-    """Effectiveness of every rotor, and when it fails."""
+    """Effectiveness of every rotor, and the time and rate of its failure."""
 
     effectiveness: Array = leaf("drone", 1)
     """Fraction of thrust and drag torque left to a rotor, 1. (n_worlds, n_drones, n_rotors)"""
     fail_step: Array | None = leaf("parameter", 1)
-    """Step of the episode in which a rotor fails, negative for never; None if none is set. (n_rotors,)"""
+    """Step of the episode in which a rotor fails, negative for never; None if no step is set. (n_rotors,)"""
     rate: Array | None = leaf("parameter", 1)
-    """Failures per second of a rotor that works, 1/s; None if none fails by chance. (n_rotors,)"""
+    """Failures per second of a rotor that works, 1/s; None if no rotor fails at random. (n_rotors,)"""
 
 
 class MotorFailure(Plugin):
     """Rotors that are weaker than the airframe's, or fail; needs rotors.
 
-    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. A failed one gives none, takes
-    no command and runs down. Controllers keep the airframe's parameters.
+    A rotor of effectiveness e gives e times the thrust and the drag torque of its speed. A failed rotor gives neither,
+    ignores its commands and runs down. Controllers keep the airframe's parameters.
     """
 
     effectiveness: ArrayLike = parameter(default=1.0, low=0.0, high=1.0)

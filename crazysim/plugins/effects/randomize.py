@@ -23,9 +23,9 @@ from crazysim.plugins.effects.rotor_aerodynamics import RotorAerodynamicsData
 from crazysim.pytree import leaf
 
 FACTORS = ("mass", "inertia", "torque", "lag", "drag")
-"""Settings that are factors of one number of a drone, in the order of ``RandomizeData.factors``."""
+"""Settings that give one factor per drone, in the order of ``RandomizeData.factors``."""
 RANGES = (*FACTORS, "thrust", "rotor_thrust", "wind", "charge", "delay")
-"""Settings that are ranges of numbers."""
+"""Settings that are ranges (low, high)."""
 
 
 class RandomizeData(MovingAir):
@@ -36,23 +36,23 @@ class RandomizeData(MovingAir):
     thrust_factors: Array = leaf("drone", 1)
     """Factors of the thrust of the rotors, 1. (n_worlds, n_drones, n_rotors)"""
     air_vel: Array | None = leaf("drone", 1, (3,))
-    """Mean wind, world frame, m/s; None without. (n_worlds, n_drones, 3)"""
+    """Mean wind, world frame, m/s; None without wind. (n_worlds, n_drones, 3)"""
     mass: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the mass, 1; None for one. (2,)"""
+    """Least and largest factor of the mass, 1; None for a factor of 1. (2,)"""
     inertia: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the inertia, 1; None for one. (2,)"""
+    """Least and largest factor of the inertia, 1; None for a factor of 1. (2,)"""
     thrust: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the thrust of all rotors, 1; None for one. (2,)"""
+    """Least and largest factor of the thrust of all rotors, 1; None for a factor of 1. (2,)"""
     rotor_thrust: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the thrust of each rotor, 1; None for one. (2,)"""
+    """Least and largest factor of the thrust of each rotor, 1; None for a factor of 1. (2,)"""
     torque: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the drag torque, 1; None for one. (2,)"""
+    """Least and largest factor of the drag torque, 1; None for a factor of 1. (2,)"""
     lag: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the rates of the rotors' lag, 1; None for one. (2,)"""
+    """Least and largest factor of the rates of the rotors' lag, 1; None for a factor of 1. (2,)"""
     drag: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest factor of the linear drag, 1; None for one. (2,)"""
+    """Least and largest factor of the linear drag, 1; None for a factor of 1. (2,)"""
     wind: Array | None = leaf("parameter", 1, (2,))
-    """Least and largest speed of the mean wind, m/s; None without. (2,)"""
+    """Least and largest speed of the mean wind, m/s; None without wind. (2,)"""
     charge: Array | None = leaf("parameter", 1, (2,))
     """Least and largest state of charge of a battery, 1; None for the setting of ``Battery``. (2,)"""
     delay: Array | None = leaf("parameter", 1, (2,))
@@ -67,13 +67,13 @@ class RandomizeData(MovingAir):
 
 
 class Randomize(Plugin):
-    """Drones that differ from their airframe, in another way in every episode; needs rotors.
+    """Drones that differ from their airframe, in a way drawn anew for every episode; needs rotors.
 
-    Each setting is a range (low, high), for all drones, (2,), or for each, (n_worlds, n_drones, 2), from which a number
-    is drawn uniformly for every drone at every reset, or in the first step of a simulation that was not reset; two
-    equal numbers are fixed, None changes nothing. Controllers keep the airframe's numbers. The numbers drawn do not
-    depend on the other settings.
-    ``Randomize.crazyflie()`` and ``Randomize.generic()`` have ranges with sources.
+    Each setting is a range (low, high): one for all drones, (2,), or one per drone, (n_worlds, n_drones, 2). A number
+    is drawn uniformly from it for every drone at every reset, or in the first step of a simulation that was not reset.
+    Two equal numbers give a fixed number; None changes nothing. Controllers keep the airframe's numbers. The number
+    drawn for a setting does not depend on the other settings. ``Randomize.crazyflie()`` and ``Randomize.generic()``
+    have ranges with sources.
     """
 
     mass: ArrayLike | None = parameter(default=None, positive=True)
@@ -83,7 +83,7 @@ class Randomize(Plugin):
     thrust: ArrayLike | None = parameter(default=None, positive=True)
     """Factor of the thrust, the same for all rotors of a drone."""
     rotor_thrust: ArrayLike | None = parameter(default=None, positive=True)
-    """Factor of the thrust, another for each rotor; it multiplies ``thrust``."""
+    """Factor of the thrust, drawn separately for each rotor; it multiplies the factor ``thrust``."""
     torque: ArrayLike | None = parameter(default=None, positive=True)
     """Factor of the rotors' drag torque."""
     lag: ArrayLike | None = parameter(default=None, positive=True)
@@ -93,9 +93,9 @@ class Randomize(Plugin):
     wind: ArrayLike | None = parameter(default=None, low=0.0)
     """Speed of a mean wind of random horizontal direction, m/s; needs a model with drag."""
     charge: ArrayLike | None = parameter(default=None, low=0.0, high=1.0)
-    """State of charge in which an episode begins, of simulations with ``Battery``."""
+    """State of charge at the beginning of an episode; needs ``Battery``."""
     delay: ArrayLike | None = parameter(default=None, low=0.0)
-    """Delay of commands, steps, rounded down, of simulations with ``Latency``, whose delay must be one per drone."""
+    """Delay of commands, steps, rounded down; needs ``Latency`` with one delay per drone."""
     optional: Sequence[str] = ()
     """Settings that are ignored, instead of an error, if the simulation lacks the model they act on: ``charge``,
     ``drag``, ``wind``, ``delay``. Settings of presets are optional."""
@@ -113,7 +113,7 @@ class Randomize(Plugin):
 
     @classmethod
     def crazyflie(cls, **changes: ArrayLike | None) -> Randomize:
-        """Return the spread between published identifications of Crazyflies 2.x, and between flights.
+        """Return ranges that cover the spread of published identifications of Crazyflies 2.x, and of different flights.
 
         The page *Disturbances, randomisation, sim to real* has the source of each range.
 
@@ -144,7 +144,7 @@ class Randomize(Plugin):
 
     @classmethod
     def _preset(cls, ranges: dict[str, Any], changes: dict[str, Any]) -> Randomize:
-        """Return a plugin of the ranges with changes, where the ranges that are not changed are optional."""
+        """Return a plugin with the ranges of a preset and changes to them; unchanged ranges are optional."""
         settings: dict[str, Any] = {"optional": tuple([name for name in ranges if name not in changes])}
         return cls(**(settings | ranges | changes))
 
@@ -204,7 +204,7 @@ class Randomize(Plugin):
         return 0 if self.delay is None else int(np.max(np.asarray(self.delay)))
 
     def _latency(self, sim: Simulation) -> str:
-        """Return the expression of a ``Latency`` whose delays can be drawn."""
+        """Return the expression, for messages, of a ``Latency`` whose delays can be drawn."""
         return f"Latency(delay=np.zeros({(sim.n_worlds, sim.n_drones)}, int), max_delay={self._max_delay})"
 
     def influence(self, data: SimData) -> SimData:

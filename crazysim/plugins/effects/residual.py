@@ -35,7 +35,7 @@ class ResidualData(PyTree):
 
     @staticmethod
     def create(airframe: Airframe) -> ResidualData:
-        """Return the shared coefficients of an airframe."""
+        """Return the coefficients of an airframe, the same for all drones."""
         dtype = jnp.result_type(float)
         names = ("hidden", "output") if "residual.hidden" in airframe.values else ()
         return ResidualData(
@@ -48,15 +48,17 @@ class ResidualData(PyTree):
 class Residual(Plugin):
     """Identified force and torque that the model lacks: linear terms and an optional network; needs rotors.
 
-    They depend on the velocity over ground, so that wind does not change them. Coefficients are for all drones, as
-    given here, or for each, with (n_worlds, n_drones) in front; without them they are those of the airframe's table
-    ``[residual]``, which were fitted with the linear drag, and cannot be combined with ``RotorAerodynamics``.
+    They depend on the velocity over ground, so that wind does not change them. Coefficients have the shapes below, for
+    all drones, or (n_worlds, n_drones) in front of them, for each drone. By default they are the coefficients in the
+    airframe's table ``[residual]``. Those were fitted with the linear drag, and so cannot be combined with
+    ``RotorAerodynamics``.
     """
 
     linear: ArrayLike | None = parameter(default=None)
     """Force, N, and torque, N m, in the body frame, per input; None for the airframe's. (6, 14)"""
     hidden: ArrayLike | None = parameter(default=None)
-    """Weights of the network's hidden layer, 1 per input; None for none, or the airframe's. (n_hidden, 14)"""
+    """Weights of the network's hidden layer, 1 per input; None for no network if ``linear`` is given, else the
+    airframe's. (n_hidden, 14)"""
     output: ArrayLike | None = parameter(default=None)
     """Force, N, and torque, N m, in the body frame, per activation; None as for ``hidden``. (6, n_hidden)"""
     name: str = "residual"
@@ -100,8 +102,8 @@ def residual_inputs(
 ) -> Array:
     """Return the inputs of a residual, all in the body frame.
 
-    They are 1; velocity, m/s; velocity times speed, m^2/s^2; angular velocity, rad/s; collective thrust over weight;
-    torque of the rotors over weight and arm.
+    They are 1; velocity, m/s; velocity times speed, m^2/s^2; angular velocity, rad/s; collective thrust divided by
+    weight; torque of the rotors divided by weight times arm length.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (..., 4)
@@ -149,7 +151,7 @@ def residual_wrench(inputs: Array, residual: ResidualData) -> tuple[Array, Array
 
 
 def _airframe_coefficients(sim: Simulation) -> dict[str, Any]:
-    """Return the coefficients of the airframes. Either all or none have a network, of one size."""
+    """Return the coefficients of the airframes. Either all airframes or none have a network, of the same size."""
     lacking = next((airframe for airframe in sim.airframes if "residual.linear" not in airframe.values), None)
     if lacking is not None:
         raise ConfigError(

@@ -25,7 +25,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 
 
 class RotorAerodynamicsData(PyTree):
-    """Parameters of rotors in moving air; none changes with time."""
+    """Parameters of rotors in moving air, constant in time."""
 
     drag: Array = leaf("parameter", 1, (1,))
     """Drag of a rotor across its axis per velocity and rotor speed, N s^2/(m rad). (1,)"""
@@ -40,35 +40,36 @@ class RotorAerodynamicsData(PyTree):
     hub_pos: Array = leaf("parameter", 2)
     """Positions of the hubs, body frame, m. (n_rotors, 3)"""
     ceiling: Array | None = leaf("parameter", 1, (1,))
-    """Height of the ceiling, world frame, m; None for none. (1,)"""
+    """Height of the ceiling, world frame, m; None without a ceiling. (1,)"""
 
 
 class RotorAerodynamics(Plugin):
     """Forces of the air on every rotor, which replace the airframe's linear drag; needs rotors.
 
-    Each rotor has the velocity of its own hub relative to the air, with all winds and downwash. Across its axis it has
-    a drag ``-k_d omega v`` at the hub, which tips the drone back; along its axis it has the thrust of blade element and
-    momentum theory: less in climbs, more in forward flight. The defaults of ``drag`` and ``inflow`` give
-    the airframe's linear drag for small velocities around hover.
+    The forces follow from the velocity of each hub relative to the air, including all winds and downwash. Across its
+    axis a rotor has a drag ``-k_d omega v`` at the hub, which tips the drone back. Along its axis it has the thrust of
+    blade element and momentum theory: less in climbs, more in forward flight. The defaults of ``drag`` and ``inflow``
+    give the airframe's linear drag for small velocities around hover.
     """
 
     drag: ArrayLike | None = parameter(default=None, low=0.0)
     """Drag of a rotor per velocity across its axis and rotor speed (k_d of RotorPy), N s^2/(m rad) = kg/rad; None for
-    that of the airframe's linear drag in hover, the mean of x and y; zero for none. () or (n_worlds, n_drones)"""
+    the value that matches the airframe's linear drag in hover, the mean of x and y; zero for no drag. () or
+    (n_worlds, n_drones)"""
     inflow: ArrayLike | None = parameter(default=None, low=0.0)
     """Loss of thrust of a hovering rotor per axial velocity and rotor speed (k_z of RotorPy), N s^2/(m rad) = kg/rad;
-    None for the airframe's linear drag along z in hover; zero for the thrust of still air.
-    () or (n_worlds, n_drones)"""
+    None for the value that matches the airframe's linear drag along z in hover; zero for the thrust of still air. () or
+    (n_worlds, n_drones)"""
     flapping: ArrayLike = parameter(default=0.0, low=0.0)
     """Moment of flapping blades at a hub per velocity across its axis and rotor speed, which tips the drone back,
-    N s^2/rad = kg m/rad. Stiffness of blades and hubs is not part of airframes, so that there is no default but zero.
-    () or (n_worlds, n_drones)"""
+    N s^2/rad = kg m/rad. The default is zero because airframes do not contain the stiffness of blades and hubs. () or
+    (n_worlds, n_drones)"""
     hub_height: ArrayLike | None = parameter(default=None)
     """Height of the hubs above the centre of mass, m, the lever arm of the drag; None for the airframe's
     ``shape.propeller_height`` above ``rotors.position``. () or (n_worlds, n_drones)"""
     ceiling: ArrayLike | None = parameter(default=None, positive=True)
     """Height of a flat ceiling, below which rotors give more thrust, world frame, m; rotors above it give the thrust of
-    free air. Needs ``inflow``; None for none. () or (n_worlds, n_drones)"""
+    free air. Needs ``inflow``; None for no ceiling. () or (n_worlds, n_drones)"""
     propeller_radius: ArrayLike | None = parameter(default=None, positive=True)
     """Radius of a propeller, m; None for the airframe's. () or (n_worlds, n_drones)"""
     air_density: ArrayLike = parameter(default=AIR_DENSITY, positive=True)

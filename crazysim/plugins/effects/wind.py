@@ -24,10 +24,10 @@ FOOT = 0.3048
 LOWEST, HIGHEST = 10.0, 1000.0
 """Range of heights in which the low-altitude model holds, ft; heights outside are clipped to it."""
 MIN_PROFILE_HEIGHT = 0.01
-"""Height below which the wind of a power law stays the same, m: its slope would be infinite at zero."""
+"""Height below which the wind of a power law stays constant, m: its slope would be infinite at zero."""
 MIN_AIRSPEED = 1.0
-"""Airspeed at which gusts pass a drone that drifts with the mean wind, m/s. An assumption: in the model's frozen field
-the gust at such a drone would never change."""
+"""Airspeed assumed for the gusts at a drone that drifts with the mean wind, m/s. An assumption: in the model's frozen
+field the gust at such a drone would never change."""
 
 
 class WindData(MovingAir):
@@ -36,9 +36,9 @@ class WindData(MovingAir):
     velocity: Array = leaf("parameter", 1, (3,))
     """Mean wind, at the reference height if it depends on the height, world frame, m/s. (3,)"""
     roughness: Array | None = leaf("parameter", 1, (1,))
-    """Roughness length of the logarithmic profile, m; None for another. (1,)"""
+    """Roughness length of the logarithmic profile, m; None for other profiles. (1,)"""
     exponent: Array | None = leaf("parameter", 1, (1,))
-    """Exponent of the power-law profile, 1; None for another. (1,)"""
+    """Exponent of the power-law profile, 1; None for other profiles. (1,)"""
     reference_height: Array | None = leaf("parameter", 1, (1,))
     """Height of the mean wind, m; None for the same wind at all heights. (1,)"""
     speed_20ft: Array | None = leaf("parameter", 1, (1,))
@@ -52,7 +52,7 @@ class WindData(MovingAir):
         return self.velocity_at(data.states.pos, ground_below(data))
 
     def mean_at(self, pos: Array, ground: Array | float = 0.0) -> Array:
-        """Return the mean wind at a position, above ground of some height, m (..., 1), world frame, m/s. (..., 3)"""
+        """Return the mean wind at a position over ground at a height, m (..., 1), world frame, m/s. (..., 3)"""
         if self.reference_height is None:
             return self.velocity
         height = pos[..., 2:] - ground
@@ -82,12 +82,12 @@ class Wind(Plugin):
     moderate, 45 severe turbulence (MIL-F-8785C, 3.7.3.4). None for no gusts. () or (n_worlds, n_drones)"""
     roughness: ArrayLike | None = parameter(default=None, positive=True)
     """Roughness length of the ground, m, for a mean that grows with the logarithm of the height: 0.15 ft (0.046 m) in
-    MIL-F-8785C near airfields, 2 ft (0.61 m) elsewhere. None for none. () or (n_worlds, n_drones)"""
+    MIL-F-8785C near airfields, 2 ft (0.61 m) elsewhere. None for no such growth. () or (n_worlds, n_drones)"""
     exponent: ArrayLike | None = parameter(default=None, low=0.0)
     """Exponent of a mean that grows with a power of the height, 1, such as 0.2 over land (IEC 61400-1) and 0.14 over
-    the sea (IEC 61400-3). None for none. () or (n_worlds, n_drones)"""
+    the sea (IEC 61400-3). None for no such growth. () or (n_worlds, n_drones)"""
     reference_height: ArrayLike = parameter(default=20 * FOOT, positive=True)
-    """Height at which a mean that grows is ``velocity``, m. () or (n_worlds, n_drones)"""
+    """Height at which a mean that grows with height equals ``velocity``, m. () or (n_worlds, n_drones)"""
     name: str = "wind"
 
     def record(self, sim: Simulation) -> WindData:
@@ -138,9 +138,7 @@ class Wind(Plugin):
 
 
 def wind_at(data: SimData, pos: Array) -> Array:
-    """Return the velocity of the air at a position near a drone, the sum over all ``Wind``, world frame, m/s; of one
-    drone. (3,)
-    """
+    """Return the velocity of the air at a position near one drone, the sum over all ``Wind``, world frame, m/s. (3,)"""
     total = jnp.zeros_like(pos)
     for record in data.plugins.values():
         if isinstance(record, WindData):

@@ -32,9 +32,9 @@ class WindFieldData(MovingAir):
     scale: Array = leaf("parameter", 1, (1,))
     """Factor of all velocities, 1. (1,)"""
     spread: Array | None = leaf("parameter", 1, (3,))
-    """Largest random displacement along each axis, m; None for none. (3,)"""
+    """Largest random displacement along each axis, m; None for no displacement. (3,)"""
     shift: Array | None = leaf("drone", 1)
-    """Random displacement in this episode, the same for all drones of a world, m; None for none.
+    """Random displacement in this episode, the same for all drones of a world, m; None without one.
     (n_worlds, n_drones, 3)"""
     air_vel: Array = leaf("drone", 1, (3,))
     """Velocity of the air at the drone, world frame, m/s. (n_worlds, n_drones, 3)"""
@@ -52,8 +52,8 @@ class WindFieldData(MovingAir):
 class WindField(Plugin):
     """Wind from velocities on a grid, as drag of the velocity relative to the air; needs a model with drag.
 
-    Velocities are trilinear between the nodes and constant outside. They are looked up once a step, at drones and at
-    loads with drag. Winds add up.
+    Velocities are interpolated trilinearly between the nodes, and are constant outside the grid. They are looked up
+    once a step, at drones and at loads with drag. Winds add up.
     """
 
     field: Grid = parameter()
@@ -63,8 +63,8 @@ class WindField(Plugin):
     scale: ArrayLike = parameter(default=1.0)
     """Factor of all velocities, 1. () or (n_worlds, n_drones)"""
     spread: ArrayLike | None = parameter(default=None, low=0.0)
-    """Largest random displacement along each axis, m, uniform, drawn for each world and episode; None for none. (3,)
-    or (n_worlds, n_drones, 3)"""
+    """Largest random displacement along each axis, m, uniform, drawn for each world and episode; None for no
+    displacement. (3,) or (n_worlds, n_drones, 3)"""
     name: str = "wind_field"
 
     def record(self, sim: Simulation) -> WindFieldData:

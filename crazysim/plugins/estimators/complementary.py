@@ -45,11 +45,12 @@ class ComplementaryData(PyTree):
     height: Array = leaf("drone", 1, (1,))
     """Height, m. (n_worlds, n_drones, 1)"""
     climb: Array = leaf("drone", 1, (1,))
-    """Change of the height in the last update, m/s. (n_worlds, n_drones, 1)"""
+    """Rate of change of the height in the last update, m/s. (n_worlds, n_drones, 1)"""
     inertial_climb: Array = leaf("drone", 1, (1,))
-    """Integral of the vertical acceleration, which decays, m/s. (n_worlds, n_drones, 1)"""
+    """Leaky integral of the vertical acceleration, m/s. (n_worlds, n_drones, 1)"""
     over_surface: Array = leaf("drone", 1, (1,))
-    """1 from the first distance to the ground on, after which pressure is not used; else 0. (n_worlds, n_drones, 1)"""
+    """1 once a distance to the ground has been measured, after which pressure is not used; else 0.
+    (n_worlds, n_drones, 1)"""
     kp: Array = leaf("parameter", 1, (1,))
     """Gain of the attitude error, 1/s. (1,)"""
     ki: Array = leaf("parameter", 1, (1,))
@@ -59,11 +60,12 @@ class ComplementaryData(PyTree):
 class Complementary(Estimator):
     """The Crazyflie's complementary filter: attitude from an ``IMU``, height from a ``Barometer`` or ``TimeOfFlight``.
 
-    The gyroscope is integrated and slowly drawn to the direction of gravity that the accelerometer shows (Mahony's
-    filter); the heading is integrated only. Positions and velocities along x and y are zero, as in the firmware, so
-    it flies commands of attitude and below. Sources: sensfusion6.c, estimator_complementary.c and
-    position_estimator_altitude.c of bitcraze/crazyflie-firmware, commit 2a18fc29. It begins at the true attitude and
-    height, with an accelerometer that shows 1 g at rest.
+    The gyroscope is integrated, and the attitude is slowly corrected towards the direction of gravity that the
+    accelerometer measures (Mahony's filter); the heading is not corrected. Positions and velocities along x and y are
+    zero, as in the firmware, so drones can be controlled with it at the level of attitude and below. Sources:
+    sensfusion6.c, estimator_complementary.c and position_estimator_altitude.c of bitcraze/crazyflie-firmware, commit
+    2a18fc29. The filter begins at the true attitude and height, and assumes that the accelerometer measures 1 g at
+    rest.
     """
 
     _: dataclasses.KW_ONLY
@@ -125,7 +127,7 @@ class Complementary(Estimator):
         ]
 
     def estimated_states(self, data: SimData) -> dict[str, Array]:
-        """Return the estimated attitude, height and vertical velocity of one drone; the rest of both is zero."""
+        """Return the estimated attitude, height and vertical velocity of one drone; along x and y both are zero."""
         record, s = self.read(data), data.states
         zero = jnp.zeros_like(s.pos[..., :2])
         pos, vel = (jnp.concatenate([zero, up], axis=-1) for up in (record.height, record.climb))
@@ -152,7 +154,7 @@ class Complementary(Estimator):
 
 
 def filtered_height(height: Array, measured: Array, shift: Array) -> Array:
-    """Return the height, m, (1,), after a measured one, m, (1,), and the inertial change in the interval, m. (1,)"""
+    """Return the height, m, from the last one, a measured one and the inertial change in the interval, m. (1,) each"""
     return KEEP_HEIGHT * height + (1 - KEEP_HEIGHT) * measured + shift
 
 
@@ -165,7 +167,7 @@ def height_over_surface(
         height: Height before. (1,)
         by_pressure: Height to use if the ground was never measured, m. (1,)
         distance: Distance to the ground, m. (1,)
-        useful: True where it is of this interval. (1,)
+        useful: True where the distance is recent and within the sensor's range. (1,)
         over_surface: 1 if the ground has been measured before. (1,)
         shift: Inertial change of the height in the interval, m. (1,)
     """
@@ -179,7 +181,7 @@ def update_mahony(
 ) -> tuple[Array, Array]:
     """Return attitude and integral after an interval (``sensfusion6UpdateQ``).
 
-    The firmware's fast inverse square root, which is off by up to 0.2%, is an exact one here.
+    The firmware's fast inverse square root, which is off by up to 0.2%, is replaced by an exact one.
 
     Args:
         quat: Attitude, body to world, unit, xyzw. (4,)

@@ -4,7 +4,7 @@ The equations, constants and guards are those of the Crazyflie's firmware (kalma
 bitcraze/crazyflie-firmware, commit 2a18fc29), whose sources are M. W. Mueller, M. Hamer and R. D'Andrea, Fusing
 ultra-wideband range measurements with accelerometers and rate gyroscopes for quadrocopter state estimation, ICRA 2015,
 and M. W. Mueller, M. Hehn and R. D'Andrea, Covariance correction step for Kalman filtering with an attitude, Journal of
-Guidance, Control, and Dynamics 40 (2017). The drag that the firmware can model is zero on Crazyflies, and left out.
+Guidance, Control, and Dynamics 40 (2017). The drag that the firmware can model is zero on Crazyflies, and is left out.
 An estimate may also contain the biases of the inertial sensors, which ``predict_biased`` and all updates use: the
 filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with velocities in
 the body frame.
@@ -30,14 +30,15 @@ POS, VEL, ATT, GYRO = (0, 1, 2), (3, 4, 5), (6, 7, 8), (12, 13, 14)
 N, N_BIASED = 9, 15
 """Number of error states without biases, and with the biases of accelerometer and gyroscope, in this order."""
 MAX_COVARIANCE, MIN_VARIANCE = 100.0, {N: 1e-6, N_BIASED: 1e-12}
-"""Bounds of a covariance and a variance (kalman_core.c); with biases, whose variances are smaller, an assumption."""
+"""Upper bound of covariances, and lower bounds of variances by the number of errors (kalman_core.c; an assumption with
+biases, whose variances are smaller)."""
 EPS = 1e-6
 """Added to a norm before a division by it (kalman_core.c)."""
 MAX_POS, MAX_VEL = 100.0, 10.0
 """Bounds of coordinates, m, and of velocities, body frame, m/s, beyond which the filter has failed
 (kalman_supervisor.c)."""
 SMALL_ANGLE, LARGE_ANGLE = 1e-4, 10.0
-"""Smallest attitude error that is moved into the attitude, and the largest, rad (kalman_core.c)."""
+"""Smallest and largest attitude error that is moved into the attitude, rad (kalman_core.c)."""
 REVERSION_SHARE = 0.001
 """Share of the initial attitude that a prediction on the ground mixes in (kalman_core_params_defaults.h)."""
 
@@ -65,7 +66,8 @@ class Estimate(PyTree):
 def covariance(upper: Array) -> Array:
     """Return the covariance, (..., n, n), from its upper triangle, row by row. (..., n (n + 1) / 2)"""
     n = _n_errors(upper)
-    # Unsigned: to signed indices JAX 0.10 adds sizes of the precision in which it indexed first, float32 or float64.
+    # Unsigned, because JAX 0.10 adds axis sizes to signed indices, typed for the precision in which it indexed first,
+    # float32 or float64.
     index = np.zeros((n, n), np.uint32)
     index[_upper_triangle(n)] = np.arange(upper.shape[-1])
     return upper[..., np.maximum(index, index.T)]
@@ -98,7 +100,7 @@ def initial_estimate(
 def predict(
     estimate: Estimate, accel: Array, gyro: Array, dt: float, resting: Array | None = None, all_axes: bool = False
 ) -> Estimate:
-    """Return the estimate after an interval, without process noise, which bounds the variances.
+    """Return the estimate after an interval, without process noise; ``add_noise`` also bounds the variances.
 
     Args:
         estimate: The estimate.
@@ -106,8 +108,8 @@ def predict(
         gyro: Angular velocity, body frame, rad/s. (3,)
         dt: Length of the interval, s.
         resting: Attitude towards which a drone on the ground is drawn, (4,); None in flight.
-        all_axes: True to use the force along all axes in flight; False for that along the z axis of the body only, as
-            the firmware does, because rotors can make no other.
+        all_axes: True to use the force along all axes in flight; False to use only the force along the z axis of the
+            body, as the firmware does, because rotors can generate no other force.
     """
     pos, vel, quat = estimate.pos, estimate.vel, estimate.quat
     rot, identity, angle = rotation.matrix(quat), jnp.eye(3, dtype=pos.dtype), dt * gyro
@@ -229,7 +231,7 @@ def update(estimate: Estimate, rows: Sequence[int], h: Array, error: Array, devi
     ph = p[:, rows] @ h
     r = deviation * deviation
     gain = ph * (1 / (jnp.dot(h, ph[jnp.asarray(rows)]) + r))
-    # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns of I - K H that belong to rows are not trivial.
+    # Joseph's form (I - K H) P (I - K H)' + K R K'; only the columns ``rows`` of I - K H differ from the identity.
     reduction = jnp.eye(n, dtype=p.dtype)[:, rows] - gain[:, None] * h
     others = np.setdiff1d(np.arange(n), rows)
     keep = np.zeros((n, 1), bool)
@@ -255,7 +257,7 @@ def finalize(estimate: Estimate, least: float = SMALL_ANGLE) -> Estimate:
 
     Args:
         estimate: The estimate.
-        least: Size of the error, rad, up to which the firmware drops it.
+        least: Size, rad, up to which an error is dropped; by default the firmware's.
     """
     error, p = estimate.att_error, covariance(estimate.cov)
     size = jnp.abs(error)
@@ -280,7 +282,8 @@ def select_estimate(which: Array, new: Estimate, old: Estimate) -> Estimate:
 def bound_covariance(p: Array) -> Array:
     """Return the upper triangle of a covariance, bounded; NaN becomes the upper bound.
 
-    The firmware takes the mean of both triangles, which differ by rounding; with one, the engine computes half of them.
+    The firmware takes the mean of both triangles, which differ by rounding; with the upper triangle alone, the engine
+    computes half as many entries.
     """
     n = p.shape[0]
     upper = p[_upper_triangle(n)]
@@ -290,7 +293,7 @@ def bound_covariance(p: Array) -> Array:
 def turn_attitude(quat: Array, angle: Array, resting: Array | None = None) -> Array:
     """Return an attitude turned in the body frame by a rotation vector, rad, with the firmware's guards. (4,)
 
-    A part of an attitude at rest is mixed in where one is given.
+    If ``resting`` is given, a share of it is mixed in (``REVERSION_SHARE``).
     """
     size = rotation.safe_norm(angle) + EPS
     half = 0.5 * size
@@ -302,12 +305,12 @@ def turn_attitude(quat: Array, angle: Array, resting: Array | None = None) -> Ar
 
 
 def _limit_covariances(covariances: Array) -> Array:
-    """Return covariances within their upper bound, which NaN becomes."""
+    """Return covariances limited to their upper bound; NaN becomes the bound."""
     return jnp.where(covariances <= MAX_COVARIANCE, covariances, MAX_COVARIANCE)
 
 
 def _limit_variances(variances: Array, n: int) -> Array:
-    """Return variances within their bounds, of ``n`` errors; NaN becomes the upper bound."""
+    """Return the variances of ``n`` errors limited to their bounds; NaN becomes the upper bound."""
     return jnp.where(variances <= MAX_COVARIANCE, jnp.maximum(variances, MIN_VARIANCE[n]), MAX_COVARIANCE)
 
 

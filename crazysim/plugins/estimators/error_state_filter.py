@@ -1,4 +1,4 @@
-"""Base class of filters with error states: sums of inertial measurements, and aids that are used once, on arrival."""
+"""Base class of filters with error states: sums of inertial measurements, and other measurements used on arrival."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class ErrorStateFilter(Estimator):
     def initial_record(self, sim: Simulation, kind: type[R], estimate: Estimate, **given: Any) -> R:
         """Return the record before the first step.
 
-        No measurement was ``used``: the step in which the latest one was taken is -1 for each sensor. The filter has
-        had no ``failures``, in which its estimate left its bounds and it was restarted.
+        In ``used``, the step in which the latest used measurement of each sensor was taken, all values are -1.
+        ``failures``, the number of times that the estimate left its bounds and the filter restarted, is zero.
 
         Args:
             sim: The simulation.
@@ -77,7 +77,7 @@ class ErrorStateFilter(Estimator):
         return self.filled(sim, kind, estimate=estimate, used=used, failures=failures, **given)
 
     def prediction_schedule(self, freq: int) -> tuple[int, Callable[[SimData], Any]]:
-        """Return the steps between predictions, for ``freq`` steps per second, Hz, and when one is due."""
+        """Return the steps between predictions at ``freq`` steps per second, and the predicate for when one is due."""
         period = freq // dividing_rate("freq", self.freq, freq)
         return period, lambda data: (data.core.steps + 1) % period == 0
 

@@ -32,9 +32,11 @@ from crazysim.plugins.sensors.triad import TriadData
 from crazysim.pytree import PyTree, leaf
 
 INITIAL_STD = (0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
-"""Standard deviations at the start: position, m, velocity, m/s, attitude, rad. Assumptions; the start is the truth."""
+"""Standard deviations at the start: position, m, velocity, m/s, attitude, rad. These are assumptions: the estimate
+starts at the true state."""
 RESTART_STD = (10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 1.0, 1.0, 1.0)
-"""The same where a filter that diverged begins again. Assumptions: 10 is the root of ``error_state.MAX_COVARIANCE``."""
+"""The same for the restart of a filter that diverged. These are assumptions: 10 is the square root of
+``error_state.MAX_COVARIANCE``."""
 MIN_STD = 1e-3
 """Least standard deviation assumed for a measurement, in m, m/s, rad or pixels, and as a share of the field for a
 magnetometer; 100 times as much, 0.1 Pa, for pressures. An assumption for sensors without noise, and for float32."""
@@ -48,15 +50,15 @@ class ESKFData(PyTree):
     accel: Array = leaf("drone", 1, (3,))
     """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
     gyro: Array = leaf("drone", 1, (3,))
-    """Sum of the angular velocities since the last prediction and of half of the one at it, for the trapezoidal rule,
-    body frame, rad/s. (n_worlds, n_drones, 3)"""
+    """Sum of half the angular velocity at the last prediction and the angular velocities since then, for the
+    trapezoidal rule, body frame, rad/s. (n_worlds, n_drones, 3)"""
     used: Array = leaf("drone", 1)
     """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
-    """Number of times that the estimate left its bounds and the filter began again. (n_worlds, n_drones, 1)"""
+    """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
     paths: Array | None = leaf("drone", 2)
     """Paths from where measurements in transit were taken to the last prediction, newest first, for each sensor whose
-    measurements are late; None without one. (n_worlds, n_drones, n_rows, 10)"""
+    measurements are late; None without such a sensor. (n_worlds, n_drones, n_rows, 10)"""
 
 
 class ESKF(ErrorStateFilter):
@@ -64,8 +66,8 @@ class ESKF(ErrorStateFilter):
 
     The filter of J. Solà, Quaternion kinematics for the error-state Kalman filter (2017, arXiv 1711.02508), with the
     velocity in the body frame. It takes its noise from the records of its sensors, so it has no gains to tune:
-    densities, random walk and spread of the biases of the ``IMU``, and the noise of the others. Their errors that
-    wander or are constant are treated as white noise. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``,
+    densities, random walk and spread of the biases of the ``IMU``, and the noise of the other sensors, whose wandering
+    and constant errors are treated as white noise. It takes any of ``MotionCapture``, ``GPS``, ``Barometer``,
     ``Magnetometer``, ``OpticalFlow``, ``TimeOfFlight``, ``UWB`` and ``Lighthouse``, and assumes that they are at the
     centre of mass.
     """
@@ -76,7 +78,7 @@ class ESKF(ErrorStateFilter):
     max_vel: float = setting(default=100.0, positive=True)
     """Velocity along an axis beyond which the estimate has diverged, m/s."""
     reset_before: ClassVar[str | None] = "integration"
-    """Name of the stage before which an episode is reset: at the state before the first step."""
+    """Name of the stage before which an episode is reset, so that the reset uses the state before the first step."""
     name: str = "eskf"
 
     @property
@@ -114,7 +116,8 @@ class ESKF(ErrorStateFilter):
     def inertial(self, data: SimData) -> tuple[Array, Array]:
         """Return measured angular velocity, rad/s, and specific force, m/s^2, of one drone, body frame. (3,) each
 
-        The ``IMU`` measures the mean force of a step in the frame at its end; here it is in the frame in its middle.
+        The ``IMU`` measures the mean force of a step in the frame at its end; here it is rotated to the frame in the
+        middle of the step.
         """
         gyro, accel = super().inertial(data)
         return gyro, accel + 0.5 / data.core.freq * rotation.cross(gyro, accel)
@@ -163,7 +166,7 @@ class ESKF(ErrorStateFilter):
 
     def _path_start_stage(self, sensor: Sensor, period: int) -> Callable[[SimData], SimData]:
         def begin_path(data: SimData) -> SimData:
-            """Start a path where one sensor measures: back to the last prediction, for now."""
+            """Start a path at the measurement of one sensor; for now it leads back to the last prediction."""
             record, (gyro, accel) = self.read(data), self.inertial(data)
             since = ((data.core.steps + 1) % period).astype(gyro.dtype) / data.core.freq
             start = jnp.asarray(inertial_path.EMPTY_PATH_ROW, gyro.dtype)
@@ -175,13 +178,13 @@ class ESKF(ErrorStateFilter):
         return begin_path
 
     def _path_rows(self, sensor: Sensor, data: SimData) -> tuple[int, int]:
-        """Return the first row of the paths of one sensor, and that after its last one."""
+        """Return the first row of the paths of one sensor, and the row after its last one."""
         counts = [_rows_in_transit(aid, data) for aid in self.aids]
         first = sum(counts[: self.aids.index(sensor)])
         return first, first + counts[self.aids.index(sensor)]
 
     def update_estimate(self, sensor: Sensor, data: SimData, record: ESKFData) -> Estimate:
-        """Return the estimate of one drone after the latest measurement of a sensor, used where it was taken."""
+        """Return one drone's estimate after a sensor's latest measurement, applied to the state when it was taken."""
         steps, taken, gravity = data.core.steps, sensor.read(data).samples.taken[0], data.params.gravity_vec
         period, (gyro, accel) = self.prediction_schedule(data.core.freq)[0], self.inertial(data)
         since = (taken - steps + (steps + 1) % period).astype(gyro.dtype) / data.core.freq  # the last prediction
@@ -214,7 +217,7 @@ def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
 
 
 def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
-    """Return when a sensor takes a measurement."""
+    """Return a function that is true in the steps in which a sensor takes a measurement."""
     return lambda data: tick(data, sensor.freq or data.core.freq)
 
 

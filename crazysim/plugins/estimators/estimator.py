@@ -1,4 +1,4 @@
-"""Base class of estimators: sensors to fuse, and controllers that fly on the estimate."""
+"""Base class of estimators: sensors to fuse, and controllers that use the estimate."""
 
 from __future__ import annotations
 
@@ -25,20 +25,22 @@ class Estimator(Plugin):
     """Base class of filters that estimate the state of every drone from an ``IMU`` and other sensors.
 
     A subclass defines ``kinds``, ``record``, ``reset_episode``, ``filter_stages`` and ``estimated_states``. With
-    ``control`` controllers use the estimate in place of the state, as do policies of tasks that observe measurements.
+    ``control``, controllers use the estimate in place of the state, and so do policies of tasks that observe
+    measurements.
     """
 
     sensors: Sequence[Sensor]
-    """Sensors: an ``IMU``, and others. ``sim.add`` needs them added before; ``Sim(estimator=...)`` adds them."""
+    """Sensors: an ``IMU``, and others. Add them before ``sim.add`` of the estimator; ``Sim(estimator=...)`` adds them
+    itself."""
     control: bool = True
-    """True where the controllers of the simulation fly on the estimate."""
+    """True if the controllers of the simulation use the estimate."""
     reset_before: ClassVar[str | None] = "increment_steps"
-    """Name of the stage before which an episode is reset: at the state after the first step."""
+    """Name of the stage before which an episode is reset, so that the reset uses the state after the first step."""
     _: dataclasses.KW_ONLY
     name: str = "estimator"
 
     def __post_init__(self) -> None:
-        """Check that the sensors are a list of them."""
+        """Check that ``sensors`` is a list of sensors."""
         super().__post_init__()
         if not isinstance(self.sensors, (list, tuple)) or not all(isinstance(x, Sensor) for x in self.sensors):
             example = f"{type(self).__name__}([IMU(), MotionCapture()])"
@@ -46,7 +48,7 @@ class Estimator(Plugin):
 
     @classmethod
     def default(cls) -> Estimator:
-        """Return the filter on the sensors that its name alone stands for."""
+        """Return the filter with its default sensors, for users who give only its name."""
         raise NotImplementedError
 
     @property

@@ -1,10 +1,10 @@
-"""Paths of integrated inertial measurements, along which an estimate and its covariance go back in time and forward.
+"""Paths of integrated inertial measurements, along which an estimate and its covariance move back in time and forward.
 
-A measurement that arrives late is used with the estimate of the time at which it was taken. The path from there is
-integrated without biases and without the estimate, so that it stays valid while both are corrected: the preintegration
-of C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, On-manifold preintegration for real-time visual-inertial
-odometry, IEEE Transactions on Robotics 33 (2017), with their derivatives with respect to biases in closed form for a
-uniform motion.
+A measurement that arrives late is used with the estimate of the time at which it was taken. The path since then is
+integrated without subtracting biases and without the estimate, so that it stays valid while both are corrected: the
+preintegration of C. Forster, L. Carlone, F. Dellaert and D. Scaramuzza, On-manifold preintegration for real-time
+visual-inertial odometry, IEEE Transactions on Robotics 33 (2017), with their derivatives with respect to biases in
+closed form for a uniform motion.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from crazysim.plugins.estimators.error_state import Estimate, bound_covariance, 
 IDENTITY_QUAT = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 """Attitude without a rotation, xyzw."""
 EMPTY_PATH_ROW = np.concatenate([IDENTITY_QUAT, np.zeros(6, np.float32)])
-"""Row of the path of no duration. (10,)"""
+"""Row of a path of zero duration. (10,)"""
 
 
 class InertialPath(NamedTuple):
-    """Motion of a body during a time, in its own frame at the start, without gravity and velocity at the start."""
+    """Motion of a body during an interval, in its frame at the start, without gravity and the velocity at the start."""
 
     quat: Array
     """Attitude at the end, end to start, unit, xyzw. (4,)"""
@@ -38,7 +38,7 @@ class InertialPath(NamedTuple):
 
     @staticmethod
     def from_row(row: Array, duration: Array) -> InertialPath:
-        """Return the path whose numbers ``to_row`` are in a row. (10,)"""
+        """Return the path of a row that ``to_row`` returned. (10,)"""
         return InertialPath(row[:4], row[4:7], row[7:], duration)
 
     def to_row(self) -> Array:

@@ -1,4 +1,4 @@
-"""The extended Kalman filter of the Crazyflie's firmware on the measurements of sensors, and flight on its estimate."""
+"""The extended Kalman filter of the Crazyflie's firmware on the measurements of sensors, and control with it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from crazysim.plugins.sensors.sensor import Sensor
 from crazysim.pytree import PyTree, device_array, leaf
 
 FIRMWARE_RATE = 1000
-"""Loops of the firmware's filter in a second, each of which adds process noise, Hz (estimator_kalman.c)."""
+"""Rate of the loop of the firmware's filter, which adds process noise each time, Hz (estimator_kalman.c)."""
 INITIAL_STD = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
 """Standard deviations at the start: position, m, velocity, m/s, attitude, rad (kalman_core_params_defaults.h)."""
 MEASUREMENT_STD = {
@@ -40,9 +40,9 @@ MEASUREMENT_STD = {
     "sweep": 0.001,
 }
 """Standard deviations that the firmware assumes: position, m, and attitude, rad, of motion capture
-(crtp_localization_service.c), flow, pixels (flowdeck_v1v2.c), scale of that of the time of flight, m (zranger2.c),
-distance to an anchor, m (lpsTwrTag.c), difference of two, m (tdoaEngine.h), angle of a light plane of a station of the
-second generation, rad (lighthouse_position_est.c, sweepStdLh2)."""
+(crtp_localization_service.c), flow, pixels (flowdeck_v1v2.c), scale of the standard deviation of a time of flight, m
+(zranger2.c), distance to an anchor, m (lpsTwrTag.c), difference of two distances, m (tdoaEngine.h), angle of a light
+plane of a station of the second generation, rad (lighthouse_position_est.c, sweepStdLh2)."""
 Std = Mapping[str, Array]
 """Standard deviations by the names of ``MEASUREMENT_STD``."""
 
@@ -53,7 +53,7 @@ class KalmanData(PyTree):
     estimate: Estimate
     """The estimate."""
     previous: Array = leaf("drone", 1)
-    """Attitude at the end of the step before, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
+    """Attitude at the end of the previous step, xyzw, with which measurements are predicted. (n_worlds, n_drones, 4)"""
     accel: Array = leaf("drone", 1, (3,))
     """Sum of the specific forces since the last prediction, body frame, m/s^2. (n_worlds, n_drones, 3)"""
     gyro: Array = leaf("drone", 1, (3,))
@@ -61,28 +61,28 @@ class KalmanData(PyTree):
     used: Array = leaf("drone", 1)
     """Step in which the latest measurement that was used was taken, for each sensor. (n_worlds, n_drones, n_sensors)"""
     failures: Array = leaf("drone", 1)
-    """Number of times that the estimate left its bounds and the filter began again. (n_worlds, n_drones, 1)"""
+    """Number of times that the estimate left its bounds and the filter restarted. (n_worlds, n_drones, 1)"""
     accel_noise: Array = leaf("parameter", 1, (3,))
     """Standard deviation of accelerations in a loop, body frame, m/s^2. (3,)"""
     gyro_noise: Array = leaf("parameter", 1, (3,))
     """Standard deviation of angular velocities in a loop, body frame, rad/s. (3,)"""
     deviations: Array = leaf("parameter", 1)
-    """Standard deviations that the filter assumes for the measurements, in the order of the sensors. (n,)"""
+    """Standard deviations that the filter assumes for the measurements, in the order of ``MEASUREMENT_STD``. (n,)"""
 
 
 class Kalman(ErrorStateFilter):
     """The Crazyflie's extended Kalman filter: position, velocity and attitude of every drone from its sensors.
 
-    It begins at the true state of a world's first step, uncertain as the firmware is after switching on. Predictions
-    run at ``freq`` on the mean of the inertial measurements between them; a measurement of another sensor is used in
-    the step in which it arrives. Besides an ``IMU`` it takes any of ``MotionCapture``, ``OpticalFlow``,
+    It begins at the true state of a world's first step, with the uncertainty of the firmware after switching on.
+    Predictions run at ``freq`` on the mean of the inertial measurements between them; a measurement of another sensor
+    is used in the step in which it arrives. Besides an ``IMU`` it takes any of ``MotionCapture``, ``OpticalFlow``,
     ``TimeOfFlight``, ``UWB`` and ``Lighthouse``.
     """
 
     _: dataclasses.KW_ONLY
     all_axes: bool = False
-    """True to use the accelerometer along all axes, for any airframe and in wind; False as the firmware, which takes
-    the force of the rotors to be the only one."""
+    """True to use the accelerometer along all axes, for any airframe and in wind; False for the firmware's method,
+    which assumes that the force of the rotors is the only one."""
     accel_noise: ArrayLike = parameter(default=(0.5, 0.5, 1.0), low=0.0)
     """Standard deviation of accelerations, body frame, m/s^2. (3,) or (n_worlds, n_drones, 3)"""
     gyro_noise: ArrayLike = parameter(default=(0.1, 0.1, 0.1), low=0.0)
@@ -168,7 +168,7 @@ class Kalman(ErrorStateFilter):
         return self.write(data, record.replace(estimate=error_state.finalize(record.estimate)))
 
     def _finish(self, data: SimData) -> SimData:
-        """Note the attitude of one drone at the end of the step."""
+        """Store the attitude of one drone at the end of the step."""
         record = self.read(data)
         return self.write(data, record.replace(previous=record.estimate.quat))
 

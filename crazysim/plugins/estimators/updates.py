@@ -1,6 +1,6 @@
 """Measurements that correct a filter with error states, as functions of one drone: the models of its aids.
 
-Those of the Crazyflie's firmware take the attitude ``rot`` of its loop before (the mm_*.c of
+The models of the Crazyflie's firmware use the attitude ``rot`` at the end of the previous loop (the mm_*.c of
 bitcraze/crazyflie-firmware, commit 2a18fc29).
 """
 
@@ -16,7 +16,7 @@ from crazysim import rotation
 from crazysim.plugins.estimators.error_state import ATT, GYRO, POS, VEL, Estimate, select_estimate, update
 
 MIN_FLOW_HEIGHT = 0.1
-"""Least height that the flow is predicted for, m (mm_flow.c)."""
+"""Smallest height for which the flow is predicted, m (mm_flow.c)."""
 MIN_TILT_COSINE = 0.1
 """Least cosine of the tilt at which a distance to the ground is used (mm_tof.c)."""
 HALF_CONE_ANGLE = 0.5 * 15 * math.pi / 180
@@ -79,7 +79,7 @@ def update_flow(
 
     Args:
         estimate: The estimate.
-        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
         flow: Motion of the image along x and y of the body, pixels. (2,)
         gyro: Angular velocity as measured, body frame, rad/s. (3,)
         scale: Pixels by which the image moves at 1 rad/s. ()
@@ -104,7 +104,7 @@ def update_range(estimate: Estimate, rot: Array, distance: Array, deviation: Arr
 
     Args:
         estimate: The estimate.
-        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
         distance: Shortest distance within the cone of the sensor. ()
         deviation: Standard deviation of the distance, m.
     """
@@ -162,10 +162,11 @@ def update_difference(
 
 
 def update_differences(estimate: Estimate, anchors: Array, differences: Array, deviation: Array | float) -> Estimate:
-    """Return the estimate after measured differences of distances to that to the first anchor, all at one time.
+    """Return the estimate after simultaneous measured differences of distances to anchors and to the first anchor.
 
-    They have the errors of the first distance in common. A distance minus the mean of those before it is a combination
-    of the differences whose errors are independent, with k distances before it of the variance ``1 + 1 / k``.
+    The differences share the error of the first distance. A distance minus the mean of the k distances before it is a
+    combination of differences; such combinations have independent errors, with ``1 + 1 / k`` times the variance of one
+    distance.
 
     Args:
         estimate: The estimate.
@@ -197,7 +198,7 @@ def update_sweep(
 
     Args:
         estimate: The estimate.
-        rot: Attitude at the end of the loop before, as a matrix. (3, 3)
+        rot: Attitude at the end of the previous loop, as a matrix. (3, 3)
         sensor: Position of the sensor, body frame, m. (3,)
         station: Position of the station, world frame, m, (3,) and its attitude, station to world, as a matrix. (3, 3)
         tilt: Tilt of the plane, rad.

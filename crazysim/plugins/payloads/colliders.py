@@ -30,20 +30,20 @@ class LoadBody(NamedTuple):
     mass: Array
     """Mass, kg. (..., 1)"""
     exists: Array | None = None
-    """True where it collides; None for always. (...)"""
+    """True where the body collides; None if it always does. (...)"""
 
 
 class Collider(NamedTuple):
-    """Bodies of one shape, one for each load, as contacts use them. Its functions take one drone or one world."""
+    """Bodies of one shape, one for each load, as used by contacts. The functions take one drone or one world."""
 
     shape: Shape
-    """Shape of each."""
+    """Shape of each body."""
     body: Callable[[SimData], LoadBody]
-    """Returns their state."""
+    """Function that returns the state of the bodies."""
     with_vel: Callable[[SimData, Array], SimData]
-    """Returns the data with other velocities of them. (..., 3)"""
+    """Function that returns the data with other velocities of the bodies. (..., 3)"""
     joined_mask: Callable[[SimData], Array]
-    """Returns True where a rigid rod joins a body to a drone, and the two cannot touch; of one world.
+    """Function that returns True where a rigid rod joins a body to a drone of a world, so that they cannot touch.
     (n_loads, n_drones)"""
 
 
@@ -59,7 +59,7 @@ class CollidingPlugin:
 
     @property
     def solid_kinds(self) -> tuple[str, ...]:
-        """Names of the objects of the scene that stand for its bodies, without their numbers."""
+        """Names of the objects of the scene that represent its bodies, without their numbers."""
         return (self.name,)
 
     @property
@@ -76,15 +76,15 @@ class CollidingPlugin:
         return load_shape(self.size)
 
     def body(self, data: SimData) -> LoadBody:
-        """Return the loads; of one drone or of one world."""
+        """Return the loads of one drone or one world."""
         raise NotImplementedError
 
     def with_vel(self, data: SimData, vel: Array) -> SimData:
-        """Return the data with other velocities of the loads; of one drone or of one world. (..., 3)"""
+        """Return the data with other velocities of the loads, for one drone or one world. (..., 3)"""
         raise NotImplementedError
 
     def joined_mask(self, data: SimData) -> Array:
-        """Return True where a rigid rod joins a load to a drone, and the two cannot touch. (n_loads, n_drones)"""
+        """Return True where a rigid rod joins a load to a drone, so that the two cannot touch. (n_loads, n_drones)"""
         raise NotImplementedError
 
 

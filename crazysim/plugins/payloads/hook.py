@@ -46,35 +46,35 @@ class HookData(LoadData):
     hook_mass: Array = leaf("parameter", 1, (1,))
     """Mass of the hook, kg. (1,)"""
     reach: Array = leaf("parameter", 1, (1,))
-    """Distance of the hook from the ring below which it picks up, m. (1,)"""
+    """Distance between hook and ring below which the hook picks up the load, m. (1,)"""
     max_speed: Array = leaf("parameter", 1, (1,))
-    """Speed of the hook relative to the ring below which it picks up, m/s. (1,)"""
+    """Relative speed of hook and ring below which the hook picks up the load, m/s. (1,)"""
 
 
 class Hook(CollidingPlugin, Plugin):
     """A hook on a rigid rod, with one load for each drone.
 
     With two degrees of freedom the rod swings freely. With one it turns about the body's y axis, and passes roll and
-    yaw torque to the drone. A load is a point mass in its ring. It is picked up where the hook is near and slow, with
-    the impulse of two bodies that stay together; a load that is let go falls freely.
+    yaw torque to the drone. A load is a point mass at its ring. It is picked up if the hook is near and slow, in an
+    impact after which the two stay together; a load that is let go falls freely.
     """
 
     mass: ArrayLike = parameter(low=0.0)
-    """Mass of the load, kg; zero for none. () or (n_worlds, n_drones)"""
+    """Mass of the load, kg; zero for no load. () or (n_worlds, n_drones)"""
     dof: int = setting(default=2, low=1, high=2)
     """Degrees of freedom of the rod, 1 or 2."""
     length: ArrayLike = parameter(default=0.4, positive=True)
     """Length of the rod, m. () or (n_worlds, n_drones)"""
     attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Joint, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    """Position of the joint relative to the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     hook_mass: ArrayLike = parameter(default=0.0203, low=0.0)
     """Mass of the hook, kg. () or (n_worlds, n_drones)"""
     damping: ArrayLike = parameter(default=0.001, low=0.0)
-    """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
+    """Viscous torque of the joint per angular velocity, N m s. () or (n_worlds, n_drones)"""
     reach: ArrayLike = parameter(default=0.05, low=0.0)
-    """Distance of the hook from the ring below which it picks up, m. () or (n_worlds, n_drones)"""
+    """Distance between hook and ring below which the hook picks up the load, m. () or (n_worlds, n_drones)"""
     max_speed: ArrayLike = parameter(default=0.5, low=0.0)
-    """Speed of the hook relative to the ring below which it picks up, m/s. () or (n_worlds, n_drones)"""
+    """Relative speed of hook and ring below which the hook picks up the load, m/s. () or (n_worlds, n_drones)"""
     drag: ArrayLike = parameter(default=0.0, low=0.0)
     """Linear drag coefficient of the load, N s/m. () or (n_worlds, n_drones)"""
     friction: ArrayLike = parameter(default=0.6, low=0.0)
@@ -96,7 +96,7 @@ class Hook(CollidingPlugin, Plugin):
     def bumblebee(mass: ArrayLike = 0.2, dof: int = 2, **settings: Any) -> Hook:
         """Return the hook of AIMotionLab's Bumblebee with a load; the rod turns about the drone's centre of mass.
 
-        Rod of 0.4 m, hook of 0.0203 kg, joint damping 0.001 N m s, ring 0.1275 m above the load's middle (facts of
+        Rod of 0.4 m, hook of 0.0203 kg, joint damping 0.001 N m s, ring 0.1275 m above the load's middle (from
         AIMotionLab-Virtual, July 2026; the joint lies at (0.0085, 0, 0) of the lab's body frame, as the centre of mass
         does).
 
@@ -151,10 +151,10 @@ class Hook(CollidingPlugin, Plugin):
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
     def pick_up_and_release(self, data: SimData) -> SimData:
-        """Pick up a load that is near and slow, or let go, as ``grip`` of the record commands; of one drone.
+        """Pick up one drone's load if it is near and slow, or let it go, as commanded by ``grip`` of the record.
 
-        Hook and ring stay together after an impact that keeps momentum: the mean of their velocities by mass, then the
-        impulse along the rod that a rigid rod passes on to the drone.
+        Hook and ring stay together after an impact that conserves momentum: they get the mass-weighted mean of their
+        velocities, and then the rigid rod passes on an impulse along itself to the drone.
         """
         load, p, s = self.read(data), data.params, data.states
         offset, speed = load.pos - load.tip_pos, load.vel - load.tip_vel
@@ -174,7 +174,7 @@ class Hook(CollidingPlugin, Plugin):
         return self.write(data.replace(states=states), held)
 
     def stop_at_floor(self, data: SimData) -> SimData:
-        """Stop hook and load at the floor; of one drone."""
+        """Stop one drone's hook and load at the floor."""
         load = self.read(data)
         height = jnp.where(load.attached, load.clearance, jnp.zeros_like(load.clearance))
         height = height + ground_height(data, load.tip_pos)
@@ -188,8 +188,8 @@ class Hook(CollidingPlugin, Plugin):
 
         Args:
             data: Simulation.
-            grip: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones), or
-                broadcast to that
+            grip: True to pick up a load within reach and to hold it, False to let go. (n_worlds, n_drones), or a shape
+                that broadcasts to it
         """
         load = self.read(data)
         flags = grip if isinstance(grip, jax.Array) else np.asarray(grip)
@@ -203,7 +203,7 @@ class Hook(CollidingPlugin, Plugin):
         return self.write(data, load.replace(grip=jnp.broadcast_to(flags, load.grip.shape)))
 
     def hang(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
-        """Return the data with hooks, and the loads on them, at rest below their drones; of all worlds.
+        """Return the data of all worlds with hooks, and the loads on them, at rest below their drones.
 
         Use it after moving drones.
 
@@ -257,7 +257,7 @@ class Hook(CollidingPlugin, Plugin):
         return np.eye(data.states.pos.shape[0], dtype=bool) & self.read(data).attached
 
     def head(self, data: SimData) -> LoadBody:
-        """Return the hooks, which collide while they carry nothing; of one drone or of one world."""
+        """Return the hooks, which collide while they carry nothing, of one drone or one world."""
         load = self.read(data)
         up = -self._rod_directions(data, load)
         mass = jnp.broadcast_to(load.hook_mass, (*load.tip_pos.shape[:-1], 1))
@@ -269,7 +269,7 @@ class Hook(CollidingPlugin, Plugin):
         return self.write(data, load.replace(tip_vel=jnp.where(load.attached[..., None], load.tip_vel, vel)))
 
     def joined_head_mask(self, data: SimData) -> Array:
-        """Return True for a hook and its drone; of one world. (n_drones, n_drones)"""
+        """Return True where a hook belongs to a drone, in one world. (n_drones, n_drones)"""
         return np.eye(data.states.pos.shape[0], dtype=bool)  # type: ignore[return-value]
 
     @staticmethod

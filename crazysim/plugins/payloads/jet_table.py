@@ -15,7 +15,7 @@ from crazysim.tables import POSITIVE, read_numbers
 VOXEL_EDGE = 0.01
 """Edge of a voxel of AIMotionLab's tables, m."""
 LAB_VOXELS = 81
-"""Voxels along x and y of AIMotionLab's later tables (facts of AIMotionLab-Virtual, July 2026)."""
+"""Voxels along x and y of AIMotionLab's later tables (as in AIMotionLab-Virtual, July 2026)."""
 
 
 class JetTable(NamedTuple):
@@ -24,11 +24,11 @@ class JetTable(NamedTuple):
     speeds: ArrayLike
     """Mean rotor speeds of the tables, rad/s, ascending. (k,)"""
     pressure: Any = None
-    """Pressures, Pa; None for none. (k, n_x, n_y, n_z)"""
+    """Pressures, Pa; None without pressures. (k, n_x, n_y, n_z)"""
     velocity: Any = None
-    """Velocities of the air, body frame, m/s; None for none. (k, n_x, n_y, n_z, 3)"""
+    """Velocities of the air, body frame, m/s; None without velocities. (k, n_x, n_y, n_z, 3)"""
     origin: ArrayLike = (0.0, 0.0, 0.0)
-    """Node of the smallest x, y and z, from the drone's centre of mass, body frame, m. (3,)"""
+    """Node with the smallest x, y and z, relative to the drone's centre of mass, body frame, m. (3,)"""
     spacing: ArrayLike = VOXEL_EDGE
     """Distance between neighbouring nodes, m: () or (3,)."""
 
@@ -38,7 +38,7 @@ class JetTable(NamedTuple):
         return np.shape(self.velocity if self.pressure is None else self.pressure)[:4]
 
     def checked(self) -> JetTable:
-        """Return the table as arrays of the host, with one spacing for each axis."""
+        """Return the table as checked NumPy arrays, with one spacing per axis."""
         speeds = read_numbers("speeds", self.speeds, POSITIVE)
         if speeds.ndim != 1 or np.any(np.diff(speeds) <= 0):
             raise ConfigError(f"expected positive rotor speeds in ascending order, rad/s, got {self.speeds!r}")
@@ -83,10 +83,11 @@ def load_jet_table(
 
     Args:
         folder: The folder.
-        shape: Nodes along x, y and z; None for a cube if the number of rows is one, and otherwise 81 x 81 x n.
+        shape: Nodes along x, y and z; None for a cube if the number of rows is a cube number, and otherwise 81 x 81 x
+            n.
         spacing: Distance between nodes, m.
-        origin: First node from the drone's centre of mass, m (3,); None for a box centred below the drone, as in the
-            lab.
+        origin: First node relative to the drone's centre of mass, m (3,); None for a box centred below the drone, as in
+            the lab.
 
     Raises:
         ConfigError: If the folder has no such files, or their sizes do not match.
@@ -128,7 +129,7 @@ def load_jet_table(
 
 
 def _table_shape(n_rows: int, shape: tuple[int, int, int] | None) -> tuple[int, int, int]:
-    """Return the nodes along x, y and z of a table with some number of rows."""
+    """Return the nodes along x, y and z of a table with ``n_rows`` rows."""
     side = round(n_rows ** (1 / 3))
     if shape is None:
         shape = (side, side, side) if side**3 == n_rows else (LAB_VOXELS, LAB_VOXELS, n_rows // LAB_VOXELS**2)

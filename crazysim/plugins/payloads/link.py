@@ -25,14 +25,14 @@ from crazysim.core.data import SimState, SimStateDeriv
 from crazysim.rotation import add_cross, cross, dot, matvec
 
 MIN_MASS = 1e-12
-"""Summand of denominators that vanish where both mass and damping are zero, kg."""
+"""Term added to denominators that vanish where both mass and damping are zero, kg."""
 MIN_SQUARED_LENGTH = 1e-20
-"""Summand of the squared distance, m^2, by which the direction of a link without length is zero."""
+"""Term added to the squared distance, m^2, so that the direction of a link without length is zero."""
 BOUNCE_SPEED = 0.1
 """Speed below which a cable that becomes taut does not bounce, m/s."""
 CORRECTION, MOST_CORRECTION = 50.0, 0.5
-"""Rate at which a scheme of higher order removes errors in length, 1/s: the same at all rates of steps, which the order
-of the scheme needs. No step removes a larger share than the second."""
+"""Rate at which a scheme of higher order removes errors in length, 1/s, and the largest share of an error that a step
+removes. The order of the scheme requires a rate that does not depend on the step."""
 SLACK_ACCELERATION = 1e9
 """Acceleration that no tension of a slack cable outweighs, m/s^2."""
 TAUT_BAND = 1e-4
@@ -43,17 +43,17 @@ class LinkParams(NamedTuple):
     """Parameters of a link."""
 
     attach: Array | None
-    """Attachment on the body, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
+    """Attachment point relative to the body's centre of mass, body frame, m; None for the centre of mass. (3,)"""
     length: Array
     """Length, m. (1,)"""
     mass: Array
     """Mass at the tip, kg. (1,)"""
     damping: Array | None = None
-    """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""
+    """Viscous torque of the joint per angular velocity, N m s; None without damping. (1,)"""
     restitution: Array | None = None
     """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
     holds: Array | None = None
-    """True where the link is connected; None for always. ()"""
+    """True where the link is connected; None if it always is. ()"""
     is_cable: bool = False
     """True for a cable, which can be slack; False for a rod."""
     is_hinge: bool = False
@@ -66,13 +66,13 @@ class LinkGeometry(NamedTuple):
     rot: Array
     """Attitude of the body. (3, 3)"""
     arm: Array | None
-    """Attachment from the centre of mass, m; None for zero. (3,)"""
+    """Attachment point relative to the centre of mass, m; None for zero. (3,)"""
     offset: Array
-    """Tip from the attachment, m. (3,)"""
+    """Position of the tip relative to the attachment point, m. (3,)"""
     distance: Array
     """Length of the offset, m. (1,)"""
     direction: Array
-    """Unit vector along the offset; zero where the offset is. (3,)"""
+    """Unit vector along the offset; zero where the offset is zero. (3,)"""
     vel: Array
     """Velocity of the tip relative to the attachment, m/s. (3,)"""
 
@@ -101,18 +101,18 @@ class LinkedMotion(NamedTuple):
 
 
 class UnitPull(NamedTuple):
-    """A unit force on the tip along a direction, and the same backwards on the body."""
+    """A unit force on the tip along a direction, and the opposite force on the body."""
 
     direction: Array
     """Direction, world frame. (3,)"""
     lever: Array | None
-    """Torque on the body, body frame, m; None for none. (3,)"""
+    """Torque on the body, body frame, m; None without torque. (3,)"""
     turn: Array | None
     """Angular acceleration of the body, body frame, 1/(kg m). (3,)"""
 
     @staticmethod
     def create(direction: Array, rot: Array, J_inv: Array, point: Array | None) -> UnitPull:
-        """Return the pull at a point of the body, from its centre of mass, body frame, m; None for there."""
+        """Return the pull at a point relative to the body's centre of mass, body frame, m; None for the centre."""
         if point is None:
             return UnitPull(direction, None, None)
         lever = cross(point, to_body_frame(rot, direction))
@@ -230,13 +230,13 @@ def correction_rate(freq: int) -> float:
 
 
 def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> Array:
-    """Return the deceleration by a linear drag over the speed, 1/s, which cannot reverse a motion in a step. (1,)
+    """Return the deceleration by a linear drag divided by the speed, 1/s, which cannot reverse a motion in a step. (1,)
 
     In a step of a scheme of order 1 it is implicit in time. The derivative at an instant is exact up to a rate of one
     per step, and limited to that.
 
     Args:
-        coefficient: Drag over the speed, N s/m. (1,)
+        coefficient: Drag per speed, N s/m. (1,)
         mass: Mass, kg. (1,)
         dt: Duration of the step, s; None for the derivative at an instant.
         freq: Steps per second, Hz.
@@ -246,13 +246,13 @@ def drag_rate(coefficient: Array, mass: Array, dt: float | None, freq: int) -> A
 
 
 def _damping_rate(link: LinkParams, dt: float | None, freq: int) -> Array:
-    """Return the deceleration of the tip by the damped joint over its speed of swing, 1/s. (1,)"""
+    """Return the deceleration of the tip by the damped joint divided by its speed of swing, 1/s. (1,)"""
     rate = drag_rate(link.damping / (link.length * link.length), link.mass, dt, freq)  # type: ignore[operator]
     return rate if link.holds is None else jnp.where(link.holds, rate, 0.0)
 
 
 def _radial_term(r: LinkGeometry, out: Array, free: Array, link: LinkParams, dt: float | None, freq: int) -> Array:
-    """Return the summand of the tension, before it is shared, that ends relative motion along the link."""
+    """Return the term of the tension, before it is shared, that ends relative motion along the link."""
     if dt is None:
         if not link.is_cable:
             return 2 * correction_rate(freq) * out
@@ -319,8 +319,8 @@ def end_relative_motion(
 ) -> tuple[SimState, Array]:
     """Return the body and the tip's velocity after the impulse that ends relative motion along the link.
 
-    Of a cable only if it is taut and the tip moves outwards; above ``BOUNCE_SPEED`` it bounces by the restitution.
-    Momentum is kept, and energy is not gained.
+    A cable exerts it only if it is taut and the tip moves outwards; above ``BOUNCE_SPEED`` it bounces by the
+    restitution. Momentum is conserved, and no energy is gained.
 
     Args:
         s: State of the body. Leaves (k,)

@@ -34,7 +34,7 @@ class LoadedState(NamedTuple):
     direction: Array
     """Unit vector from drone to load. (..., 3)"""
     direction_rate: Array
-    """Its rate, 1/s. (..., 3)"""
+    """Rate of the direction, 1/s. (..., 3)"""
     quat: Array
     """Attitude, body to world, xyzw. (..., 4)"""
     ang_vel: Array

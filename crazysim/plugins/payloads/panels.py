@@ -27,7 +27,8 @@ class Panels(NamedTuple):
 def shape_panels(shape: Shape, largest: float) -> Panels:
     """Return the surface of a ball or a box as panels.
 
-    The panels of a box are equal rectangles on each side. Those of a ball lie on a spiral of equal areas (Fibonacci).
+    The panels of a box are equal rectangles on each side. The panels of a ball have equal areas and lie on a Fibonacci
+    spiral.
 
     Args:
         shape: Sphere or box.

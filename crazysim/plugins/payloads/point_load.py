@@ -26,7 +26,7 @@ from crazysim.plugins.payloads.rotor_jet import jet_force
 from crazysim.pytree import leaf, select_worlds
 
 CABLE_SEGMENTS = 8
-"""Straight pieces by which a cable is drawn."""
+"""Number of straight pieces with which a cable is drawn."""
 LINK_RADIUS = 0.004
 """Radius of a drawn rod or cable, m."""
 WIRE_RADIUS, HOOK_RADIUS = 0.003, 0.0045
@@ -49,17 +49,17 @@ class LoadData(BodiesInAir):
     attached: Array = leaf("drone", 0)
     """True where the load hangs from its drone. (n_worlds, n_drones)"""
     mass: Array = leaf("parameter", 1, (1,))
-    """Mass of the load, kg; zero for none. (1,)"""
+    """Mass of the load, kg; zero for no load. (1,)"""
     length: Array = leaf("parameter", 1, (1,))
     """Length of rod or cable, m. (1,)"""
     attach: Array | None = leaf("parameter", 1, (3,), sparse=True)
-    """Attachment on the drone, from its centre of mass, body frame, m; None for the centre of mass. (3,)"""
+    """Attachment point relative to the drone's centre of mass, body frame, m; None for the centre of mass. (3,)"""
     damping: Array | None = leaf("parameter", 1, (1,))
-    """Viscous torque of the joint over the angular velocity, N m s; None for none. (1,)"""
+    """Viscous torque of the joint per angular velocity, N m s; None without damping. (1,)"""
     restitution: Array | None = leaf("parameter", 1, (1,))
     """Ratio of radial speeds after and before a cable becomes taut, 1; None for no bounce. (1,)"""
     drag: Array | None = leaf("parameter", 1, (1,))
-    """Linear drag coefficient of the load, N s/m; None for none. (1,)"""
+    """Linear drag coefficient of the load, N s/m; None without drag. (1,)"""
     friction: Array = leaf("parameter", 1, (1,))
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("parameter", 1, (1,))
@@ -75,7 +75,7 @@ class PointLoad(CollidingPlugin):
     """``Plugin.write``."""
 
     def stop_at_floor(self, data: SimData) -> SimData:
-        """Stop the load at the floor; of one drone or of one world."""
+        """Stop the load of one drone or one world at the floor."""
         load = self.read(data)
         clearance = load.clearance + ground_height(data, load.pos)
         pos, vel = clip_to_floor(load.pos, load.vel, clearance, load.friction)
@@ -103,7 +103,7 @@ def find_integrator(sim: Simulation) -> Callable[..., SimData] | None:
 
 
 def free_acceleration(data: SimData, load: LoadData, name: str, dt: float | None) -> Array:
-    """Return the acceleration of a free load under gravity, drag and jets of rotors, m/s^2; of one drone. (3,)
+    """Return the acceleration of one drone's free load under gravity, drag and jets of rotors, m/s^2. (3,)
 
     Drag cannot reverse a motion (``drag_rate``), and a load without mass moves with the air.
 
@@ -152,7 +152,7 @@ def hanging_state(
 
     Args:
         s: State of the drones. Leaves (..., k)
-        attach: Attachment, body frame, m; None for the centre of mass. (..., 3)
+        attach: Attachment point, body frame, m; None for the centre of mass. (..., 3)
         length: Length of the link, m. (..., 1)
         clearance: Height of the load above the floor where it rests, m. (..., 1)
         is_cable: True for a cable, which is slack where the load rests; a rod then lies behind the drone.
@@ -170,7 +170,7 @@ def hanging_state(
 
 @jit_unless_traced("name")
 def direction(data: SimData, name: str = "load") -> tuple[Array, Array]:
-    """Return the unit vector from attachment to load, world frame, and its rate, 1/s; of one drone or of all. (..., 3)
+    """Return the unit vector from attachment to load, world frame, and its rate, 1/s, for one drone or all. (..., 3)
 
     Args:
         data: Simulation with a ``SlungLoad`` or a ``Hook``.
@@ -216,7 +216,7 @@ def add_to_scene(
         rgba: Colour of the loads.
         length: Length of a link, m.
         n_loads: Number of loads in a world; there is a link for each drone.
-        n_pieces: Straight pieces of each.
+        n_pieces: Number of straight pieces of each link.
         ring: Height of the loads' rings above their middles, m, for links that end in a hook; None for others.
     """
     rgba = as_rgba((0.85, 0.55, 0.2, 1.0) if rgba is None else rgba)
@@ -253,7 +253,7 @@ def link_pieces(top: Array, offset: Array, length: Array, n: int) -> tuple[Array
 
     Args:
         top: Upper ends, world frame, m. (k, 3)
-        offset: Lower ends from there, m. (k, 3)
+        offset: Lower ends relative to the upper ends, m. (k, 3)
         length: Lengths, m. (k, 1) or (1,)
         n: Pieces per link.
 

@@ -1,4 +1,4 @@
-"""The jet of a drone's rotors on the surface of loads."""
+"""Forces of the jet of a drone's rotors on the surfaces of loads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from crazysim.plugins.payloads.panels import shape_panels
 from crazysim.pytree import PyTree, device_array, leaf, static
 
 PANELS_PER_LENGTH = 2
-"""Panels along the longest edge of a load by default."""
+"""Default number of panels along the longest edge of a load."""
 
 
 class RotorJetData(PyTree):
@@ -44,11 +44,11 @@ class RotorJetData(PyTree):
     speeds: Array | None = leaf("shared", 1)
     """Mean rotor speeds of the tables, rad/s; None for the analytic jet. (n_tables,)"""
     pressure: Array | None = leaf("shared", 4)
-    """Pressures, Pa; None for none. (n_tables, n_x, n_y, n_z)"""
+    """Pressures, Pa; None without pressures. (n_tables, n_x, n_y, n_z)"""
     velocity: Array | None = leaf("shared", 5)
-    """Velocities of the air, body frame of the drone, m/s; None for none. (n_tables, n_x, n_y, n_z, 3)"""
+    """Velocities of the air, body frame of the drone, m/s; None without velocities. (n_tables, n_x, n_y, n_z, 3)"""
     origin: Array | None = leaf("shared", 1)
-    """First node from the drone's centre of mass, body frame, m; None for the analytic jet. (3,)"""
+    """First node relative to the drone's centre of mass, body frame, m; None for the analytic jet. (3,)"""
     spacing: Array | None = leaf("shared", 1)
     """Distance between nodes, m; None for the analytic jet. (3,)"""
     load: str = static()
@@ -60,8 +60,9 @@ class RotorJet(Plugin):
 
     The force on a panel of area A with the outward normal n is ``-P A n`` for a pressure P of a table, and ``rho v
     max(-v.n, 0) A`` for air of velocity v relative to the load: the momentum of the air that arrives. The analytic jet
-    is the same as in ``Downwash``. A table is linear between nodes and between rotor speeds, and zero outside its box;
-    below its smallest speed the jet falls to zero with the speed, above its largest it stays.
+    is the same as in ``Downwash``. A table is interpolated linearly between nodes and between rotor speeds, and is zero
+    outside its box. Below its smallest rotor speed the jet decreases to zero with the speed; above its largest one it
+    stays constant.
     """
 
     table: JetTable | None = None
@@ -150,7 +151,7 @@ def jet_pressure(
     Args:
         data: One drone, one world or all worlds.
         record: Record of the jets.
-        drone: Number of the drone whose jet it is; None for each load's own.
+        drone: Index of the drone whose jet acts; None for each load's own drone.
         pos: Centres of the panels, world frame, m. (..., n, 3)
         normal: Their outward normals, world frame. (..., n, 3)
         vel: Velocity of the loads, world frame, m/s. (..., 3)
@@ -159,14 +160,14 @@ def jet_pressure(
     of_one = (s.pos, s.quat, mean_rotor_vel(data), collective_thrust(data), record.diameter, record.air_density)
     if drone is not None:
         of_one = tuple(x if x.ndim == 1 else x[drone] for x in of_one)
-    # An axis for the panels.
+    # Insert an axis for the panels.
     load_pos, quat, rotor_vel, thrust, diameter, density = (x[..., None, :] for x in of_one)
     offset = pos - load_pos
 
     def momentum(air: Array) -> Array:
         relative = air - vel[..., None, :]
         arrives = -rotation.dot(relative, normal)
-        # Only air of the jet has momentum to give: still air outside it exerts no force on a load that moves.
+        # Only air in the jet transfers momentum: still air outside it exerts no force on a load that moves.
         blows = rotation.dot(air, air) > 0
         return jnp.where(blows & (arrives > 0), density * arrives, 0.0) * relative
 
@@ -175,7 +176,7 @@ def jet_pressure(
         return momentum(-hover_jet_speed(offset, axis, thrust, diameter, density) * axis)
     speed = rotor_vel * RPM_TO_RAD_S
     share, table = table_position(speed, record.speeds)
-    # A record with tables has a position among them.
+    # With tables, ``origin`` and ``spacing`` are arrays.
     cell = (rotation.rotate_inverse(quat, offset) - record.origin) / record.spacing  # type: ignore[operator]
     shape = record.velocity.shape if record.pressure is None else record.pressure.shape
     share = jnp.where(is_inside(shape[1:4], cell)[..., None], share, 0.0)
@@ -189,7 +190,7 @@ def jet_pressure(
 
 
 def table_position(speed: Array, speeds: Array) -> tuple[Array, Array]:
-    """Return the factor of a rotor speed below the smallest of a table, and its position between tables.
+    """Return the factor of the jet below the smallest rotor speed, and the position of a speed between tables.
 
     Args:
         speed: Rotor speed, rad/s. (..., 1)

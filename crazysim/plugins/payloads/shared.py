@@ -1,4 +1,4 @@
-"""One load below several drones of a world."""
+"""One load that all drones of a world carry."""
 
 from __future__ import annotations
 
@@ -32,9 +32,11 @@ from crazysim.plugins.payloads.point_load import (
 from crazysim.pytree import PyTree, device_array, leaf
 
 TENSION_REGULARIZATION = 1e-6
-"""Summand of the matrix of tensions, 1, without which four rods at one load would have no unique tensions."""
+"""Term added to the diagonal of the matrix of tensions, 1, without which the tensions of four rods would not be
+unique."""
 N_ITERATIONS = 3
-"""Number of solutions of the tensions, each without the cables that would push in the last."""
+"""Number of times that the tensions are solved for, each without the cables that would push in the previous
+solution."""
 
 
 class SharedLoadData(PyTree):
@@ -51,7 +53,7 @@ class SharedLoadData(PyTree):
     length: Array = leaf("parameter", 1, (1,))
     """Length of each rod or cable, m. (1,)"""
     attach: Array | None = leaf("parameter", 1, (3,))
-    """Attachment on the drones, body frame, m; None for the centre of mass. (3,)"""
+    """Attachment points on the drones, body frame, m; None for the centre of mass. (3,)"""
     friction: Array = leaf("shared", 1)
     """Coulomb's coefficient between load and floor, 1. (1,)"""
     clearance: Array = leaf("shared", 1)
@@ -68,7 +70,7 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
         clearance: Height of the load above the floor where it rests, m. (1,)
 
     Returns:
-        World frame, m and m/s. (n_worlds, 1, 3) each
+        Position and velocity, world frame, m and m/s. (n_worlds, 1, 3) each
     """
     mean = states.pos.mean(axis=1, keepdims=True)
     # As low as the cables of the drones around it allow.
@@ -81,9 +83,9 @@ def hanging_load(states: SimState, length: Array, clearance: Array) -> tuple[Arr
 class SharedLoad(PointLoad, Plugin):
     """One load, a point mass, on rods or cables from all drones of a world.
 
-    The tensions follow from one system of equations of all drones. It needs an integrator that moves positions with new
-    velocities, ``symplectic_euler`` or ``rk4``. It starts at rest below the drones' mean position. Its gravity is
-    the mean of the drones'.
+    The tensions follow from one system of equations of all drones. It needs an integrator that updates positions with
+    the new velocities, ``symplectic_euler`` or ``rk4``. It starts at rest below the drones' mean position. Its
+    gravitational acceleration is the mean of the drones'.
     """
 
     coupling: ClassVar[Literal["drone", "world"]] = "world"
@@ -94,7 +96,7 @@ class SharedLoad(PointLoad, Plugin):
     cable: bool = True
     """True for cables, False for rigid rods."""
     attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    """Attachment point relative to the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     friction: float = parameter(default=0.6, low=0.0, shapes=((),))
     """Coulomb's coefficient between load and floor."""
     size: ArrayLike = setting(default=0.05, positive=True, shapes=((), (3,)))

@@ -33,7 +33,7 @@ from crazysim.pytree import device_array, select_worlds
 L = TypeVar("L", bound=LoadData)
 
 ABSENT_LOAD_DEPTH = 1000.0
-"""Depth at which loads are that do not exist, m."""
+"""Depth by which loads that do not exist are moved out of sight, m."""
 
 
 class SlungLoad(PointLoad, Plugin):
@@ -44,15 +44,15 @@ class SlungLoad(PointLoad, Plugin):
     """
 
     mass: ArrayLike = parameter(low=0.0)
-    """Mass of the load, kg; at zero the drone flies as without it. () or (n_worlds, n_drones)"""
+    """Mass of the load, kg; at zero the drone flies as without a load. () or (n_worlds, n_drones)"""
     length: ArrayLike = parameter(default=0.4, positive=True)
     """Length of rod or cable, m. () or (n_worlds, n_drones)"""
     cable: bool = False
     """True for a cable, False for a rigid rod."""
     attach: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
-    """Attachment, from the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
+    """Attachment point relative to the drone's centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     damping: ArrayLike = parameter(default=0.0, low=0.0)
-    """Viscous torque of the joint over its angular velocity, N m s. () or (n_worlds, n_drones)"""
+    """Viscous torque of the joint per angular velocity, N m s. () or (n_worlds, n_drones)"""
     restitution: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Ratio of the radial speeds after and before a cable becomes taut, 0 to 1. () or (n_worlds, n_drones)"""
     drag: ArrayLike = parameter(default=0.0, low=0.0)
@@ -72,7 +72,7 @@ class SlungLoad(PointLoad, Plugin):
         return load_record(self, sim, LoadData, self.cable, rest_height(self.size))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the floor's stage, and for cables in schemes of higher order the stage of becoming taut."""
+        """Return the floor's stage, and for cables with ``rk4`` the stage in which they become taut."""
         placements = [StagePlacement(Stage(self.stop_at_floor, "drone"), "increment_steps", name=f"{self.name}_floor")]
         method = find_integrator(sim)
         if self.cable and method is rk4:
@@ -89,13 +89,13 @@ class SlungLoad(PointLoad, Plugin):
         return linked.deriv.replace(plugins=deriv.plugins | {self.name: rates})
 
     def become_taut(self, data: SimData) -> SimData:
-        """Apply the impulse of a cable that is taut while the load moves outwards; of one drone."""
+        """Apply the impulse of one drone's cable if it is taut while the load moves outwards."""
         load, p = self.read(data), data.params
         states, vel = end_relative_motion(data.states, p.mass, p.J_inv, self._link_params(load), load.pos, load.vel)
         return self.write(data.replace(states=states), load.replace(vel=vel))
 
     def hang(self, data: SimData, mask: ArrayLike | None = None) -> SimData:
-        """Return the data with every load attached, and at rest below its drone; of all worlds.
+        """Return the data of all worlds with every load attached, and at rest below its drone.
 
         Use it after moving drones.
 
@@ -184,7 +184,7 @@ def move_loads(
     ring: float = 0.0,
     show_free_links: bool = False,
 ) -> Objects:
-    """Return the scene's objects with loads and links at their poses; of one world.
+    """Return the objects of one world's scene with loads and links at their poses.
 
     Loads without mass, which do not exist, are out of sight.
 
@@ -194,7 +194,7 @@ def move_loads(
         load: Its record.
         tip: Ends of the links, world frame, m. (n_drones, 3)
         holds: True where something is attached to the end; other links hang along the body's z axis. (n_drones,)
-        n_pieces: Straight pieces of a link.
+        n_pieces: Number of straight pieces of a link.
         ring: Height of the point by which a load hangs above its middle, m.
         show_free_links: True to show links of loads that do not exist.
     """

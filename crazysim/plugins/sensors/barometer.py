@@ -28,21 +28,21 @@ class BarometerData(PyTree):
     samples: Samples
     """Measurements."""
     wander: Array = leaf("drone", 1, (1,))
-    """Error that wanders, Pa. (n_worlds, n_drones, 1)"""
+    """Wandering error, Pa. (n_worlds, n_drones, 1)"""
     offset: Array = leaf("drone", 1, (1,))
-    """Error in this episode, Pa. (n_worlds, n_drones, 1)"""
+    """Constant error in this episode, Pa. (n_worlds, n_drones, 1)"""
     noise: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of a measurement, Pa. (1,)"""
     drift: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of the error that wanders, Pa. (1,)"""
     drift_time: Array = leaf("parameter", 1, (1,))
-    """Its correlation time, s. (1,)"""
+    """Correlation time of the wandering error, s. (1,)"""
     offset_spread: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of the offset between episodes, Pa. (1,)"""
     altitude: Array = leaf("parameter", 1, (1,), sparse=True)
     """Altitude of the origin above sea level, m. (1,)"""
     resolution: Array | None = leaf("parameter", 1, (1,))
-    """Smallest difference of two measurements, Pa; None for none. (1,)"""
+    """Step to which measurements are rounded, Pa; None for no rounding. (1,)"""
 
 
 class Barometer(Sensor):
@@ -50,9 +50,9 @@ class Barometer(Sensor):
 
     kind: ClassVar[type[PyTree]] = BarometerData
     noise: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of a measurement, Pa; 12 Pa are a metre. () or (n_worlds, n_drones)"""
+    """Standard deviation of a measurement, Pa; 12 Pa correspond to one metre. () or (n_worlds, n_drones)"""
     drift: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of an error that wanders, such as weather and temperature, Pa. () or (n_worlds, n_drones)"""
+    """Standard deviation of a wandering error, as from weather and temperature, Pa. () or (n_worlds, n_drones)"""
     drift_time: ArrayLike = parameter(default=60.0, positive=True)
     """Correlation time of that error, s. () or (n_worlds, n_drones)"""
     offset_spread: ArrayLike = parameter(default=0.0, low=0.0)
@@ -60,7 +60,7 @@ class Barometer(Sensor):
     altitude: ArrayLike = parameter(default=0.0, low=-500.0, high=9000.0)
     """Altitude of the origin above sea level, m. () or (n_worlds, n_drones)"""
     resolution: ArrayLike | None = parameter(default=None, positive=True)
-    """Smallest difference of two measurements, Pa; None for none. () or (n_worlds, n_drones)"""
+    """Step to which measurements are rounded, Pa; None for no rounding. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     freq: int | None = 50
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""

@@ -1,4 +1,4 @@
-"""Sensors that measure to known positions: ranges of ultra-wideband anchors, and sweep angles of lighthouses."""
+"""Sensors that measure relative to known positions: distances to ultra-wideband anchors, lighthouse sweep angles."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class UWBData(PyTree):
 
 
 class UWB(Sensor):
-    """Distances to anchors by two-way ranging, m, or their differences to the first distance (TDoA), m.
+    """Distances to anchors by two-way ranging, m, or their differences from the first distance (TDoA), m.
 
     A distance has a bias, white noise, and, at random, a detour of exponentially distributed length, as of reflected
     signals. All anchors are measured at the same time.
@@ -56,9 +56,9 @@ class UWB(Sensor):
     anchors: ArrayLike = parameter()
     """Positions of the anchors, world frame, m. (n_anchors, 3)"""
     noise: ArrayLike = parameter(default=0.0, low=0.0)
-    """Standard deviation of a distance, m; of a difference it is sqrt(2) times that. () or (n_worlds, n_drones)"""
+    """Standard deviation of a distance, m; a difference has sqrt(2) times as much. () or (n_worlds, n_drones)"""
     bias: ArrayLike = parameter(default=0.0)
-    """Error of every distance, m; differences have none. () or (n_worlds, n_drones)"""
+    """Constant error of every distance, m; it cancels in differences. () or (n_worlds, n_drones)"""
     outliers: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Probability that a distance is measured along a detour, 0 to 1. () or (n_worlds, n_drones)"""
     detour: ArrayLike = parameter(default=1.0, low=0.0)
@@ -118,11 +118,12 @@ class LighthouseData(PyTree):
 
 
 class Lighthouse(Sensor):
-    """Angles at which the two light planes of base stations pass photodiodes, rad, and where these are in view.
+    """Angles at which the two light planes of base stations pass photodiodes, rad, and whether these are in view.
 
     In a station's frame, x forwards and z upwards, a plane with tilt t passes the point (x, y, z) at
-    ``atan2(y, x) + asin(z tan(t) / sqrt(x^2 + y^2))`` (Taffanel et al. 2021, arXiv:2104.11523). A diode is in view in
-    front of a station that is above the plane of the body's x and y axes; other angles are zero. Nothing hides a diode.
+    ``atan2(y, x) + asin(z tan(t) / sqrt(x^2 + y^2))`` (Taffanel et al. 2021, arXiv:2104.11523). A diode is in view if
+    it is in front of a station that is above the plane of the body's x and y axes; the angles of all others are zero.
+    Objects do not hide diodes.
     """
 
     stations: ArrayLike = parameter()
@@ -158,7 +159,7 @@ class Lighthouse(Sensor):
         )
 
     def ideal(self, data: SimData) -> Array:
-        """Return the angles, rad, and 1 where they are in view, else 0. (3 n_stations n_diodes,)"""
+        """Return the angles, rad, and 1 where a diode is in view, else 0. (3 n_stations n_diodes,)"""
         record, s = self.read(data), data.states
         diodes = rotation.rotate(s.quat, record.diodes, s.pos)
         offset = diodes - record.stations[:, None]

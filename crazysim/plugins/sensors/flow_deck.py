@@ -22,9 +22,9 @@ from crazysim.pytree import PyTree, leaf
 PIXELS_PER_RADIAN = 35.0 / 0.71674
 """Pixels by which the image moves per radian (mm_flow.c of crazyflie-firmware: 35 pixels, aperture 0.71674)."""
 MIN_TILT_COSINE = 0.1
-"""Least cosine of the tilt at which the ground is seen, 84 degrees. An assumption."""
+"""Smallest cosine of the tilt at which the ground is in view: a tilt of 84 degrees. An assumption."""
 MIN_FLOW_DISTANCE = 0.02
-"""Least distance of the ground, m, that the flow is divided by. An assumption."""
+"""Smallest distance to the ground, m, by which the flow is divided. An assumption."""
 FAR_NOISE = math.log(0.2 / 0.0025) / (4.0 - 2.5), 2.5, 0.0025
 """Growth b, 1/m, distance c, m, and scale a, m, of the noise of the time of flight, ``a (1 + exp(b (d - c)))``, as the
 filter of the Crazyflie assumes it (zranger2.c of crazyflie-firmware)."""
@@ -42,15 +42,15 @@ class OpticalFlowData(PyTree):
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
     """Position of the camera relative to the centre of mass, body frame, m. (3,)"""
     resolution: Array | None = leaf("parameter", 1, (1,))
-    """Smallest difference of two measurements, pixels; None for none. (1,)"""
+    """Step to which measurements are rounded, pixels; None for no rounding. (1,)"""
 
 
 class OpticalFlow(Sensor):
-    """Motion of the image of a camera that looks down, pixels since the measurement before, along x and y of the body.
+    """Motion of the image of a camera that looks down, pixels per measurement, along x and y of the body.
 
     With the distance d to the ground along the optical axis, and the velocity v of the camera in its own frame, the
     image of the ground moves by ``v_x / d - w_y`` and ``v_y / d + w_x`` radians per second (mm_flow.c of
-    crazyflie-firmware). The ground is taken to be level; a drone on its side or upside down measures no motion.
+    crazyflie-firmware). The ground is assumed to be level; a drone on its side or upside down measures no motion.
     """
 
     kind: ClassVar[type[PyTree]] = OpticalFlowData
@@ -61,7 +61,7 @@ class OpticalFlow(Sensor):
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Position of the camera relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     resolution: ArrayLike | None = parameter(default=None, positive=True)
-    """Smallest difference of two measurements, pixels; None for none. () or (n_worlds, n_drones)"""
+    """Step to which measurements are rounded, pixels; None for no rounding. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     freq: int | None = 100
     """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step."""
@@ -100,15 +100,15 @@ class TimeOfFlightData(PyTree):
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
     """Position of the sensor relative to the centre of mass, body frame, m. (3,)"""
     resolution: Array | None = leaf("parameter", 1, (1,))
-    """Smallest difference of two measurements, m; None for none. (1,)"""
+    """Step to which measurements are rounded, m; None for no rounding. (1,)"""
 
 
 class TimeOfFlight(Sensor):
     """Distance to the ground along the negative z axis of the body, m; ``max_range`` where nothing is nearer.
 
-    The ground is the floor or terrain below the drone, taken to be level: the distance is the height over the cosine of
-    the tilt. Obstacles are for ``RangeFinder``. At distance d the standard deviation is
-    ``noise + far_noise (1 + exp(2.92 (d - 2.5)))``, by default what the filter of the Crazyflie assumes.
+    The ground is the floor or terrain below the drone, assumed to be level: the distance is the height divided by the
+    cosine of the tilt. Use ``RangeFinder`` for obstacles. At distance d the standard deviation is
+    ``noise + far_noise (1 + exp(2.92 (d - 2.5)))``, by default as the filter of the Crazyflie assumes.
     """
 
     kind: ClassVar[type[PyTree]] = TimeOfFlightData
@@ -121,11 +121,12 @@ class TimeOfFlight(Sensor):
     pos: ArrayLike = parameter(default=(0.0, 0.0, 0.0))
     """Position of the sensor relative to the centre of mass, body frame, m. (3,) or (n_worlds, n_drones, 3)"""
     resolution: ArrayLike | None = parameter(default=0.001, positive=True)
-    """Smallest difference of two measurements, m; None for none. () or (n_worlds, n_drones)"""
+    """Step to which measurements are rounded, m; None for no rounding. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     freq: int | None = 25
-    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step. The firmware takes one in at least
-    25 ms (zranger2.c), and 25 Hz is the largest divisor of 500 below; 40 divides 1000."""
+    """Measurements per second, Hz, a divisor of ``sim.freq``; None for every step. The firmware measures at most once
+    in 25 ms (zranger2.c), which is 40 Hz. The default is the largest divisor of 500 below that; 40 Hz is possible with
+    1000 steps per second."""
     name: str = "time_of_flight"
 
     @property
@@ -155,7 +156,7 @@ def range_deviation(distance: Array, scale: Array) -> Array:
 
 
 def ground_distance(data: SimData, pos: Array) -> tuple[Array, Array]:
-    """Return the distance of level ground along the negative z axis of the body, m, and True where it is seen.
+    """Return the distance to level ground along the body's negative z axis, m, and True where it is in view.
 
     Both are (1,).
 

@@ -1,4 +1,4 @@
-"""Satellite navigation: position with errors that wander, and velocity."""
+"""Satellite navigation: position with wandering errors, and velocity."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class GPSData(PyTree):
     samples: Samples
     """Measurements."""
     wander: Array = leaf("drone", 1, (3,))
-    """Error of the position that wanders, world frame, m. (n_worlds, n_drones, 3)"""
+    """Wandering error of the position, world frame, m. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a position, m. (3,)"""
     drift: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Standard deviation of the error that wanders, m. (3,)"""
+    """Standard deviation of the wandering error, m. (3,)"""
     drift_time: Array = leaf("parameter", 1, (1,))
-    """Its correlation time, s. (1,)"""
+    """Correlation time of the wandering error, s. (1,)"""
     vel_noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of a velocity, m/s. (3,)"""
     pos: Array = leaf("parameter", 1, (3,), sparse=True)
@@ -44,8 +44,7 @@ class GPS(Sensor):
     noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
     """Standard deviation of a position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
     drift: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)
-    """Standard deviation of an error of the position that wanders, world frame, m. (), (3,) or
-    (n_worlds, n_drones, 3)"""
+    """Standard deviation of a wandering error of the position, world frame, m. (), (3,) or (n_worlds, n_drones, 3)"""
     drift_time: ArrayLike = parameter(default=60.0, positive=True)
     """Correlation time of that error, s. () or (n_worlds, n_drones)"""
     vel_noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)

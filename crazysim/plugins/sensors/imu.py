@@ -46,9 +46,9 @@ BMI088: dict[str, Any] = {
     ),
 }
 """Bosch BMI088, of the Crazyflie 2.1. Noise densities and offsets: data sheet BST-BMI088, revision 1.9, tables 4 and 5
-(an offset's typical value taken as standard deviation). Ranges of 2000 degrees/s and 24 g in 16 bits, and the filters:
-as the firmware sets them (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz). The data sheet
-states no instability or random walk of the bias: they are zero."""
+(typical values of offsets are used as standard deviations). Ranges of 2000 degrees/s and 24 g in 16 bits, and the
+filters, are those that the firmware sets (sensors_bmi088_bmp3xx.c of crazyflie-firmware, BW_116 and OSR4 at 1600 Hz).
+The data sheet states no instability or random walk of the bias: they are zero."""
 
 _FIRMWARE_GYRO_BIAS = 0.014 * RAD_PER_DEGREE / math.sqrt(2 * 0.512)
 CRAZYFLIE: dict[str, Any] = {
@@ -57,10 +57,10 @@ CRAZYFLIE: dict[str, Any] = {
         BMI088["accel"], bias_spread=np.array([20e-3, 20e-3, 0.0]) * STANDARD_GRAVITY, bandwidth=18.5
     ),
 }
-"""BMI088 behind the firmware of the Crazyflie (sensors_bmi088_bmp3xx.c). Before take-off the mean of 512 samples
-of the gyroscope is subtracted, so the mean of their noise is the bias that is left; the accelerometer is scaled to 1 g,
-which leaves no bias along gravity. Behind the filters of the chip are Butterworth filters of second order with corners
-of 80 and 30 Hz; the corners here are those of a filter of first order that delays as much as both together."""
+"""BMI088 after processing by the firmware of the Crazyflie (sensors_bmi088_bmp3xx.c). Before take-off the mean of 512
+samples of the gyroscope is subtracted, so the mean of their noise is the remaining bias; the accelerometer is scaled to
+1 g, which leaves no bias along gravity. The filters of the chip are followed by second-order Butterworth filters with
+corners of 80 and 30 Hz; the corners here belong to a first-order filter with the same delay as both together."""
 
 MPU9250: dict[str, Any] = {
     "gyro": Triad(
@@ -83,8 +83,8 @@ MPU9250: dict[str, Any] = {
     ),
 }
 """InvenSense MPU-9250, of the Crazyflie 2.0: product specification PS-MPU-9250A-01, revision 1.0, tables 1 and 2, at
-2000 degrees/s, 16 g and DLPFCFG = 2. Tolerances are taken as standard deviations, and the cross-axis sensitivity as
-that of a rotation. It states no instability or random walk of the bias: they are zero."""
+2000 degrees/s, 16 g and DLPFCFG = 2. Tolerances are used as standard deviations, and the cross-axis sensitivity as the
+standard deviation of a rotation. It states no instability or random walk of the bias: they are zero."""
 
 MPU6050: dict[str, Any] = {
     "gyro": dataclasses.replace(
@@ -129,9 +129,9 @@ class IMUData(PyTree):
 class IMU(Sensor):
     """Gyroscope, rad/s, and accelerometer, m/s^2, in the sensor's frame.
 
-    The accelerometer measures the acceleration of its position, with gravity subtracted: 9.81 m/s^2 upwards at rest.
-    The acceleration is the change of the velocity in the step, whatever caused it, contacts and loads included. An
-    unbalanced rotor shakes the drone with the centrifugal force ``imbalance w^2``.
+    The accelerometer measures the acceleration of its position, minus gravity: 9.81 m/s^2 upwards at rest. The
+    acceleration is the change of the velocity in the step by all causes, including contacts and loads. An unbalanced
+    rotor shakes the drone with the centrifugal force ``imbalance w^2``.
     """
 
     gyro: Triad = parameter(default=Triad())
@@ -150,7 +150,7 @@ class IMU(Sensor):
 
     @classmethod
     def crazyflie(cls, **settings: Any) -> IMU:
-        """Return the unit of the Crazyflie 2.1 behind its firmware; see ``CRAZYFLIE``. Other settings are passed on."""
+        """Return the unit of the Crazyflie 2.1 with its firmware; see ``CRAZYFLIE``. Other settings are passed on."""
         return cls(**(CRAZYFLIE | settings))
 
     @classmethod
@@ -234,7 +234,7 @@ class IMU(Sensor):
         return {"ang_vel": rotation.rotate(self.read(data).quat, self.part(data, "gyro"))}
 
     def _store_velocities(self, data: SimData) -> SimData:
-        """Note the velocities of one drone before the step."""
+        """Store the velocities of one drone before the step."""
         s = data.states
         return self.write(data, self.read(data).replace(vel=s.vel, ang_vel=s.ang_vel))
 
@@ -261,7 +261,7 @@ def vibration(imbalance: Array, speed: Array, phase: Array, rotor_pos: Array) ->
     """Return force, N, torque, N m, and angular momentum, N m s, of unbalanced rotors, body frame. (3,) each
 
     The centrifugal force ``m e w^2`` turns with the rotor in its plane; the angular momentum is the integral of its
-    torque over time. All rotors turn the same way here, which only sets the order of the phases.
+    torque over time. All rotors are assumed to turn the same way, which affects only the relation of their phases.
 
     Args:
         imbalance: Imbalance m e, kg m. (n_rotors,)

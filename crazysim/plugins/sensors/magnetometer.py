@@ -19,7 +19,8 @@ from crazysim.plugins.sensors.triad import Triad, TriadData
 from crazysim.pytree import PyTree, leaf
 
 MAX_FIELD = 1e-3
-"""Strongest field accepted, T, some fifteen times the earth's, so that other units are noticed. An assumption."""
+"""Strongest field accepted, T, some fifteen times the earth's, so that fields in other units are rejected. An
+assumption."""
 
 
 class MagnetometerData(PyTree):
@@ -39,8 +40,8 @@ class Magnetometer(Sensor):
     """Magnetic field in the sensor's frame, T. The bias of its errors is known as hard iron."""
 
     field: ArrayLike = parameter()
-    """Magnetic field, world frame, T: (0, 2e-5, -4.5e-5) with x east, y north and z up has the size of that in central
-    Europe (an estimate; take yours from the World Magnetic Model). (3,) or (n_worlds, n_drones, 3)"""
+    """Magnetic field, world frame, T: (0, 2e-5, -4.5e-5) with x east, y north and z up has the magnitude of the field
+    in central Europe (an estimate; take yours from the World Magnetic Model). (3,) or (n_worlds, n_drones, 3)"""
     errors: Triad = parameter(default=Triad())
     """Errors of the three axes, T."""
     rpy: ArrayLike = parameter(default=(0.0, 0.0, 0.0))

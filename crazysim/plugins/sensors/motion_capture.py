@@ -24,7 +24,7 @@ class MotionCaptureData(PyTree):
     samples: Samples
     """Measurements."""
     last: Array = leaf("drone", 1, (3,))
-    """Position measured last, world frame, m. (n_worlds, n_drones, 3)"""
+    """Last measured position, world frame, m. (n_worlds, n_drones, 3)"""
     vel: Array = leaf("drone", 1, (3,))
     """Low-passed difference quotient of the positions, m/s. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
@@ -42,8 +42,8 @@ class MotionCaptureData(PyTree):
 class MotionCapture(Sensor):
     """Position, m, attitude, xyzw, and velocity, m/s, of a tracked body on every drone, world frame.
 
-    The velocity is the difference of successive positions over their interval behind a low-pass filter, as estimators
-    of laboratories form it, so noise of the position is in it too.
+    The velocity is the low-pass filtered difference quotient of successive positions, as laboratories usually estimate
+    it, and so it contains the noise of the positions.
     """
 
     noise: ArrayLike = parameter(default=0.0, low=0.0, per_axis=True)

@@ -1,4 +1,4 @@
-"""Measurements on board of quantities that other parts simulate: rotor speeds, battery voltage, ranges."""
+"""Onboard measurements of quantities that are simulated elsewhere: rotor speeds, battery voltage, ranges."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from crazysim.plugins.sensors.sensor import Samples, Sensor, quantise
 from crazysim.pytree import PyTree, leaf
 
 ELECTRICAL_SPEED_STEP = 100.0
-"""Step of the electrical speed in telemetry, rpm: the flights of IDSIA's Crazyflies (2025) have it."""
+"""Step of the electrical speed in telemetry, rpm, as in flight logs of IDSIA's Crazyflies (2025)."""
 
 
 class NoisyData(PyTree):
@@ -34,7 +34,7 @@ class NoisyData(PyTree):
     noise: Array = leaf("parameter", 1, (1,), sparse=True)
     """Standard deviation of a measurement, in its unit. (1,)"""
     resolution: Array | None = leaf("parameter", 1, (1,))
-    """Smallest difference of two measurements, in its unit; None for none. (1,)"""
+    """Step to which measurements are rounded, in their unit; None for no rounding. (1,)"""
 
 
 class NoisySensor(Sensor):
@@ -44,7 +44,7 @@ class NoisySensor(Sensor):
     noise: ArrayLike = parameter(default=0.0, low=0.0)
     """Standard deviation of a measurement, in its unit. () or (n_worlds, n_drones)"""
     resolution: ArrayLike | None = parameter(default=None, positive=True)
-    """Smallest difference of two measurements, in its unit; None for none. () or (n_worlds, n_drones)"""
+    """Step to which measurements are rounded, in their unit; None for no rounding. () or (n_worlds, n_drones)"""
     _: dataclasses.KW_ONLY
     name: str = "noisy"
 
@@ -55,7 +55,7 @@ class NoisySensor(Sensor):
 
 
 class RotorSpeeds(NoisySensor):
-    """Rotor speeds as telemetry of the motors reports them, rpm; needs rotors.
+    """Rotor speeds as reported by the motors' telemetry, rpm; needs rotors.
 
     Telemetry counts electrical revolutions in steps of 100 rpm: with six pole pairs, ``resolution=100 / 6``.
     """
@@ -116,7 +116,7 @@ class BatteryVoltage(NoisySensor):
 
 
 class MultiRanger(NoisySensor):
-    """Distances of a ``RangeFinder``, added before, at a rate, late and with noise, m.
+    """Distances of a ``RangeFinder``, added before, with a rate, a delay and noise, m.
 
     A distance beyond the range is the range finder's ``max_range``, without noise.
     """

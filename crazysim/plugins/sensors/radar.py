@@ -20,20 +20,20 @@ from crazysim.pytree import PyTree, device_array, leaf
 from crazysim.rotation import safe_clip, safe_norm
 
 CLEAR, ALARM = (0.25, 0.6, 0.9, 1.0), (0.95, 0.2, 0.15, 1.0)
-"""Colours of a lobe without a drone in it, and with one."""
+"""RGBA colours of an empty lobe, and of a lobe with a drone in it."""
 N_MERIDIANS, N_POINTS = 12, 40
-"""Curves by which a lobe is drawn, and points of each side of a curve."""
+"""Number of teardrop outlines drawn for a lobe, and number of points on each half of an outline."""
 
 
 class RadarData(PyTree):
-    """Radars of every world, and the time that each drone has been within their lobes."""
+    """Radars, the same in every world, and the time that each drone has been within their lobes."""
 
     pos: Array = leaf("shared", 2)
     """Positions of the radars, world frame, m. (n_radars, 3)"""
     max_range: Array = leaf("shared", 1)
     """Length of each lobe, m. (n_radars,)"""
     exponent: Array = leaf("shared", 1)
-    """Exponents of the lobes, 1: larger ones are thinner near the radar. (n_radars,)"""
+    """Exponents of the lobes, 1; the larger, the thinner a lobe is near its radar. (n_radars,)"""
     height_scale: Array = leaf("shared", 1)
     """Factors of the thickness of the lobes, 1. (n_radars,)"""
     tilt: Array = leaf("shared", 1)
@@ -49,10 +49,10 @@ class RadarData(PyTree):
 
 
 class Radar(Plugin):
-    """Radars, each detecting the drones within its lobe, also behind objects.
+    """Radars, each of which detects the drones within its lobe; objects do not block it.
 
     The lobe is a teardrop in the vertical plane, turned about the vertical axis of the radar: the range is the same in
-    all directions. Settings are one for all radars, or one for each.
+    all directions. Each setting is one number for all radars, or one number per radar.
     """
 
     pos: ArrayLike = parameter()
@@ -60,7 +60,7 @@ class Radar(Plugin):
     max_range: ArrayLike = parameter(default=10.0, positive=True)
     """Length of the lobe, m. () or (n_radars,)"""
     exponent: ArrayLike = parameter(default=1.3, low=0.0)
-    """Exponent of the lobe, 1: larger ones are thinner near the radar. () or (n_radars,)"""
+    """Exponent of the lobe, 1; the larger, the thinner the lobe is near its radar. () or (n_radars,)"""
     height_scale: ArrayLike = parameter(default=1.0, positive=True)
     """Factor of the thickness of the lobe, 1. () or (n_radars,)"""
     tilt: ArrayLike = parameter(default=0.0, low=-math.pi / 2, high=math.pi / 2)
@@ -89,13 +89,13 @@ class Radar(Plugin):
         return [StagePlacement(Stage(self.count, "drone"), before="increment_steps")]
 
     def count(self, data: SimData) -> SimData:
-        """Add a step to the time within each lobe, of one drone."""
+        """Add one step to the time of one drone within each lobe that it is in."""
         record = self.read(data)
         time = jnp.where(record.margin_at(data.states.pos) > 0, 1 / data.core.freq, 0.0)
         return self.write(data, record.replace(exposure=record.exposure + time))
 
     def detects(self, data: SimData) -> Array:
-        """Return True where a radar detects a drone, of one drone, one world or all worlds. (..., n_radars)"""
+        """Return True where a radar detects a drone, for one drone, one world or all worlds. (..., n_radars)"""
         return self.read(data).margin_at(data.states.pos) > 0
 
     def observations(self, data: SimData) -> dict[str, Array]:
@@ -118,9 +118,10 @@ class Radar(Plugin):
 def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: Array, tilt: Array) -> Array:
     """Return the depth of a point within a radar's lobe along the normal to its axis, m, negative outside. (...)
 
-    With a half the range, the lobe is the teardrop ``x = a (1 - cos t)``, ``|z| <= h a sin(t) sin(t / 2)^e``, t from 0
-    to pi, tilted in the vertical plane and then turned about the vertical axis (facts of AIMotionLab-Virtual, 2024).
-    Without t, ``|z| <= h a 2^(-e / 2) u^((1 + e) / 2) sqrt(2 - u)`` with ``u = x / a``.
+    With a equal to half the range, the lobe is the teardrop ``x = a (1 - cos t)``, ``|z| <= h a sin(t) sin(t / 2)^e``,
+    t from 0 to pi, tilted in the vertical plane and then turned about the vertical axis
+    (formula of AIMotionLab-Virtual, 2024). Eliminating t gives ``|z| <= h a 2^(-e / 2) u^((1 + e) / 2) sqrt(2 - u)``
+    with ``u = x / a``.
 
     Args:
         offset: Position relative to the radar, world frame, m. (..., 3)
@@ -141,7 +142,7 @@ def lobe_margin(offset: Array, max_range: Array, exponent: Array, height_scale: 
         beyond = jnp.maximum(u - 2, 0.0) + jnp.maximum(-u, 0.0)
         return limit - jnp.abs(across) - size * beyond
 
-    # The lobe of the opposite direction reaches over the axis where it is steep.
+    # A steep lobe reaches across the vertical axis, so that the lobe in the opposite direction counts too.
     return jnp.maximum(margin(away), margin(-away))
 
 

@@ -80,14 +80,14 @@ class RangeFinder(Plugin):
         return RangeFinderData(device_array(distance), device_array(rays), device_array(far))
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        """Return the stage that measures: of one drone; of one world if drones or loads are to be measured; or of all
-        worlds if more can move than a step's kernel has code for.
+        """Return the stage that measures: for one drone; for one world if distances to drones or loads are measured; or
+        for all worlds if more geoms can move than a fused kernel can unroll.
         """
         visual, solid = sim.scene.visual_model, sim.scene.collision_model
         movers = moving_plugins(sim.scene.plugins(), [body.name for body in visual.objects])
         touched = {body.name for body in solid.objects}
         objects = tuple(body for body in visual.objects if body.name in touched or body.name not in movers)
-        # The outline of a drone is enough for a few rays.
+        # The collision shape of a drone is enough for a few rays.
         model = dataclasses.replace(visual, objects=objects, drones=solid.drones)
         movers = {name: plugin for name, plugin in movers.items() if name in touched}
         n_movable = sum(len(body.geoms) for body in objects if body.row is not None)
@@ -101,13 +101,13 @@ class RangeFinder(Plugin):
             return data.core.steps % period == 0
 
         def measure(data: SimData) -> SimData:
-            """Measure distances, to loads where they are now."""
+            """Measure distances, with loads at their current positions."""
             present = {name: plugin for name, plugin in movers.items() if plugin.name in data.plugins}
             current = with_moved_objects(data, present)
             return self.write(data, self._measure(model, current, scope == "drone", scene.ray_kernels))
 
         def measure_at_times(data: SimData) -> SimData:
-            """Measure in a call that is left out where no world measures."""
+            """Measure in a call that is skipped if no world is due."""
             return jax.lax.cond(jnp.any(is_due(data)), measure, lambda data: data, data)
 
         fn = measure_at_times if scope == "batch" and period > 1 else measure

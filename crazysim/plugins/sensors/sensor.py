@@ -25,7 +25,7 @@ from crazysim.pytree import PyTree, device_array, leaf
 R = TypeVar("R", bound=PyTree)
 
 MAX_ROWS = 64
-"""Most measurements of one sensor in transit."""
+"""Largest number of measurements of one sensor in transit."""
 NEVER_ARRIVES = 2**31 - 1
 """Step of arrival of a measurement that is lost."""
 MAX_DELAY = 100.0
@@ -33,22 +33,22 @@ MAX_DELAY = 100.0
 
 
 class Samples(PyTree):
-    """Latest measurement that has arrived, and those in transit."""
+    """Latest measurement that has arrived, and the measurements in transit."""
 
     value: Array = leaf("drone", 1)
     """Latest measurement that has arrived. (n_worlds, n_drones, k)"""
     taken: Array = leaf("drone", 1)
-    """Step in which it was taken, negative before the first one. (n_worlds, n_drones, 1)"""
+    """Step in which the latest measurement was taken, negative before the first one. (n_worlds, n_drones, 1)"""
     delay: Array | None = leaf("parameter", 1, (1,))
     """Time from measurement to arrival, s; None without delay. (1,)"""
     jitter: Array | None = leaf("parameter", 1, (1,))
     """Largest random addition to the delay, s; None without delay. (1,)"""
     dropout: Array | None = leaf("parameter", 1, (1,))
-    """Probability that a measurement is lost, 0 to 1; None if none is. (1,)"""
+    """Probability that a measurement is lost, 0 to 1; None if no measurement is lost. (1,)"""
     queue: Array | None = leaf("drone", 2)
     """Measurements in transit, newest first; None without delay. (n_worlds, n_drones, n_rows, k)"""
     due: Array | None = leaf("drone", 1)
-    """Steps in which they arrive; None without delay. (n_worlds, n_drones, n_rows)"""
+    """Steps in which the queued measurements arrive; None without delay. (n_worlds, n_drones, n_rows)"""
 
 
 class Sensor(Plugin):
@@ -63,7 +63,7 @@ class Sensor(Plugin):
     kind: ClassVar[type[PyTree]]
     """Class of the record."""
     reset_before: ClassVar[str | None] = "increment_steps"
-    """Name of the stage before which an episode is reset: at the state of the first measurement."""
+    """Name of the stage before which an episode is reset, so that the reset uses the state of the first measurement."""
 
     _: dataclasses.KW_ONLY
     freq: int | None = None
@@ -75,7 +75,8 @@ class Sensor(Plugin):
     dropout: ArrayLike = parameter(default=0.0, low=0.0, high=1.0)
     """Probability that a measurement is lost, 0 to 1. () or (n_worlds, n_drones)"""
     max_delay: float | None = setting(default=None, low=0.0, high=MAX_DELAY)
-    """Largest delay with jitter that the record can take later on, s; None for ``delay`` plus ``jitter``."""
+    """Largest sum of delay and jitter to which the record can be changed later, s; None for ``delay`` plus
+    ``jitter``."""
     name: str = "sensor"
 
     @property
@@ -185,7 +186,7 @@ class Sensor(Plugin):
         return float(np.max(np.asarray(self.delay)) + np.max(np.asarray(self.jitter)))
 
     def _take_measurement(self, data: SimData) -> SimData:
-        """Take a measurement of one drone, and send it on its way."""
+        """Take a measurement of one drone, and queue it, or hold it if there is no delay."""
         key, step = drone_key(data, self.name), data.core.steps
         value, record = self.measure(data, self.read(data), key)
         samples, lost, late = record.samples, False, 0.0
@@ -210,7 +211,7 @@ class Sensor(Plugin):
         record, step = self.read(data), data.core.steps
         samples, period = record.samples, data.core.freq // (self.freq or data.core.freq)
         value, taken = samples.value, samples.taken
-        for row in reversed(range(samples.due.shape[0])):  # newest last
+        for row in reversed(range(samples.due.shape[0])):  # the newest one last, so that it is kept
             arrived = samples.due[row] <= step
             value = jnp.where(arrived, samples.queue[row], value)
             taken = jnp.where(arrived, step - step % period - row * period, taken)

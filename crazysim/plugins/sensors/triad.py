@@ -21,7 +21,7 @@ class TriadData(PyTree):
     """Errors of the three axes of every sensor, in the unit u of the measurement."""
 
     bias: Array = leaf("drone", 1)
-    """Bias now, without the wandering part, u. (n_worlds, n_drones, 3)"""
+    """Current bias without the wandering part, u. (n_worlds, n_drones, 3)"""
     scale: Array = leaf("drone", 1)
     """Relative error of the scale in this episode, 1. (n_worlds, n_drones, 3)"""
     misalignment: Array = leaf("drone", 1)
@@ -29,11 +29,11 @@ class TriadData(PyTree):
     wander: Array = leaf("drone", 1)
     """Wandering part of the bias, u. (n_worlds, n_drones, 3)"""
     filtered: Array | None = leaf("drone", 1)
-    """Output of the low-pass filter, u; None without one. (n_worlds, n_drones, 3)"""
+    """Output of the low-pass filter, u; None without a filter. (n_worlds, n_drones, 3)"""
     noise: Array = leaf("parameter", 1, (3,), sparse=True)
     """Density of the white noise, one-sided, u/sqrt(Hz). (3,)"""
     random_walk: Array = leaf("parameter", 1, (3,), sparse=True)
-    """Standard deviation by which the bias has changed after 1 s, u/sqrt(s). (3,)"""
+    """Standard deviation of the random walk of the bias after 1 s, u/sqrt(s). (3,)"""
     instability: Array = leaf("parameter", 1, (3,), sparse=True)
     """Standard deviation of the wandering part of the bias, u. (3,)"""
     correlation_time: Array = leaf("parameter", 1, (1,))
@@ -43,11 +43,11 @@ class TriadData(PyTree):
     spread: Array = leaf("parameter", 1, (9,), sparse=True)
     """Standard deviations of bias, scale error and misalignment at the beginning of an episode. (9,)"""
     bandwidth: Array | None = leaf("parameter", 1, (1,))
-    """Corner frequency of the low-pass filter, Hz; None without one. (1,)"""
+    """Corner frequency of the low-pass filter, Hz; None without a filter. (1,)"""
     limit: Array | None = leaf("parameter", 1, (3,))
-    """Largest measurement of either sign, u; None for any. (3,)"""
+    """Largest magnitude of a measurement, u; None for no limit. (3,)"""
     resolution: Array | None = leaf("parameter", 1, (3,))
-    """Smallest difference of two measurements, u; None for none. (3,)"""
+    """Step to which measurements are rounded, u; None for no rounding. (3,)"""
 
     def draw_errors(self, truth: Array, noise: Array) -> TriadData:
         """Return the errors of one sensor in an episode.
@@ -78,7 +78,7 @@ class TriadData(PyTree):
         bias = self.bias + self.random_walk * math.sqrt(dt) * noise[3:6]
         wander = gauss_markov_step(self.wander, self.instability, self.correlation_time, dt, noise[6:])
         triad = self.replace(bias=bias, wander=wander)
-        # a one-sided density up to half the rate
+        # The one-sided density extends up to half the sampling rate.
         value = triad.without_noise(truth) + self.noise * math.sqrt(0.5 / dt) * noise[:3]
         if self.filtered is not None and self.bandwidth is not None:
             value = self.filtered + (1 - jnp.exp(-2 * math.pi * dt * self.bandwidth)) * (value - self.filtered)
@@ -99,14 +99,14 @@ class Triad:
     """
 
     noise: ArrayLike = setting(default=0.0, low=0.0)
-    """Density of white noise as data sheets state it, one-sided, u/sqrt(Hz): the root mean square behind an ideal
+    """Density of white noise as data sheets state it, one-sided, u/sqrt(Hz): the root mean square after an ideal
     low-pass filter is ``noise sqrt(bandwidth)``."""
     bias: ArrayLike = 0.0
     """Mean of the bias at the beginning of an episode, u."""
     bias_spread: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of the bias at the beginning of an episode, u."""
     random_walk: ArrayLike = setting(default=0.0, low=0.0)
-    """Standard deviation by which the bias changes in 1 s, u/sqrt(s)."""
+    """Standard deviation of the random walk of the bias after 1 s, u/sqrt(s)."""
     instability: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of a bias that wanders, a first-order Gauss-Markov process, u."""
     correlation_time: ArrayLike = setting(default=100.0, positive=True)
@@ -116,15 +116,15 @@ class Triad:
     scale_spread: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of the relative error of the scale between episodes, 1."""
     misalignment: ArrayLike = 0.0
-    """Small rotation of the axes against the mounting, rad."""
+    """Mean of a small rotation of the axes relative to the mounting, rad."""
     misalignment_spread: ArrayLike = setting(default=0.0, low=0.0)
     """Standard deviation of that rotation between episodes, rad."""
     bandwidth: ArrayLike | None = setting(default=None, positive=True)
     """Corner frequency of a first-order low-pass filter, Hz; None for none. () or (n_worlds, n_drones)"""
     limit: ArrayLike | None = setting(default=None, positive=True)
-    """Largest measurement of either sign, u; None for any."""
+    """Largest magnitude of a measurement, u; None for no limit."""
     resolution: ArrayLike | None = setting(default=None, positive=True)
-    """Smallest difference of two measurements, u; None for none. Gradients pass as if there were none."""
+    """Step to which measurements are rounded, u; None for no rounding. Gradients ignore the rounding."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -22,7 +22,7 @@ BODY, DARK, STEEL = (0.1, 0.35, 0.75, 1.0), (0.08, 0.08, 0.08, 1.0), (0.6, 0.6, 
 RUBBER, WOOD = (0.16, 0.16, 0.16, 1.0), (0.7, 0.6, 0.35, 1.0)
 """Colours of bodies, rims, spokes, tyres and decks."""
 TOUCHES, GHOST = 'contype="0" conaffinity="2"', 'contype="0" conaffinity="0"'
-"""Attributes of geoms that drones touch, and of others."""
+"""Attributes of geoms that drones touch, and of other geoms."""
 N_SPOKES = 5
 """Spokes of a wheel, which make its rotation visible."""
 
@@ -34,7 +34,7 @@ def part_names(cars: Any) -> tuple[str, ...]:
 
 
 def _kind(cars: Any, part: str) -> str:
-    """Return the name of the objects of a part; names of bodies begin with the names of cars."""
+    """Return the name of the objects of a part; objects of bodies have the name of the cars alone."""
     return cars.name if part == "body" else f"{cars.name}_{part}"
 
 

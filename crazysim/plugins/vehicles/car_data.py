@@ -26,8 +26,8 @@ class CarData(Members):
     yaw_rate: Array = leaf("member", 1)
     """Rate of the heading, rad/s. (n_worlds, n_members, 1)"""
     normal: Array = leaf("member", 1)
-    """Unit normal of the ground below, upwards, world frame; it follows terrain within ``SETTLING_TIME``.
-    (n_worlds, n_members, 3)"""
+    """Unit normal of the ground below, upwards, world frame; it follows terrain with a time constant of
+    ``SETTLING_TIME``. (n_worlds, n_members, 3)"""
     steer: Array = leaf("member", 1)
     """Steering angle in the middle of the front axle, rad, positive to the left. (n_worlds, n_members, 1)"""
     distance: Array = leaf("member", 1)
@@ -35,7 +35,7 @@ class CarData(Members):
     joints: Array | None = leaf("member", 1)
     """Headings of the trailer's drawbar and deck, rad, not wrapped; None without trailers. (n_worlds, n_members, 2)"""
     command: Array = leaf("member", 1)
-    """Command: motor reference, 1, or speed, m/s, by the command level, and steering angle, rad.
+    """Motor reference, 1, or speed, m/s, depending on the command level, followed by the steering angle, rad.
     (n_worlds, n_members, 2)"""
     applied: Array | None = leaf("member", 1)
     """Motor reference and steering angle, rad, of the last tick of the controller; None at the level ``drive``, where
@@ -47,7 +47,7 @@ class CarData(Members):
     params: CarParams
     """Parameters of the dynamics."""
     path: Path | None
-    """Paths; None for cars that follow none."""
+    """Paths; None for cars that follow no path."""
     index: Array | None = leaf("parameter", 1, (1,))
     """Index of the path that a car follows. (1,)"""
     start: Array | None = leaf("parameter", 1, (1,))

@@ -12,7 +12,7 @@ from crazysim.plugins.vehicles.model import VehicleModel
 from crazysim.pytree import PyTree, as_parameter, leaf
 
 SLIP_SPEED = 0.1
-"""Least speed below which the forces of tyres and dry friction decrease to zero at standstill, m/s."""
+"""Smallest value of ``CarParams.slip_speed``, m/s."""
 
 
 class CarParams(PyTree):
@@ -54,13 +54,13 @@ class CarParams(PyTree):
 
     @staticmethod
     def create(vehicle: VehicleModel, freq: int, trailer: bool = False) -> CarParams:
-        """Return the shared parameters of a vehicle model.
+        """Return the parameters of a vehicle model, the same for all vehicles.
 
         The grip of an axle is its static load times the friction coefficient; load transfer is neglected.
 
         Args:
             vehicle: The vehicle model.
-            freq: Rate of the physics, Hz: at rates too low for tyres at ``SLIP_SPEED``, ``slip_speed`` is larger.
+            freq: Rate of the physics, Hz: if it is too low for tyres at ``SLIP_SPEED``, ``slip_speed`` is larger.
             trailer: True if the vehicle tows its trailer.
         """
         number = vehicle.number
@@ -76,7 +76,8 @@ class CarParams(PyTree):
         kinematic = vehicle.dynamics == "kinematic"
         stiffness = [0.0, 0.0] if kinematic else [number("tyres.front"), number("tyres.rear")]
         moments = front**2 * stiffness[0] + rear**2 * stiffness[1]
-        # The fastest rate of lateral motion is at most this over the speed; times the step it stays below 1.
+        # The fastest rate of lateral motion is at most this divided by the speed; its product with the step must stay
+        # below 1.
         rate = max(sum(stiffness) / mass, moments / yaw_inertia)
         drive, drive_max = drive_constants(vehicle)
         slip_speed = max(SLIP_SPEED, rate / freq)

@@ -63,10 +63,10 @@ def to_body_frame(yaw: Array, vector: Array) -> Array:
 
 
 def ackermann(steer: Array, wheelbase: float, track: float) -> Array:
-    """Return the steering angles of left and right front wheel whose axes meet on the axis of the rear wheels.
+    """Return the steering angles of the front wheels with which their axes meet on the axis of the rear wheels.
 
-    ``tan(left) = L tan / (L - (t / 2) tan)`` and ``tan(right) = L tan / (L + (t / 2) tan)`` with the tangent of the
-    steering angle in the middle, wheelbase L and track t of the kingpins.
+    ``tan(left) = L tan / (L - (t / 2) tan)`` and ``tan(right) = L tan / (L + (t / 2) tan)`` where tan is the tangent of
+    the steering angle in the middle, L the wheelbase and t the distance of the kingpins.
 
     Args:
         steer: Steering angle of a wheel in the middle, rad, positive to the left. (..., 1)
@@ -74,7 +74,7 @@ def ackermann(steer: Array, wheelbase: float, track: float) -> Array:
         track: Distance of the kingpins, m.
 
     Returns:
-        rad. (..., 2)
+        Steering angles of the left and the right wheel, rad. (..., 2)
     """
     tan = jnp.tan(steer)
     top, half = wheelbase * tan, track / 2 * tan

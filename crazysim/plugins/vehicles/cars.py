@@ -36,9 +36,9 @@ from crazysim.trajectories import Trajectory
 CONTROL_FREQ = 50
 """Default rate of the controllers, Hz, lowered to the next divisor of the simulation's rate."""
 SPEED_GAIN = 4.0
-"""Acceleration over the error of speed at the command level ``speed``, 1/s."""
+"""Acceleration per error of the speed at the command level ``speed``, 1/s."""
 SETTLING_TIME = 0.02
-"""Time in which height and tilt of a car follow the ground, s, as with stiff springs."""
+"""Time constant with which height and tilt of a car follow the ground, s, as with stiff springs."""
 
 
 class Cars(Population):
@@ -67,10 +67,11 @@ class Cars(Population):
     reference: Literal["time", "arc"] = "time"
     """``time`` to keep to the timing of the path; ``arc`` to drive at the speed of the path where the car is."""
     index: ArrayLike | None = parameter(default=None)
-    """Number of the path of each car; None for car i path i modulo their number. () or (n_worlds, n_members)"""
+    """Index of each car's path; with None, car i follows path i modulo the number of paths. (), (n_members,) or
+    (n_worlds, n_members)"""
     start: ArrayLike | None = parameter(default=None)
-    """Time at which a car is at the start of its path, s; None for zero, and at equal intervals for the cars of one
-    closed path. () or (n_worlds, n_members)"""
+    """Time at which a car is at the start of its path, s; None for zero, or equal intervals for the cars of one closed
+    path. (), (n_members,) or (n_worlds, n_members)"""
     trailer: bool = False
     """True for cars that tow a trailer."""
     rate: int | None = None
@@ -106,7 +107,7 @@ class Cars(Population):
         return PurePursuit() if self.controller is None else self.controller
 
     def rate_in(self, freq: int) -> int:
-        """Return the rate of the controller in a simulation of a rate, Hz."""
+        """Return the rate of the controller, Hz, in a simulation at ``freq``, Hz."""
         if self.rate is not None:
             return self.rate
         return default_rates(freq, {"rate": CONTROL_FREQ}, f" of {self.name!r}")["rate"]
@@ -244,7 +245,7 @@ class Cars(Population):
 
 
 def _repeat_for_members(record: PyTree | None, counts: tuple[int, int]) -> PyTree | None:
-    """Return a record of one member repeated for all."""
+    """Return the record of one member repeated for all members."""
     return None if record is None else jax.tree.map(lambda x: np.array(np.broadcast_to(x, (*counts, *x.shape))), record)
 
 

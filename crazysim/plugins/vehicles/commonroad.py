@@ -1,4 +1,4 @@
-"""The single-track model of the F1TENTH gym, for results that are to compare with it."""
+"""The single-track model of the F1TENTH gym, for results that can be compared with it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CommonRoadParams(PyTree):
     friction: Array = leaf("parameter", 1, (1,))
     """Friction coefficient, 1. (1,)"""
     stiffness: Array = leaf("parameter", 1, (2,))
-    """Cornering stiffness of front and rear axle over friction and load, 1/rad. (2,)"""
+    """Cornering stiffness of front and rear axle divided by friction and load, 1/rad. (2,)"""
     arms: Array = leaf("parameter", 1, (2,))
     """Distances of front and rear axle from the centre of mass, m. (2,)"""
     height: Array = leaf("parameter", 1, (1,))
@@ -93,7 +93,8 @@ def commonroad_single_track(state: CommonRoadState, command: Array, params: Comm
     acc = limited_acceleration(v, command[..., 1:], p)
     front, rear = p.arms[..., :1], p.arms[..., 1:]
     wheelbase = front + rear
-    # Slip forces over the mass: of an axle of load m (g l -+ a h) / L, friction times stiffness times load times angle.
+    # Slip forces divided by the mass: for an axle of load m (g l -+ a h) / L, friction times stiffness times load times
+    # angle.
     grip_front = p.friction * p.stiffness[..., :1] * (g * rear - acc * p.height) / wheelbase
     grip_rear = p.friction * p.stiffness[..., 1:] * (g * front + acc * p.height) / wheelbase
     is_slow = jnp.abs(v) < KINEMATIC_BELOW

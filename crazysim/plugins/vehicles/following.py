@@ -1,4 +1,4 @@
-"""The protocol of controllers that follow paths, and the part that all have in common: errors and speed."""
+"""Controllers that follow paths: base class with path errors and speed control, pure pursuit, and Stanley's law."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from crazysim.rotation import safe_arctan2, safe_clip
 class PathState(NamedTuple):
     """A vehicle relative to its path at one instant.
 
-    Offset, heading error and curvature refer to the path along the direction in which the vehicle points:
-    of a path that is driven backwards, against its direction.
+    Offset, heading error and curvature refer to the path in the direction in which the vehicle points. If the path is
+    driven backwards, that is opposite to the path's own direction.
     """
 
     path: Path
     """The paths."""
     index: Array
-    """Number of the vehicle's path. ()"""
+    """Index of the vehicle's path. ()"""
     arc: Array
     """Arc length of the projection of the vehicle, m. (1,)"""
     offset: Array
@@ -55,10 +55,10 @@ def path_state(state: CarState, path: Path, index: Array, guess: Array, ahead: A
     Args:
         state: State of the vehicle.
         path: Paths.
-        index: Number of its path. ()
+        index: Index of its path. ()
         guess: Arc length near its projection, m. (1,)
         ahead: Distance from the centre of mass to the point of the vehicle that is projected, forwards, m. (1,)
-        time: Time since the start for a reference by time, s; None for one by arc length. ()
+        time: Time since the start for a reference by time, s; None for a reference by arc length. ()
     """
     heading = jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
     lookahead_pos = state.pos[:2] + ahead * heading
@@ -112,11 +112,11 @@ class PathController:
     backwards: ClassVar[bool] = True
     """True if it can drive backwards."""
     position_gain: float = setting(default=4.0, low=0.0)
-    """Acceleration over the distance from a reference by time, 1/s^2."""
+    """Acceleration per distance from a reference by time, 1/s^2."""
     speed_gain: float = setting(default=4.0, low=0.0)
-    """Acceleration over the error of speed, 1/s."""
+    """Acceleration per error of the speed, 1/s."""
     reference_max: float = setting(default=0.25, low=0.0)
-    """Largest size of the motor reference, in the unit of the vehicle's."""
+    """Largest size of the motor reference, in the unit of the vehicle's motor reference."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make every subclass a frozen dataclass."""
@@ -168,7 +168,7 @@ class PathController:
         raise NotImplementedError(f"{type(self).__name__} does not define steering")
 
     def driving(self, state: CarState, at: PathState, gains: Any, car: CarParams) -> Array:
-        """Return the motor reference that follows the reference speed, and the position of one by time. (1,)"""
+        """Return the motor reference that follows the reference speed, and the position of a reference by time. (1,)"""
         acc = self.position_gain * at.lag + self.speed_gain * (at.speed - state.body_vel[:1])
         return motor_reference(at.speed, acc, car)
 
@@ -182,9 +182,9 @@ class PathController:
 class PurePursuit(PathController):
     """Pure pursuit: the rear axle drives on the circle to a point ahead on the path.
 
-    ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) seen from the rear axle, also backwards.
-    Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. It cuts corners by about the square of
-    the look-ahead distance times the curvature over 6, and needs no gains.
+    ``tan(d) = L 2 y / (x^2 + y^2)`` with the wheelbase L and the point (x, y) relative to the rear axle; the formula
+    also holds backwards. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", 1992. It cuts corners
+    by about the square of the look-ahead distance times the curvature over 6, and needs no gains.
     """
 
     lookahead: float = setting(default=0.3, positive=True)
@@ -201,7 +201,7 @@ class PurePursuit(PathController):
         axle = state.pos[:2] - car.rear * jnp.concatenate([jnp.cos(state.yaw), jnp.sin(state.yaw)])
         offset = to_world_frame(-state.yaw, goal - axle)
         square = offset[:1] * offset[:1] + offset[1:] * offset[1:]
-        # Past the end of an open path the point is that end, as near as one likes.
+        # Past the end of an open path the goal is that end, whose distance may be arbitrarily small.
         curvature = 2 * offset[1:] / jnp.maximum(square, 0.25 * self.lookahead * self.lookahead + 1e-4)
         return jnp.arctan((car.front + car.rear) * curvature), memory
 

@@ -10,7 +10,7 @@ from crazysim.plugins.vehicles.car_state import CarState
 from crazysim.plugins.vehicles.single_track import drive_force, state_rates, steer_rate
 
 RETURN_RATE = 50.0
-"""Rate at which velocities that no rolling wheels allow decrease, 1/s."""
+"""Rate at which velocities that are incompatible with rolling wheels decay, 1/s."""
 
 
 def kinematic(state: CarState, command: Array, params: CarParams, push: Array | None = None) -> CarState:
@@ -18,14 +18,14 @@ def kinematic(state: CarState, command: Array, params: CarParams, push: Array | 
 
     The yaw rate is ``w = v_x tan(d) / L`` and the velocity of the centre of mass to the left ``l_r w`` (Rajamani,
     "Vehicle Dynamics and Control", 2012, section 2.2). Along the vehicle the drive, limited by the grip, and external
-    forces accelerate it; those across it are taken by the wheels.
+    forces accelerate it; the wheels balance forces across it.
 
     Args:
         state: State.
         command: Motor reference, 1, and steering angle, rad. (..., 2)
         params: Parameters.
         push: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None for
-            none. (..., 3)
+            no external force. (..., 3)
     """
     p, speed, wheelbase = params, state.body_vel[..., :1], params.front + params.rear
     drive, grip = drive_force(command[..., :1], speed, p), p.grip[..., :1] + p.grip[..., 1:]

@@ -27,7 +27,7 @@ aiml_virtual/controller/car_lpv_controller.py."""
 LONGITUDINAL_GAINS = ((0.0010, -0.0132, 0.4243), (-0.0044, 0.0563, 0.0959))
 """Gains of distance and speed as polynomials of the model's parameter p, highest power first. Sources: the same."""
 RATE, INTEGRAL_MAX, SMOOTHING = 40, 0.1, 0.5
-"""Rate of the controller for which the integral's gain is, Hz, limit of the integral, m, and weight of the newest
+"""Rate of the controller to which the integral's gain refers, Hz, limit of the integral, m, and weight of the newest
 difference in the rate of the offset. Sources: the same."""
 
 
@@ -35,7 +35,7 @@ class LPVGains(PyTree):
     """Gains of ``LPV``."""
 
     feedforward: Array = leaf("parameter", 1, (1,))
-    """Steering angle over signed curvature, rad m. (1,)"""
+    """Steering angle per signed curvature, rad m. (1,)"""
     period: Array = leaf("parameter", 1, (1,))
     """Period of the controller, s. (1,)"""
 
@@ -65,7 +65,7 @@ class LPV(PathController):
     v)``.
 
     Gains and feed-forward f are published (``LATERAL_GAINS``, ``LONGITUDINAL_GAINS``). The lab's curvature has no sign,
-    which steers the wrong way in one direction of turning; here it has. Forwards only, for the F1TENTH cars.
+    which steers the wrong way in one direction of turning; here it has one. Forwards only, for the F1TENTH cars.
     """
 
     backwards: ClassVar[bool] = False

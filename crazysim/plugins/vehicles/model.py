@@ -78,7 +78,7 @@ KEYS: dict[str, Key] = {
 }
 """Shapes and ranges of all numbers, by table and key."""
 OPTIONAL_KEYS = ("tyres.front", "tyres.rear", "drive.", "trailer.")
-"""Beginnings of the keys that a vehicle may lack; ``drive`` needs its force or its torque."""
+"""Prefixes of the keys that a vehicle may lack; ``drive`` needs its force or its torque."""
 LAYOUT = Layout(KEYS, ("name", "base", "model", "sources"), GUIDE)
 """Keys of vehicles."""
 
@@ -145,7 +145,7 @@ def load_vehicle(source: VehicleSource) -> VehicleModel:
 
 
 def _load_model(source: Any, bases: tuple[str, ...]) -> VehicleModel:
-    """Return the vehicle model of a source, which is the base of others."""
+    """Return the vehicle model of a source, which is the base of the sources ``bases``."""
     if isinstance(source, VehicleModel):
         return source
     bases = extend_bases(bases, source)

@@ -22,23 +22,23 @@ from crazysim.trajectories.trajectory import Trajectory
 MAX_PIECE_LENGTH = 0.1
 """Largest length of a piece of a path, m."""
 MAX_PIECES = 100_000
-"""Most pieces of a path."""
+"""Largest number of pieces of a path."""
 N_SAMPLES = 8193
-"""Samples of a curve from which its arc length is measured, by the trapezoidal rule."""
+"""Number of samples of a curve from which its arc length is integrated, by the trapezoidal rule."""
 N_TIMES = 257
-"""Samples of the arc length over time."""
+"""Number of samples of the arc length as a function of time."""
 NEWTON_STEPS = 2
-"""Newton steps of a projection, which begins where the tick before ended."""
+"""Number of Newton steps of a projection, which begins at the result of the previous tick."""
 MAX_NEWTON_STEP = 0.5
 """Largest displacement in one Newton step, m."""
 STOPPING_LENGTH = 0.5
 """Length before the end of an open path in which a reference by arc length slows down, m."""
 MIN_SPEED_SHARE = 0.1
-"""Least speed of a reference by arc length, as a share of the path's largest: one must leave a start at rest."""
+"""Smallest speed of a reference by arc length, as a share of the path's largest, so that a vehicle at rest starts."""
 STRAIGHT_RATE = 0.05
-"""Rate of a curve, of its largest, below which its path is straight."""
+"""Rate of a curve, as a share of its largest rate, below which its path is treated as straight."""
 N_REPEATED_POINTS = 12
-"""Points of a closed path that are repeated on both sides, so that its spline is smooth where it closes."""
+"""Number of points of a closed path that are repeated at both ends, so that its spline is smooth where it closes."""
 
 Floats = NDArray[np.float64]
 
@@ -62,8 +62,8 @@ class Path(PyTree):
     """
 
     coefficients: Array = leaf("shared", 4)
-    """Coefficients of x and y, m, in each piece, constant term first, of the share of the piece's length. Padding
-    repeats the last piece. (n_paths, n_pieces, 2, 6)"""
+    """Coefficients of x and y, m, in each piece, constant term first; the argument is the share of the piece's length.
+    Padding repeats the last piece. (n_paths, n_pieces, 2, 6)"""
     length: Array = leaf("shared", 1)
     """Length of each path, m. (n_paths,)"""
     spacing: Array = leaf("shared", 1)
@@ -101,7 +101,7 @@ class Path(PyTree):
         It is the spline of degree 5 over the length of the chords.
 
         Args:
-            points: Points, x and y, world frame, m; of a closed path without the first one again. (n_points, 2)
+            points: Points, x and y, world frame, m; a closed path does not repeat the first one. (n_points, 2)
             speed: Speed, m/s; negative to drive backwards.
             closed: True for a path that ends at its start.
         """
@@ -161,11 +161,11 @@ class Path(PyTree):
 
     @property
     def goes_backwards(self) -> bool:
-        """True if a path is driven backwards; on the host."""
+        """True if any path is driven backwards; computed on the host."""
         return bool(np.any(np.asarray(self.speeds) < 0))
 
     def at(self, index: Array | int, s: Array) -> PathPoint:
-        """Return a path at an arc length; a closed one continues from its start, an open one stays at its ends.
+        """Return the point of a path at an arc length; closed paths start again, open ones stay at their ends.
 
         Args:
             index: Number of the path. ()
@@ -182,9 +182,9 @@ class Path(PyTree):
         return (share * _entry_at(self.speeds, index, piece))[None]
 
     def time_reference(self, index: Array | int, t: Array) -> tuple[Array, Array]:
-        """Return the arc length, m, and the speed, m/s, at a time; before the start and after the end at rest.
+        """Return the arc length, m, and the speed, m/s, at a time; at rest before the start and after the end.
 
-        On a closed path the arc length increases with every round, and the motion continues.
+        On a closed path the motion continues, and the arc length increases with every lap.
 
         Args:
             index: Number of the path. ()
@@ -209,10 +209,10 @@ class Path(PyTree):
         return (s + rounds * _entry_at(self.length, index))[None], (sign * v)[None]
 
     def project(self, index: Array | int, pos: Array, guess: Array) -> Array:
-        """Return the arc length of the point of a path next to a position, from a guess nearby; within a step.
+        """Return the arc length of the point of a path nearest to a position, from a guess nearby; compiled.
 
         Newton's method, whose steps ``(p - r) . t / (1 - curvature e)`` are limited to ``MAX_NEWTON_STEP``. On a closed
-        path the arc length increases with every round.
+        path the arc length increases with every lap.
 
         Args:
             index: Number of the path. ()
@@ -235,7 +235,7 @@ class Path(PyTree):
         return s
 
     def nearest(self, index: int, pos: ArrayLike) -> float:
-        """Return the arc length of the point of a path next to a position, anywhere on it, on the host.
+        """Return the arc length of the sampled point of a path nearest to a position, anywhere on it, on the host.
 
         Args:
             index: Number of the path.
@@ -260,7 +260,7 @@ class Path(PyTree):
         return np.asarray(point.pos, float), float(np.arctan2(y, x)), float(arc[0])
 
     def _locate(self, index: Array | int, s: Array) -> tuple[Array, Array]:
-        """Return the piece at an arc length, and the share of its length."""
+        """Return the piece at an arc length, and the position in it as a share of its length."""
         length, spacing = _entry_at(self.length, index), _entry_at(self.spacing, index)
         wrapped = s - length * lax.floor(s / length)
         local = jnp.where(_entry_at(self.closed, index), wrapped, safe_clip(s, 0.0, length)) / spacing
@@ -293,7 +293,7 @@ def _path_of_curve(
     """Return a path of one slot.
 
     Args:
-        curve: Parameters (n,) and the order of a derivative to x and y. (n, 2)
+        curve: Function from parameters (n,) and the order of a derivative to x and y. (n, 2)
         times: Parameters, equally spaced. (n,)
         rate: Length of the derivative there. (n,)
         progress: Arc length and its rate over time. (n_times, 2)
@@ -357,5 +357,5 @@ def _evaluate(coefficients: Array, u: Array) -> PathPoint:
 
 
 def _entry_at(x: Array, *index: Array | int) -> Array:
-    """Return an entry of an array; an index that is too large or too small means the last or first one."""
+    """Return an entry of an array; an index that is out of range is clipped to the last or first one."""
     return jnp.asarray(x).at[index].get(mode="clip", wrap_negative_indices=False)

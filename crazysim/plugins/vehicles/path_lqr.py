@@ -25,18 +25,18 @@ from crazysim.pytree import PyTree, as_parameter, leaf
 from crazysim.rotation import safe_clip
 
 SPEED_STEP, N_SPEEDS = 0.25, 24
-"""Distance of the speeds for which there are gains, m/s, and their number: the gains hold up to 6 m/s."""
+"""Interval between the speeds in the table of gains, m/s, and their number: the table extends to 6 m/s."""
 
 N_SQUARINGS = 14
-"""Squarings of the matrix exponential."""
+"""Number of squarings in the matrix exponential."""
 
 
 class PathLQRGains(PyTree):
-    """Gains of ``PathLQR`` over the speed."""
+    """Gains of ``PathLQR`` as a function of the speed."""
 
     table: Array = leaf("shared", 3)
-    """Gains of offset, sideways velocity, heading error and yaw rate, and the steering angle over curvature, for
-    speeds from ``SPEED_STEP`` in steps of that, forwards and backwards. (2, N_SPEEDS, 5)"""
+    """Gains of offset, sideways velocity, heading error and yaw rate, and the steering angle per curvature, for speeds
+    from ``SPEED_STEP`` in steps of ``SPEED_STEP``, forwards and backwards. (2, N_SPEEDS, 5)"""
 
 
 class PathLQR(PathController):
@@ -56,7 +56,7 @@ class PathLQR(PathController):
         """Return the gains, computed in float64.
 
         Raises:
-            ConfigError: If no gain stabilises the vehicle, or a weight has another shape.
+            ConfigError: If no gain stabilises the vehicle, or a weight has the wrong shape.
         """
         speeds = SPEED_STEP * np.arange(1, N_SPEEDS + 1) * np.array([[1.0], [-1.0]])
         Q, R = weight_matrix("Q", self.Q, 4), weight_matrix("R", [self.R], 1)
@@ -100,7 +100,7 @@ def lateral_gains(
     discrete = matrix_exponential(block * period)  # the input is held for a period
     K = gain_discrete(discrete[:4, :4], discrete[:4, 4:], Q, R)[0]
     # Steady cornering of curvature 1: the yaw rate is the speed, and sideways velocity and steering angle balance it.
-    # Of vehicles without slip the two equations are multiples of the tangent of the steering angle, and still regular.
+    # For vehicles without slip the two equations are multiples of the tangent of the steering angle, and still regular.
     rows = jnp.array([1, 3])
     balance = jnp.stack([A[rows, 1], B[rows, 0]], axis=1)
     side, steer = jnp.linalg.solve(balance, -A[rows, 3] * speed)

@@ -76,7 +76,7 @@ def single_track(state: CarState, command: Array, params: CarParams, push: Array
         command: Motor reference, 1, and steering angle, rad. (..., 2)
         params: Parameters.
         push: External force forwards and to the left, N, and torque about the vertical axis, N m, body frame; None for
-            none. (..., 3)
+            no external force. (..., 3)
     """
     p, vx, vy, w = params, state.body_vel[..., :1], state.body_vel[..., 1:], state.yaw_rate
     drive = drive_force(command[..., :1], vx, p)

@@ -1,4 +1,4 @@
-"""Starts of cars: in a row, at given positions, or along their paths."""
+"""Initial poses of cars: in a row, at given positions, or along their paths."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def row_positions(n: int) -> NDArray:
 
 
 def member_array(name: str, value: ArrayLike, counts: tuple[int, int], core: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return positions or headings for all cars, or for each, checked. (..., *core)
+    """Return checked positions or headings, one for all cars or one per car. (..., *core)
 
     Args:
         name: Name of the setting, for errors.
@@ -41,7 +41,7 @@ def member_array(name: str, value: ArrayLike, counts: tuple[int, int], core: tup
 
 
 def member_numbers(name: str, value: ArrayLike, counts: tuple[int, int], n: int | None = None) -> NDArray:
-    """Return a number for all cars, (1,), or for each, (n_worlds, n_members, 1).
+    """Return one number for all cars, (1,), or one per car, (n_worlds, n_members, 1).
 
     Args:
         name: Name of the setting, for errors.
@@ -95,7 +95,8 @@ def project_arcs(paths: Any, index: Any, pos: NDArray, arc: NDArray) -> NDArray:
         paths: Paths.
         index: Index of each car's path. (1,) or (n_worlds, n_members, 1)
         pos: Positions of the cars, m. (n_worlds, n_members, 2)
-        arc: References, m: on closed paths the result is in the round nearest to them. (n_worlds, n_members, 1)
+        arc: Reference arc lengths, m; on closed paths the result is in the lap nearest to them.
+            (n_worlds, n_members, 1)
     """
     index, projections = np.broadcast_to(index, arc.shape), np.empty_like(arc)
     for member in np.ndindex(arc.shape[:2]):
