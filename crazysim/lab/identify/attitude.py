@@ -1,4 +1,4 @@
-"""Fits of the models ``so_rpy`` to logs with attitude commands."""
+"""Fits of the ``so_rpy`` models to logs with attitude commands."""
 
 from __future__ import annotations
 
@@ -48,7 +48,10 @@ class FittedModel(PyTree):
         return FittedModel(params if mass is None else params.replace(mass=jnp.asarray([mass], jnp.float32)))
 
     def prepared(self, log: Log) -> Log:
-        """Return the log with attitudes relative to the first 0.1 s, and the lagged thrust as its rotor speeds."""
+        """Return the log with attitudes relative to the first 0.1 s, and the thrust in place of the rotor speeds.
+
+        The thrust is lagged if the model has ``thrust_dyn_coef``.
+        """
         columns = _columns(log)
         thrust = columns["cmd_f"]
         if self.params.thrust_dyn_coef is not None:
@@ -78,7 +81,7 @@ class FittedModel(PyTree):
 
 
 def _columns(log: Log) -> dict[str, NDArray]:
-    """Return a log under Crazyflow's names."""
+    """Return the columns of a log by Crazyflow's names."""
     cmd = log.attitude_command
     if cmd is None:
         raise ConfigError(
@@ -98,7 +101,7 @@ def _columns(log: Log) -> dict[str, NDArray]:
 def identify_attitude(
     logs: Sequence[Log], airframe: str | Path, dynamics: str, source: str, *, mass: float | None = None
 ) -> tuple[Airframe, str]:
-    """Return an airframe with a fitted model of logs with attitude commands, and its TOML file.
+    """Return an airframe with a model fitted to logs with attitude commands, and the text of its TOML file.
 
     Args:
         logs: Logs with ``attitude_command`` that begin in hover, without gaps.

@@ -1,4 +1,4 @@
-"""ROS bags as tables of columns at equal times."""
+"""ROS bags as tables of columns that share their times."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ POSES = {
     "geometry_msgs/msg/TransformStamped": ("transform/translation", "transform/rotation"),
     "geometry_msgs/msg/Pose": ("position", "orientation"),
 }
-"""Fields of position and attitude by type of message, most informative first."""
+"""Fields of position and attitude by message type, most informative first."""
 ROTORS = {"actuator_msgs/msg/Actuators": "velocity", "mav_msgs/msg/Actuators": "angular_velocities"}
-"""Fields of rotor speeds, rad/s, by type of message."""
+"""Fields of rotor speeds, rad/s, by message type."""
 
 MAX_METADATA = 2**24
 """Largest ``metadata.yaml``, bytes."""
@@ -48,7 +48,7 @@ class _BagFile(io.BufferedReader):
 
 
 class _BagPath(type(Path())):
-    """Path whose files are read within bounds."""
+    """Path whose files are opened as ``_BagFile``, and whose text has at most ``MAX_METADATA`` bytes."""
 
     def open(self, *args: Any, **kwargs: Any) -> Any:
         """Open the file for reading."""
@@ -70,15 +70,21 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
     """Return the columns of a bag of ROS 1 or 2, interpolated at the times of the fastest topic.
 
     A name such as ``/drone/odom/pose/pose/position/x`` or ``/motors/data[0]`` is a topic and a field of its messages.
-    Without such names, the columns are named as in crazysim's logs: position and attitude of the only topic of a type
-    in ``POSES``; the twist of Odometry, which is in the frame of the body (nav_msgs/Odometry), with the velocity
-    turned to the world; the angular velocity of the only Imu, which precedes; and rotor speeds of the only Actuators,
-    rad/s (actuator_msgs, mav_msgs). Units are SI (REP 103). Times come from the headers, or else from the bag.
+    Without such names, topics are chosen by message type, and the columns are named as in crazysim's logs:
+
+    - Position and attitude come from the topic of the first type in ``POSES`` that the bag has. Odometry also gives
+      velocity and angular velocity. They are in the body frame (nav_msgs/Odometry), and the velocity is rotated to the
+      world frame.
+    - The angular velocity of an Imu replaces the angular velocity of Odometry.
+    - Rotor speeds come from Actuators, rad/s (actuator_msgs, mav_msgs), and are converted to rpm.
+
+    Several topics of the chosen type are an error. Units are SI (REP 103). Times come from the headers, or else from
+    the bag.
 
     Args:
         path: File ``.bag``, ``.mcap`` or ``.db3``, or folder with ``metadata.yaml``.
         repairs: List that descriptions of repairs are appended to.
-        wanted: Names of the columns.
+        wanted: Names of the columns; None for the default ones.
 
     Raises:
         ConfigError: If a topic or a field is missing, or topics are ambiguous.
@@ -107,7 +113,7 @@ def read_bag(path: Path, repairs: list[str], wanted: Columns | None = None) -> d
 
 
 def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
-    """Return topic and field of a column."""
+    """Return the topic and the field of a column."""
     fitting = [topic for topic in topics if column.startswith(f"{topic}/")]
     if not fitting:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
@@ -120,7 +126,7 @@ def _split(name: str, column: str, topics: dict[str, str]) -> tuple[str, str]:
 
 
 def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
-    """Return topics and fields of the columns that follow from the types of messages."""
+    """Return the topic and the field of each column, chosen by message type."""
 
     def only(kinds: Sequence[str]) -> tuple[str, str] | None:
         for kind in kinds:
@@ -157,7 +163,7 @@ def _default(name: str, topics: dict[str, str]) -> dict[str, tuple[str, str]]:
 
 
 def _stream(name: str, bag: Any, topic: str, kind: str, fields: dict[str, str]) -> Stream:
-    """Return the messages of a topic."""
+    """Return the messages of a topic as a stream."""
     get = {column: _getter(field) for column, field in fields.items()}
     times, rows = [], []
     for connection, stamp, raw in bag.messages([c for c in bag.connections if c.topic == topic]):
@@ -199,7 +205,7 @@ def _getter(field: str) -> Callable[[Any], Any]:
 
 
 def _turned(stream: Stream) -> Stream:
-    """Return the stream with velocities turned from the body to the world, where it has them."""
+    """Return the stream with its velocity, if it has one, rotated from the body frame to the world frame."""
     c = stream.columns
     if "vx" not in c:
         return stream

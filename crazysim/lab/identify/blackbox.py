@@ -16,11 +16,11 @@ from crazysim.lab.identify.readers import decimate
 POLES = 14
 """Magnetic poles of the motors where the file does not state ``motor_poles``: Betaflight's default."""
 HEADER_WITHIN = 1000
-"""Lines within which the names of the columns stand, after the settings that the Blackbox Explorer writes first."""
+"""Number of lines in which the column names are sought; the Blackbox Explorer writes settings before them."""
 
 
 def header_of(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
-    """Return number and cells of the line that names the columns, and the settings before it; None for other files."""
+    """Return the index and cells of the line of column names, and the settings before it; None if there is none."""
     settings: dict[str, str] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in zip(range(HEADER_WITHIN), file, strict=False):
@@ -32,23 +32,23 @@ def header_of(path: Path) -> tuple[int, list[str], dict[str, str]] | None:
 
 
 def read_blackbox(path: Path, repairs: list[str]) -> dict[str, NDArray]:
-    """Return the columns of a blackbox log in the names of crazysim's logs, at 250 Hz at most.
+    """Return the columns of a blackbox log by the names of crazysim's logs, at 250 Hz at most.
 
-    ``wx``, ``wy``, ``wz``, body axes forward, left, up; ``rpm1`` to ``rpmN`` where bidirectional DSHOT was on, in
-    Betaflight's order; ``command1`` to ``commandN``, the outputs to the motors; ``voltage``; and ``qx`` to ``qw`` where
-    the log has ``imuQuaternion``. Position and velocity are not in such logs.
+    The columns are ``wx``, ``wy``, ``wz`` about the body axes forward, left, up; ``rpm1`` to ``rpmN``, in Betaflight's
+    order, if bidirectional DSHOT was on; ``command1`` to ``commandN``, the outputs to the motors; ``voltage``; and
+    ``qx`` to ``qw`` if the log has ``imuQuaternion``. Blackbox logs have no position and no velocity.
 
     Units are as in the Blackbox Explorer (betaflight/blackbox-log-viewer, flightlog_fields_presenter.js): degrees/s
-    for ``gyroADC``, ten times as much with ``blackbox_high_resolution``; 100 electrical rpm for ``eRPM``; 0.01 V for
-    ``vbatLatest``, and V where blackbox_decode names the unit; microseconds for the time. Axes follow from Betaflight's
-    src/main/flight/imu.c, whose yaw is negative where the rotation about body z is positive.
+    for ``gyroADC``, or 0.1 degrees/s with ``blackbox_high_resolution``; 100 electrical rpm for ``eRPM``; 0.01 V for
+    ``vbatLatest``; microseconds for the time. Units that blackbox_decode names in the header take precedence. Axes
+    follow from Betaflight's src/main/flight/imu.c, whose yaw is negative where the rotation about body z is positive.
 
     Args:
         path: File.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
-        ConfigError: If columns are missing, or most rows are damaged.
+        ConfigError: If columns are missing, or too many rows are damaged.
     """
     header = header_of(path)
     if header is None:

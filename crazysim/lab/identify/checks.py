@@ -1,4 +1,4 @@
-"""Checks that the columns of a log describe one motion: units, axes, signs and order follow from mechanics."""
+"""Checks that the columns of a log obey mechanics, which reveals wrong units, axes, signs and orders."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ if TYPE_CHECKING:
     from crazysim.lab.identify.logs import Log
 
 RATIOS = (0.5, 2.0)
-"""Ratios of measured to expected motion that count as agreement, on each axis that moves. Of the logs of two public
-benchmarks none is outside of 0.6 to 1.3: delays between streams, drag and noise leave that."""
+"""Ratios of measured to expected motion that count as agreement, on each axis that moves. In the logs of two
+public benchmarks, delays between streams, drag and noise give 0.6 to 1.3."""
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "feet": 0.3048}
-"""Units of positions, and with /s of velocities, in m."""
+"""Units of positions, in m. Velocities have these units per second."""
 DIVERGED_ERROR = 10.0
-"""Error of a rate over the motion from which it counts as diverged: in those logs below 4 or above 30."""
+"""Ratio of error to motion above which a rate counts as diverged. In the logs of those benchmarks it is below 4 or
+above 30."""
 MIN_TURN_RATE = 0.01
 """Standard deviation of roll and pitch rates below which nothing can be fitted, rad/s: the noise of a gyroscope
-(BMI088, 0.014 degrees/s over the root of Hz) gives 0.003 rad/s at 250 Hz."""
+(BMI088, 0.014 degrees/s/sqrt(Hz)) gives 0.003 rad/s at 250 Hz."""
 MIN_SPAN = 0.3
 """Span of the position below which the drone counts as resting, m. The estimator of a resting drone drifts."""
 PIECE_DURATION = 2.0
@@ -37,19 +38,22 @@ PIECE_DURATION = 2.0
 
 
 class Pair(NamedTuple):
-    """Changes over windows of equal duration that must be equal."""
+    """Measured and expected changes over windows of equal duration, which must agree."""
 
     what: str
-    """Property of the columns that makes them equal."""
+    """Property of the columns that makes them agree."""
     measured: NDArray
     """Measured changes. (n, 3)"""
     expected: NDArray
     """Changes that follow from other columns. (n, 3)"""
     floor: float
-    """Change below which an axis does not move, in the unit of the changes."""
+    """Change below which an axis counts as not moving, in the unit of the changes."""
 
     def sizes(self) -> NDArray:
-        """Return medians of measured and expected changes where the expected ones are largest, and positive. (3, 2)"""
+        """Return the medians of measured and expected changes on each axis, zero for axes that do not move. (3, 2)
+
+        They are over the quarter of the windows with the largest expected changes, with signs that make these positive.
+        """
         sizes = np.zeros((3, 2))
         for k, (x, y) in enumerate(zip(self.measured.T, self.expected.T, strict=True)):
             is_large = np.abs(y) >= np.quantile(np.abs(y), 0.75)
@@ -59,7 +63,7 @@ class Pair(NamedTuple):
         return sizes
 
     def ratios(self) -> NDArray:
-        """Return the ratio of both on each axis, NaN for axes that do not move. (3,)"""
+        """Return the ratio of measured to expected changes on each axis, NaN for axes that do not move. (3,)"""
         along, size = self.sizes().T
         return np.divide(along, size, out=np.full(3, np.nan), where=size > 0)
 
@@ -83,7 +87,7 @@ def check_motion(
         name: Name of the log, for messages.
         t: Time, s. (n,)
         data: Columns by field of ``Columns``, in the units of a log.
-        derived: Fields that were not measured but differentiated; the attitude, if it was given as angles.
+        derived: Fields that were differentiated, not measured; also ``quat`` if the attitude was given as angles.
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
@@ -126,7 +130,7 @@ def check_motion(
 
 
 def check_turning(logs: Sequence[Log]) -> None:
-    """Check that some log turns about the x and y axes, so that a rotation can be fitted to it."""
+    """Check that the logs turn enough about the x and y axes for a fit of the rotation."""
     rates = np.max([np.std(log.ang_vel[:, :2], axis=0) for log in logs], axis=0, initial=0.0)
     if np.any(rates < MIN_TURN_RATE):
         raise ConfigError(
@@ -136,7 +140,7 @@ def check_turning(logs: Sequence[Log]) -> None:
 
 
 class Law(NamedTuple):
-    """A law of mechanics, in a log."""
+    """Result of checking a law of mechanics in a log."""
 
     fault: str
     """Description of the violation; empty for none."""
@@ -145,7 +149,7 @@ class Law(NamedTuple):
 
 
 def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> list[Law]:
-    """Return the laws that the columns must follow."""
+    """Check the laws that the columns must obey."""
     up, problem = float(np.median(_thrust_axis(data["quat"])[:, 2])), "a thrust that points up in most samples, got"
     laws = [Law("" if up > 0 else f"{problem} {up:.2f} as the median of its z component", True)]
     for pair in (*(pair for pair, _ in _rates(t, data, derived)), _thrust(t, data)):
@@ -157,7 +161,7 @@ def _laws(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> 
 
 
 def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[Pair, int]]:
-    """Yield each measured rate with the changes of its integral, and the samples of a window."""
+    """Yield a pair of changes for each measured rate, and the samples per window."""
     if "vel" not in derived:
         width, (change, expected) = _changes(t, 0.2, data["pos"], integral(data["vel"], t))
         yield Pair("a velocity that moves the position", change, expected, 0.01), width
@@ -171,9 +175,9 @@ def _rates(t: NDArray, data: Mapping[str, NDArray], derived: tuple[str, ...]) ->
 def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
     """Return measured changes of the acceleration, and expected ones from attitude, rotor speeds and gravity.
 
-    The thrust over the mass is proportional to the squares of the speeds, with the weight as its median along z;
-    without speeds it balances the weight. Changes between windows leave out constant accelerations, such as the drag of
-    a cruise.
+    The thrust is proportional to the sum of the squared rotor speeds, scaled so that the median of its vertical
+    component is the weight. Without rotor speeds, its vertical component is the weight, unless the tilt is large.
+    Constant accelerations, such as from drag in cruise, cancel in the difference between consecutive windows.
     """
     axis = _thrust_axis(data["quat"])
     if data["rotor_vel"].shape[1]:
@@ -191,12 +195,12 @@ def _thrust(t: NDArray, data: Mapping[str, NDArray]) -> Pair:
         return Pair("", np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
     measured, expected = ((x[width:] - x[:-width])[air] for x in (measured, expected))
     if not data["rotor_vel"].shape[1]:
-        measured = measured * [1, 1, 0]  # Nothing is expected of z without speeds.
+        measured = measured * [1, 1, 0]  # Without speeds, changes along z are not predicted.
     return Pair("accelerations that follow from thrust and gravity", measured, expected, 0.1)
 
 
 def _changes(t: NDArray, duration: float, *series: NDArray) -> tuple[int, list[NDArray]]:
-    """Return the samples of a window, and the changes of series over all windows, zero where a window crosses a gap."""
+    """Return the samples per window, and the changes of series over all windows; zero for windows across a gap."""
     dt = float(np.median(np.diff(t)))
     width = min(max(1, round(duration / dt)), len(t) - 1)
     whole = t[width:] - t[:-width] < 1.5 * width * dt
@@ -214,13 +218,13 @@ def _diverged_windows(pair: Pair, size: int) -> NDArray:
 
 
 def _thrust_axis(quat: NDArray) -> NDArray:
-    """Return the z axis of the body in the world. (n, 3)"""
+    """Return the z axis of the body in the world frame. (n, 3)"""
     x, y, z, w = quat.T
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
 def _alternatives(data: Mapping[str, NDArray], derived: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, NDArray]]]:
-    """Yield the correction of each common mistake, and the columns after it."""
+    """Yield the remedy for each common mistake as text, and the columns after it."""
 
     def scaled(**factors: float | Sequence[float]) -> Mapping[str, NDArray]:
         return {**data, **{key: data[key] * np.asarray(x) for key, x in factors.items()}}

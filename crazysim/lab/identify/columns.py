@@ -25,8 +25,8 @@ NAME_ORDERS = {
 class Columns:
     """Names of a log's columns; ``-`` before a name changes the sign.
 
-    A log may lack columns of velocity and angular velocity, which are then differentiated; rotor speeds, commands and
-    voltage.
+    Velocity, angular velocity, rotor speeds, commands and voltage are optional. A missing velocity or angular velocity
+    is computed by differentiation.
     """
 
     pos: tuple[str, ...] = ("x", "y", "z")
@@ -40,9 +40,9 @@ class Columns:
     ang_vel: tuple[str, ...] = ("wx", "wy", "wz")
     """Angular velocity, body frame, rad/s."""
     rotor_vel: tuple[str, ...] = ("rpm1", "rpm2", "rpm3", "rpm4")
-    """Rotor speeds in the order of the airframe's rotors."""
+    """Rotor speeds, rpm, in the order of the airframe's rotors."""
     command: tuple[str, ...] = ("command1", "command2", "command3", "command4")
-    """Commands of the rotors in the order of the airframe's rotors, in any unit if their speeds were measured."""
+    """Commands of the rotors in the order of the airframe's rotors, in any unit if rotor speeds were measured."""
     attitude_command: tuple[str, ...] = ("roll_command", "pitch_command", "yaw_command", "thrust_command")
     """Commanded roll, pitch and yaw, rad, and collective thrust, N."""
     voltage: tuple[str, ...] = ("voltage",)
@@ -50,7 +50,7 @@ class Columns:
     time: str = "t"
     """Time, s."""
     seconds_per_unit: float = 1.0
-    """Factor from the logged times to s, of tables: other files state their unit."""
+    """Factor from the logged times to s. It applies to tables only; other files state their unit."""
     metres_per_unit: float = 1.0
     """Factor from the logged positions to m."""
     speed_per_unit: float = 1.0
@@ -110,8 +110,8 @@ KNOWN_COLUMNS = {
         share_per_command=1 / 65535,
     ),
 }
-"""Columns of known logs: the default names, IDSIA's benchmark, also as its repository's ``.csv`` files name them, and
-NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
+"""Columns of known logs: the default names; IDSIA's benchmark, also with the names in its repository's ``.csv`` files;
+and NanoBench (arXiv 2603.09908; commands of the motors, 0 to 65535, but no rotor speeds)."""
 MAX_NUMBER = 1e20
 """Largest number of a log; times in ns since 1970 are 2e18."""
 OPTIONAL_FIELDS = ("vel", "ang_vel", "rotor_vel", "command", "attitude_command", "voltage")
@@ -172,9 +172,9 @@ def missing_columns(table: Mapping[str, NDArray], columns: Columns) -> list[str]
 
 
 def with_rotor_count(table: Mapping[str, NDArray], columns: Columns) -> Columns:
-    """Return the columns with as many rotors as a log has, such as ``rpm1`` to ``rpm6``, where their names are default.
+    """Return the columns with default rotor names extended to the rotors of a log, such as ``rpm1`` to ``rpm6``.
 
-    Logs of fewer rotors than four are left to the check for missing columns.
+    Logs with fewer than four rotors are left to ``missing_columns``.
     """
     sized = {}
     for key in ("rotor_vel", "command"):

@@ -1,4 +1,4 @@
-"""Rows and numbers of text files whose cells are parted by commas."""
+"""Rows and numbers of text files whose cells are separated by commas."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 MAX_COLUMNS = 10_000
 """Most columns of a file."""
 MAX_TEXT = 40
-"""Most characters that are kept of a cell without a number."""
+"""Most characters that are kept from a cell without a number."""
 
 
 def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
@@ -27,7 +27,7 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
-        ConfigError: If the first line has no names, or most rows have another number of cells.
+        ConfigError: If the first line has no names, or too many rows have another number of cells.
     """
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         header, *lines = [*file] or [""]
@@ -55,12 +55,12 @@ def read_delimited(path: Path, repairs: list[str]) -> dict[str, NDArray]:
 def split_rows(
     name: str, lines: Iterable[str], width: int, first: int, repairs: list[str], remedy: str
 ) -> list[list[str]]:
-    """Return the cells of the rows that have as many as the header; a few others are dropped.
+    """Return the cells of the rows with as many cells as the header; up to ``MAX_REPAIRED_SHARE`` others are dropped.
 
     Args:
         name: Name of the file, for messages.
         lines: Lines after the header.
-        width: Number of cells.
+        width: Number of cells in the header.
         first: Number of the first of these lines in the file, from 1.
         repairs: List that descriptions of repairs are appended to.
         remedy: Last sentence of the error.
@@ -91,7 +91,7 @@ def parse_number(text: str) -> float:
 
 
 def _column(cells: Sequence[str]) -> NDArray:
-    """Return numbers, NaN where a cell has none; the text if most cells have none."""
+    """Return the numbers of a column, NaN where a cell has none; its text unless most cells have finite numbers."""
     try:
         return np.array(cells, np.float64)
     except ValueError:

@@ -38,12 +38,13 @@ WINDOW_DURATION = 0.5
 """Duration of the windows over which forces and torques change the velocities, s."""
 SLOW_CORNER = 0.2
 """Standard deviation of delays for slow torques, samples. In simulated flights at 100 Hz whose commands change at
-samples, torques per velocity were off as by a delay of 0.4 to 0.5 samples, whose cause is unknown."""
+samples, torques per velocity had the errors that a delay of 0.4 to 0.5 samples would cause, for an unknown reason."""
 MAX_FACTOR = 10.0
-"""Factor of the airframe's curves and moments from which a fit is an error. At the rotor speeds of hover, which are
-checked, a thrust factor stays below 2.5 squared times the factor of the mass."""
+"""Largest factor of the airframe's curves and moments; a fit with a larger one is an error. Rotor speeds are checked to
+be near hover, so a thrust factor stays below 2.5 squared times the factor of the mass."""
 MIN_FACTORS = {"rotor inertia": 0.0}
-"""Least values of factors that may be smaller: flights that hardly yaw do not show the inertia of the rotors."""
+"""Least values of factors that may be below ``1 / MAX_FACTOR``: flights that hardly yaw do not show the inertia of the
+rotors."""
 
 
 FACTORS = ("thrust factor", "inertia x", "inertia y", "inertia z", "torque factor", "rotor inertia")
@@ -73,11 +74,11 @@ class Identification:
     model: Model
     """Model of that airframe, with its residual."""
     values: dict[str, float]
-    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, of logs with
+    """Identified parameters by name, see ``FACTORS``, ``FORCES`` and ``TORQUES``, and ``motor lag``, 1/s, for logs with
     commands and measured speeds."""
     deviations: dict[str, float]
-    """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged where these are few, so
-    that three of them contain the truth in 99% of the fits; NaN of fewer than three blocks."""
+    """Standard deviations of the parameters, from the scatter between blocks of 10 s, enlarged if there are few blocks,
+    so that three standard deviations contain the truth in 99% of the fits; NaN for fewer than three blocks."""
     delays: dict[str, float]
     """Delay of the state behind the rotor speeds in each log, by its name, s."""
     changes: dict[str, NDArray]
@@ -138,7 +139,7 @@ def identify(logs: Sequence[Log], airframe: str | Path = "cf21B_500", *, mass: f
 
     Three linear regressions: of the changes of velocity over 0.5 s on thrust and drag, turned by the measured attitude;
     of fast rotation on the torques of the rotors (``fast_rotation``); and of the changes of angular velocity over
-    0.5 s on the other torques. The mass is not observable from the motion, so it is a given number.
+    0.5 s on the other torques. The mass is not observable from the motion, so it is not fitted.
 
     Args:
         logs: Logs of the same sample time.
@@ -238,7 +239,7 @@ def _torques(
         spin[:, 2] = -(rotor_inertia * log.rotor_vel) @ mixing[2]
         momentum = log.ang_vel @ inertia + spin
         rotors = np.c_[arm * thrust @ mixing[:2].T, drag @ mixing[2]]
-        # Everything known, integrated, goes to the left side.
+        # Integrals of the known terms move to the left side.
         impulse = integral(rotors - np.cross(log.ang_vel, momentum), log.t)
         vel, total, axes = _body(log, log.vel), thrust.sum(-1, keepdims=True), np.eye(3)
         columns = [total * axes[1], -total * axes[0], np.broadcast_to(axes[2], vel.shape)]
@@ -288,9 +289,9 @@ def _regression(
                 break
             free &= ~wrong
         residual = y - x @ coefficients
-        scale = 1.4826 * np.median(np.abs(residual), axis=0)  # of a normal distribution with that median
+        scale = 1.4826 * np.median(np.abs(residual), axis=0)  # standard deviation, if residuals are normal
         weights = 1 / np.maximum(scale, np.abs(residual) / 2) / np.maximum(scale, 1e-30)
-    # Deviations by leaving each block out (jackknife), without bounds, which hide what other coefficients may be.
+    # Deviations by leaving out each block (jackknife), without bounds, which would hide the scatter of coefficients.
     numbers = np.unique(block)
     if len(numbers) < MIN_BLOCKS:
         return coefficients, np.full(k, np.nan)

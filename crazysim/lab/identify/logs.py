@@ -35,7 +35,7 @@ from crazysim.lab.identify.tables import read_table
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One flight, with samples at equal intervals."""
+    """One flight, with samples at equal intervals except at ``gaps``."""
 
     name: str
     """Name for messages."""
@@ -50,9 +50,9 @@ class Log:
     ang_vel: NDArray
     """Angular velocity, body frame, rad/s. (n, 3)"""
     rotor_vel: NDArray
-    """Rotor speeds, rpm; of no rotor where the log has none. (n, n_rotors)"""
+    """Rotor speeds, rpm; ``n_rotors`` is 0 if the log has none. (n, n_rotors)"""
     command: NDArray | None = None
-    """Commands of the rotors, in the unit of the log; None if it has none. (n, n_rotors)"""
+    """Commands of the rotors, logged values times ``share_per_command``; None if the log has none. (n, n_rotors)"""
     attitude_command: NDArray | None = None
     """Commanded roll, pitch and yaw, rad, and collective thrust, N; None if the log has none. (n, 4)"""
     voltage: NDArray | None = None
@@ -62,7 +62,7 @@ class Log:
     repairs: tuple[str, ...] = ()
     """Descriptions of the repairs."""
     modelled: bool = False
-    """True for rotor speeds that were not measured: see ``with_speeds``."""
+    """True if the rotor speeds were modelled by ``with_speeds``, not measured."""
 
     @property
     def dt(self) -> float:
@@ -84,7 +84,8 @@ def read_log(
 
     Args:
         path: File, or columns by name.
-        columns: Names of the columns, or a key of ``KNOWN_COLUMNS``; by default the first of these that the log has.
+        columns: Names of the columns, or a key of ``KNOWN_COLUMNS``; by default the last of these keys whose
+            columns the log has.
         motion: Motion capture of the same flight, whose columns are added to the log. Its clock may differ: it is
             shifted so that the angular velocities agree.
         between: Start and end of the part that is read, s after the first sample.
@@ -126,7 +127,7 @@ def read_log(
     for key in ("pos", "quat", *OPTIONAL_FIELDS):
         names = getattr(columns, key)
         if names and unsigned_name(names[0]) in table:
-            # With the time, whose length all columns must have.
+            # The time is included, so that columns of another length are an error.
             data[key] = stack_columns(name, table, (columns.time, *names))[:, 1:] * factors.get(key, 1.0)
     if "attitude_command" in data:
         data["attitude_command"] *= [*[columns.rad_per_command] * 3, columns.newton_per_command]

@@ -14,7 +14,7 @@ from crazysim.lab.identify.readers import Stream, resample
 LAG_STEP = 0.005
 """Interval at which angular velocities are compared, s."""
 MAX_SPAN = 100
-"""Longest duration, in steps for each sample."""
+"""Longest duration of a recording, in ``LAG_STEP`` per sample."""
 DERIVATIVE_DURATION = 0.06
 """Duration over which positions and attitudes are differentiated, s."""
 
@@ -26,9 +26,9 @@ def join_motion_capture(
     columns: Columns,
     repairs: list[str],
 ) -> dict[str, NDArray]:
-    """Return a log's columns, and from motion capture the columns that it lacks, on the clock of the log.
+    """Return a log's columns, and the columns of motion capture that it lacks, on the clock of the log.
 
-    The clocks may differ by any time, which is found by correlating the magnitudes of the angular velocities.
+    The clocks may differ by any offset, which is found by correlating the magnitudes of the angular velocities.
 
     Args:
         name: Name of the log, for messages.
@@ -82,7 +82,7 @@ def join_motion_capture(
 
 
 def _numbers(table: Mapping[str, NDArray], n: int, without: Sequence[str]) -> dict[str, NDArray]:
-    """Return the columns of n numbers."""
+    """Return the columns with n numbers, other than ``without``."""
     columns = {key: np.asarray(x) for key, x in table.items() if key not in without}
     return {key: x.astype(np.float64) for key, x in columns.items() if x.shape == (n,) and x.dtype.kind in "fiub"}
 
@@ -110,14 +110,14 @@ def _lag(a: NDArray, b: NDArray) -> tuple[float, float]:
 
 
 def body_rates(t: NDArray, quat: NDArray) -> NDArray:
-    """Return angular velocities that follow from an attitude over the time, body frame, rad/s. (n - 1, 3)"""
+    """Return the angular velocities between consecutive attitudes, body frame, rad/s. (n - 1, 3)"""
     (a, aw), (b, bw) = [(q[:, :3], q[:, 3:]) for q in (quat[:-1], quat[1:])]
     vector, scalar = aw * b - bw * a - np.cross(a, b), aw * bw + np.sum(a * b, axis=-1, keepdims=True)
     return 2 * vector * np.sign(scalar) / np.diff(t)[:, None]
 
 
 def velocity_of(t: NDArray, pos: NDArray) -> NDArray:
-    """Return the velocity that follows from positions: lines through ``DERIVATIVE_DURATION``, m/s. (n, 3)"""
+    """Return velocities as slopes of lines fitted to positions over ``DERIVATIVE_DURATION``, m/s. (n, 3)"""
     half = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 2))
     padded = np.concatenate([2 * pos[:1] - pos[half:0:-1], pos, 2 * pos[-1:] - pos[-2 : -half - 2 : -1]])
     times = np.concatenate([2 * t[:1] - t[half:0:-1], t, 2 * t[-1:] - t[-2 : -half - 2 : -1]])
@@ -127,7 +127,7 @@ def velocity_of(t: NDArray, pos: NDArray) -> NDArray:
 
 
 def ang_vel_of(t: NDArray, quat: NDArray) -> NDArray:
-    """Return the angular velocity that follows from attitudes, means over ``DERIVATIVE_DURATION``, rad/s. (n, 3)"""
+    """Return angular velocities from attitudes, averaged over about half of ``DERIVATIVE_DURATION``, rad/s. (n, 3)"""
     rates = body_rates(t, quat)
     rates = np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
     half = max(1, round(DERIVATIVE_DURATION / float(np.median(np.diff(t))) / 4))

@@ -20,7 +20,7 @@ from crazysim.lab.identify.repairs import MAX_REPAIRED_SHARE
 VOLTAGE_WINDOW = 1.0
 """Width of the Hann window over the voltage, s: telemetry is slow and coarse."""
 GROUND_MARGIN = 1.0
-"""Duration after the rotors first carry the drone, and before they last do, that is left out, s."""
+"""Duration that is left out after the rotors first carry the drone, and before they last do, s."""
 MIN_RATE, MAX_RATE = 2.0, 200.0
 """Rates between which the lag of motors is sought, 1/s."""
 MAX_DELAY = 0.04
@@ -31,10 +31,10 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
     """Return the log with rotor speeds, modelled where they were not measured.
 
     The voltage at a motor is its command times the battery's voltage. The airframe's ``battery.thrust_over_voltage``
-    gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays the speed. Motors and propellers differ by
-    some percent, which would be a torque larger than in most manoeuvres: each rotor's thrusts are scaled so that all
-    rotors pull equally on average over the flight. So these logs show no centre of mass and no constant torque.
-    Samples before take-off and after landing are left out.
+    gives the thrust, its thrust curve the speed, and ``rotors.lag`` delays the speed. Motors and propellers differ by a
+    few percent, which would cause a larger torque than most manoeuvres. Each rotor's thrusts are therefore scaled so
+    that all rotors have the same mean thrust over the flight, and offsets of the centre of mass and constant torques
+    cannot be fitted to such logs. Samples before take-off and after landing are left out.
 
     Args:
         log: Log, whose commands are shares of the battery's voltage, 0 to 1, if it has no speeds.
@@ -73,7 +73,7 @@ def with_speeds(log: Log, airframe: Airframe) -> Log:
 
 
 def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
-    """Return the speeds of rotors behind held commands, rpm. (n, n_rotors)"""
+    """Return the rotor speeds that lag behind commands held between samples, rpm. (n, n_rotors)"""
 
     def step(speed: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         cmd, duration = x
@@ -88,10 +88,10 @@ def _lagged_speeds(commanded: NDArray, dt: NDArray, lag: NDArray) -> NDArray:
 
 
 def motor_lag(logs: Sequence[Log]) -> NDArray:
-    """Return the rate of a lag of first order between commands and measured speeds of each rotor, 1/s.
+    """Return the rate of a first-order lag between commands and measured speeds of each rotor, 1/s.
 
-    A speed is a quadratic function of the lagged command and its lagged square, later by a delay of the telemetry. Rate
-    and delay are those that leave the least squares, so that noise of the speeds does not bias them.
+    A speed is a linear function of the lagged command and the lagged square of the command, delayed by the telemetry.
+    Rate and delay minimise the squared residuals, so that noise of the speeds does not bias them.
 
     Args:
         logs: Logs with commands and measured speeds; others, and modelled speeds, are left out.
@@ -122,7 +122,7 @@ def _rate(command: NDArray, speed: NDArray, dt: float) -> float:
         best = np.inf
         for d in delays:
             for k, r in enumerate(rates):
-                # The response is shifted, not the speed, whose noise an interpolation would make smaller.
+                # Shift the response, not the speed: interpolation would reduce the noise of the speed.
                 shifted = [np.interp(index - d / dt, index, c)[inner] for c in responses[:, k].T]
                 x = np.c_[shifted[0], shifted[1], np.ones(len(shifted[0]))]
                 residual = speed[inner] - x @ np.linalg.lstsq(x, speed[inner], rcond=None)[0]

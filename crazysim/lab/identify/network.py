@@ -16,7 +16,7 @@ from crazysim.lab.identify.prediction import Model, Windows, attitude_error, pre
 from crazysim.plugins.effects.residual import ResidualData, residual_inputs
 
 SCALES = {"pos": 0.02, "attitude": 0.05, "vel": 0.1, "ang_vel": 0.5}
-"""Sizes of errors that count as one: m, rad, m/s, rad/s. Larger ones count linearly (Huber)."""
+"""Scales of errors: m, rad, m/s, rad/s. Larger errors count linearly (Huber)."""
 DURATION = 0.5
 """Duration of the predictions, s."""
 STRIDE = 0.05
@@ -40,18 +40,18 @@ def fit_residual(
     """Return the model with a trained residual: linear terms and a network that are added to force and torque.
 
     Adam minimises Huber's loss of open-loop predictions of 0.5 s, by gradients through the dynamics. The parameters of
-    the model stay as they are. With validation logs the result is the best
-    of those seen every 100 iterations by their loss.
+    the model stay as they are. With validation logs, their loss is computed every 100 iterations, and the result is the
+    residual with the least loss.
 
     Args:
         logs: Logs of the same sample time, aligned.
         model: Model from ``identify``.
         n_hidden: Number of units of the hidden layer; 0 for linear terms alone.
         iterations: Number of steps of Adam.
-        batch_size: Number of windows of a step.
+        batch_size: Number of windows per step.
         learning_rate: Largest learning rate; it decreases to zero with half a cosine.
         decay: Weight decay.
-        validation: Logs that are not trained on and choose the result.
+        validation: Logs that select the result and are not used for training.
         seed: Seed of the first weights and of the batches.
 
     Raises:
@@ -76,7 +76,7 @@ def fit_residual(
     scale = weight * jnp.repeat(jnp.array([FORCE, TORQUE * float(params.L[0])]), 3)
 
     def residual(weights: dict[str, Array]) -> ResidualData:
-        """Return the residual of weights of order one."""
+        """Return the residual from weights of order one."""
         linear = model.residual.linear + scale[:, None] * weights["linear"] / spread
         if not n_hidden:
             return ResidualData(linear, None, None)
@@ -122,7 +122,7 @@ def fit_residual(
 
 
 def scaled_errors(model: Model, window: Windows, dt: float) -> Array:
-    """Return the errors of the prediction of one window at ten times, over ``SCALES``. (120,)"""
+    """Return the errors of the prediction of one window at ten times, divided by ``SCALES``. (120,)"""
     pos, quat, vel, ang_vel = predict(model, window, dt)
     n = window.pos.shape[0]
     samples = np.unique(np.linspace(0, n - 1, 11).round().astype(int))[1:]

@@ -27,7 +27,7 @@ HORIZONS = (0.1, 0.25, 0.5)
 
 
 class Windows(PyTree):
-    """Pieces of logs of equal length, from which predictions start."""
+    """Pieces of logs, all of the same length. A prediction starts at the first sample of each."""
 
     pos: Array
     """Position, world frame, m. (n_windows, n, 3)"""
@@ -56,7 +56,7 @@ class Predictor(Protocol):
     """Model that predicts logged flights: ``Model`` or ``FittedModel``."""
 
     def prepared(self, log: Log) -> Log:
-        """Return the log as the model describes it."""
+        """Return the log with its columns converted to the variables of the model."""
         ...
 
     def start(self, window: Windows) -> Array:
@@ -68,17 +68,17 @@ class Predictor(Protocol):
         ...
 
     def derivative(self, state: State, inputs: Array) -> State:
-        """Return the time derivatives of a state under inputs. (...) The attitude's is the angular velocity."""
+        """Return the time derivatives of a state under inputs; the angular velocity for the attitude."""
         ...
 
 
 class Model(PyTree):
-    """Everything that predicts a flight from its rotor speeds."""
+    """Model that predicts a flight from its rotor speeds."""
 
     params: first_principles.Params
     """Parameters of the first-principles model."""
     residual: ResidualData
-    """Forces and torques that are added to those of the first-principles model."""
+    """Forces and torques that are added to the first-principles model."""
 
     @staticmethod
     def create(airframe: Airframe, mass: float | None = None) -> Model:
@@ -221,8 +221,8 @@ def prediction_errors(
     Returns:
         RMSE of the position, m, and of the attitude, ``2 sin(angle / 2)`` in degrees, at each horizon, by
         name: ``position``, ``attitude``, both ``... at constant body rates`` (forces of the model alone),
-        ``position at constant velocity``, ``attitude unchanged``; and the mean distances and angles between
-        predicted and measured state, m and degrees, which end in ``(mean)``. (len(horizons),) each
+        ``position at constant velocity``, ``attitude unchanged``. The same names with `` (mean)`` appended have the
+        mean distances, m, and angles, degrees, between predicted and measured states. (len(horizons),) each
     """
     batch, dt = windows([model.prepared(log) for log in logs], max(horizons), 0.05), logs[0].dt
     pos, quat, _, _ = jax.jit(jax.vmap(lambda w: predict(model, w, dt)))(batch)

@@ -1,4 +1,4 @@
-"""Streams of messages at equal times, and logs of a Crazyflie's micro-SD card."""
+"""Resampling of message streams to common times, and logs of a Crazyflie's micro-SD card."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from crazysim.lab.identify.columns import Columns, unsigned_name, without_huge_n
 from crazysim.lab.identify.repairs import PERIOD_RANGE, align_signs, unwrap_angles
 
 MAX_HOLD = 3.0
-"""Intervals of a stream, after which its interpolated values count as a gap."""
+"""Longest pause of a stream that is interpolated, in intervals of the stream; a longer one is a gap."""
 VARIABLE_PATTERN = re.compile(r"(.+)\(([bBhHiIfd?])\)", re.DOTALL)
 """Name and type of a variable of a micro-SD log, such as ``gyro.x(f)``."""
 MAX_RATE = 250.0
-"""Rate to which faster logs are averaged, Hz: above about 50 Hz nothing is identified."""
+"""Rate to which faster logs are averaged, Hz. Nothing is identified from motion above about 50 Hz."""
 
 
 class Stream(NamedTuple):
@@ -39,14 +39,15 @@ def resample(
 ) -> dict[str, NDArray]:
     """Return the columns of all streams, interpolated linearly at the times of the fastest; ``t`` begins at zero.
 
-    Where a stream pauses for over three of its intervals the samples are left out, which leaves a gap. Streams that are
-    slower than a log may be are left out, too, but for the voltage.
+    Samples in pauses of a stream longer than ``MAX_HOLD`` intervals are left out, which leaves a gap. Streams with
+    longer intervals than ``PERIOD_RANGE`` allows are left out too, except the voltage.
 
     Args:
         name: Name of the file, for messages.
         streams: Streams by name.
         repairs: List that descriptions of repairs are appended to.
-        columns: Names of the columns, None for the default ones. Attitudes are made continuous first.
+        columns: Names of the columns, None for the default ones. Attitudes are made continuous before they are
+            interpolated.
 
     Raises:
         ConfigError: If no two streams overlap, a stream has fewer than two samples, or position or attitude are too
@@ -99,7 +100,7 @@ def resample(
 
 
 def decimate(table: dict[str, NDArray], repairs: list[str]) -> dict[str, NDArray]:
-    """Return the table with means over as many samples as bring it to ``MAX_RATE`` or just below.
+    """Return the table with groups of samples averaged, so that its rate is at most ``MAX_RATE``.
 
     Args:
         table: Columns by name, with the time ``t``, s.
@@ -117,9 +118,8 @@ def read_crazyflie(path: Path, repairs: list[str], wanted: Columns | None = None
     """Return the columns of a log of the Crazyflie's micro-SD card, by the names of its log variables.
 
     The format is defined by tools/usdlog/cfusdlog.py of Bitcraze's crazyflie-firmware at commit 34c90e75: versions 1
-    and 2.
-    Compressed attitudes, such as ``stateEstimateZ.quat``, become four columns, such as ``stateEstimateZ.qx`` to ``qw``
-    (src/modules/interface/quatcompress.h). Variables that two events share get the name of the event in front.
+    and 2. Compressed attitudes, such as ``stateEstimateZ.quat``, become four columns, such as ``stateEstimateZ.qx`` to
+    ``qw`` (src/modules/interface/quatcompress.h). Variables that several events share are prefixed with the event.
 
     Args:
         path: File.
@@ -187,8 +187,9 @@ def _are_uint32(x: NDArray) -> bool:
 def decompress_quat(packed: NDArray) -> NDArray:
     """Return the quaternions in 32 bits of Bitcraze's quatcompress.h, xyzw. (n,) -> (n, 4)
 
-    From the lowest bits up: magnitudes of nine bits, in units of 1 / (511 sqrt(2)), each below a bit that is set for
-    negative ones, of the components but the largest, from the last to the first; then the index of the largest.
+    The lowest 30 bits hold the components other than the largest, the last one in the lowest bits. Each takes nine bits
+    for its magnitude, in units of 1 / (511 sqrt(2)), and above them a bit that is set if it is negative. The highest
+    two bits hold the index of the largest component.
     """
     largest, quat = packed >> 30, np.zeros((len(packed), 4))
     for k in (3, 2, 1, 0):
@@ -202,7 +203,7 @@ def decompress_quat(packed: NDArray) -> NDArray:
 
 
 def _kinds(data: bytes, n_kinds: int) -> tuple[dict[int, tuple[str, list[str], struct.Struct]], int]:
-    """Return name, variables and layout of each kind of record, and the place of the first record."""
+    """Return name, variables and layout of each kind of record, and the offset of the first record, bytes."""
     kinds, offset = {}, 5
 
     def text(offset: int) -> tuple[str, int]:

@@ -28,7 +28,7 @@ CARRIED_SHARE, IDLE_SHARE = 0.75, 0.4
 """Shares of the typical thrust. A drone is on the ground where its thrust is below the first for longer than
 ``GROUND_DURATION`` and falls below the second: flight controllers raise the thrust slowly before they take off."""
 N_NEIGHBOURS = 10
-"""Samples on both sides of an interval that show if time was lost or only jitters."""
+"""Number of samples on each side of an interval from which lost time and jitter are distinguished."""
 
 
 def check_period(name: str, t: NDArray) -> None:
@@ -54,9 +54,9 @@ def check_period(name: str, t: NDArray) -> None:
 
 
 def increasing_samples(name: str, t: NDArray, repairs: list[str]) -> NDArray:
-    """Return the samples of the longest sequence whose time increases. (n,), True where a sample is kept.
+    """Return True for the samples of the longest sequence whose time increases. (n,)
 
-    A single time that is too early or too late is thus dropped alone.
+    If a single time is too early or too late, only that sample is dropped.
     """
     keep = np.isfinite(t)
     if not np.all(np.diff(t[keep]) > 0):
@@ -130,7 +130,7 @@ def find_gaps(name: str, t: NDArray, repairs: list[str]) -> NDArray:
 def interpolate_missing(
     name: str, t: NDArray, data: dict[str, NDArray], repairs: list[str]
 ) -> tuple[NDArray, dict[str, NDArray]]:
-    """Return the data, with missing values interpolated over up to ``MAX_INTERPOLATION``, and without longer gaps.
+    """Return time and data with missing values interpolated over up to ``MAX_INTERPOLATION``, without longer gaps.
 
     A value is missing where it is not finite, an attitude also where its quaternion is zero, as motion capture gives
     for a lost body.
@@ -195,7 +195,7 @@ def airborne_samples(name: str, t: NDArray, thrust: NDArray, repairs: list[str])
         np.maximum(thrust, 0.0), size=2 * max(1, round(0.1 / float(np.median(np.diff(t))))) + 1, mode="nearest"
     )
     order = np.argsort(smooth)
-    weight = np.cumsum(smooth[order] ** 2)  # Little for idling rotors, however long.
+    weight = np.cumsum(smooth[order] ** 2)  # Idling rotors have little weight, however long they idle.
     typical = smooth[order[np.searchsorted(weight, weight[-1] / 2)]]
     if not typical > 0:
         raise ConfigError(

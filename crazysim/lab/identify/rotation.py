@@ -1,9 +1,10 @@
 """Moments of inertia, torque curve and delay from fast rotation, by linear regression.
 
-Over a fraction of a second, aerodynamic torques of the flow around the drone are several times those that turn it, and
-no simple model predicts them to some percent. A fit of long predictions therefore explains them by moments of inertia
-that are far too large, which make the prediction insensitive to its torques. Fast rotation does not have this problem:
-above some hertz the torque of the rotors turns the body. So both sides of the equation of motion are band-passed.
+Over a fraction of a second, aerodynamic torques of the flow around the drone are several times larger than the torques
+that turn it, and no simple model predicts them within a few percent. A fit of long predictions therefore explains them
+by moments of inertia that are far too large, which make the prediction insensitive to its torques. Fast rotation does
+not have this problem: above a few hertz, the torque of the rotors turns the body. Both sides of the equation of motion
+are therefore band-passed.
 
 Telemetry of rotor speeds is held, quantised and late, which biases coefficients towards zero (errors in variables).
 Commands are free of that: where a log has them, they are the instruments of two-stage least squares.
@@ -38,10 +39,10 @@ SAMPLING_ERROR = 5e-4
 """Relative error of integrals between samples, which is the same in all blocks: of moments of inertia it was 0.04 to
 0.12% in simulated flights without noise, at 100 and 500 Hz."""
 DELAY_DEVIATION = 0.02
-"""Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there, of
-which quadrature makes a delay of dt^2 / (12 time constant): 0.04 samples of 0.01 s for a time constant of 0.02 s."""
+"""Standard deviation of delays, samples. A first-order motor whose command changes at a sample has a corner there,
+which quadrature turns into a delay of dt^2 / (12 time constant): 0.04 samples for 0.01 s and a constant of 0.02 s."""
 N_ITERATIONS = 3
-"""Number of fits, each with gyroscopic torques from the moments of inertia of the last."""
+"""Number of fits, each with gyroscopic torques from the moments of inertia of the previous fit."""
 
 
 class FastRotation(NamedTuple):
@@ -58,10 +59,10 @@ class FastRotation(NamedTuple):
 def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_factor: float = 1.0) -> FastRotation:
     """Return moments of inertia, torque curve and delays that explain the fast rotation of logs.
 
-    About x and y, thrust and arms give the torque, and so the scale. About z neither the drag torque nor the rotors'
-    inertia is known, so that only their ratios to the moment of inertia are: that moment is in proportion to the other
-    two, as in the airframe. Results are weighted medians over blocks, because streams of telemetry drift against each
-    other and lose packets, which spoils single blocks.
+    About x and y, thrust and arms give the torque, and therefore the scale of the moments of inertia. About z, only the
+    ratios of drag torque and rotor inertia to the moment of inertia are observable, so that moment is assumed to be in
+    the same proportion to the other two as in the airframe. Results are weighted medians over blocks, because streams
+    of telemetry drift against each other and lose packets, which spoils single blocks.
 
     Args:
         logs: Logs of the same sample time.
@@ -106,7 +107,7 @@ def fast_rotation(logs: Sequence[Log], params: first_principles.Params, thrust_f
 
 
 def aligned(log: Log, delay: float) -> Log:
-    """Return the log with rotor speeds and commands that are later by a delay, s."""
+    """Return the log with rotor speeds and commands delayed by ``delay``, s."""
     command = None if log.command is None else shift_series(log.command, delay / log.dt)
     return replace(log, rotor_vel=shift_series(log.rotor_vel, delay / log.dt), command=command)
 
@@ -124,14 +125,14 @@ def weighted_median(x: NDArray, variance: NDArray) -> tuple[float, float]:
         return center, math.nan
     count = np.sum(weight) ** 2 / np.sum(weight**2)
     spread = math.sqrt(np.sum(weight * (x - center) ** 2) / np.sum(weight) / (count - 1))
-    return center, 1.2533 * deviation_factor(len(x)) * spread  # deviation of a median over a mean's (Gauss)
+    return center, 1.2533 * deviation_factor(len(x)) * spread  # ratio of deviations of median and mean (Gauss)
 
 
 def deviation_factor(n: int) -> float:
     """Return the factor by which a standard deviation from n numbers must be larger for the same confidence.
 
-    Student's t distribution with n - 1 degrees of freedom over the normal one, by the expansion of Abramowitz and
-    Stegun, Handbook of Mathematical Functions, 26.7.5, at three standard deviations.
+    The ratio of the quantiles of Student's t distribution with n - 1 degrees of freedom and the normal distribution, by
+    the expansion of Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.5, at three standard deviations.
     """
     v = n - 1
     return (3 + 30 / (4 * v) + 1656 / (96 * v**2) + 11592 / (384 * v**3)) / 3
@@ -202,7 +203,7 @@ class _Rotors(NamedTuple):
 
 
 def _speeds_of_commands(log: Log) -> NDArray:
-    """Return the rotor speeds that commands explain: a finite impulse response, and squares. (n, n_rotors)"""
+    """Return the rotor speeds fitted by finite impulse responses to commands and their squares. (n, n_rotors)"""
     n, count = len(log.t), round(RESPONSE_DURATION / log.dt)
     index = np.clip(np.arange(n)[:, None] - np.arange(-1, count)[None], 0, n - 1)
     speeds = []
@@ -220,7 +221,7 @@ def _change(x: NDArray) -> NDArray:
 
 
 def _integral_over_two(x: NDArray, dt: float) -> NDArray:
-    """Return the integral over the two intervals around each sample, zero at the ends, exact for degree 5."""
+    """Return the integral over the two intervals around each sample, zero at the ends; exact up to degree 5."""
     total = np.zeros_like(x)
     total[2:-2] = (114 * x[2:-2] + 34 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) * (dt / 90)
     return total
@@ -240,7 +241,8 @@ def _band(x: NDArray, dt: float, slow: float) -> NDArray:
 def _blocks(d: _LogTerms, late: float = 0.0) -> NDArray:
     """Return the solution of each block, about z with a delay that is longer by ``late`` samples.
 
-    Coefficients of torque about x and y, of drag torque and of reaction; delay; variances of the coefficients.
+    The columns are the coefficients of torque about x and y, of drag torque and of reaction; the delay, s; and the
+    variances of the four coefficients.
     (n_blocks, 9)
     """
     n, margin = len(d.turned), round(YAW_SLOW_WIDTH / d.dt / 2)
@@ -264,7 +266,7 @@ def _blocks(d: _LogTerms, late: float = 0.0) -> NDArray:
 
 
 def _solve(d: _LogTerms, axis: int, delay: float, samples: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the coefficients of the regressors and their variances, at some samples.
+    """Return the coefficients of the regressors and their variances, fitted at ``samples``.
 
     Regressors about x and y are the torque, its rate, and the thrust, for an offset of the centre of mass; about z
     the drag torque and the reaction of the rotors. The last one is the angular velocity.

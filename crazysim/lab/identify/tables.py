@@ -1,4 +1,4 @@
-"""Files of logs as tables of columns."""
+"""Log files as tables of columns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from crazysim.lab.identify.ulog import read_ulog
 from crazysim.storage import read_arrays, reading
 
 MAX_LOG = 2**31
-"""Largest file of a log, bytes, but for ROS bags, which are not read into memory as a whole."""
+"""Largest log file, bytes. ROS bags have no limit, since they are not read into memory as a whole."""
 
 
 def read_table(

@@ -1,4 +1,4 @@
-"""Logs of PX4, in its format ULog.
+"""Logs of PX4, in its ULog format.
 
 The format is described at https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Appended data,
 which PX4 writes after a crash, follow the others without a mark.
@@ -29,7 +29,7 @@ TOPICS = (
 MAGIC = b"ULog\x01\x12\x35"
 """First bytes of a file."""
 SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
-"""Content of a message ``S``, after which a damaged file is read again."""
+"""Content of a message ``S``, after which reading of a damaged file resumes."""
 HEADER_SIZE = 16
 """Bytes before the first message."""
 KINDS = b"ABCDFILMOPQRS"
@@ -47,11 +47,11 @@ FIELD = re.compile(r"([\w/-]+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
 
 
 def read_ulog(path: Path, repairs: list[str]) -> dict[str, NDArray]:
-    """Return the columns of a PX4 ULog in the names of crazysim's logs.
+    """Return the columns of a PX4 ULog by the names of crazysim's logs.
 
-    World axes are north, west, up, and body axes forward, left, up: PX4's, turned half about the first axis. Rotor
-    speeds are those of ``esc_status`` and commands those of ``actuator_motors``, or else of ``actuator_outputs``, in
-    PX4's order. Commanded attitudes are those of ``vehicle_attitude_setpoint``, with its thrust as a share from 0 to 1.
+    World axes are north, west, up, and body axes forward, left, up: PX4's, rotated by 180 degrees about the first axis.
+    Rotor speeds are those of ``esc_status`` and commands those of ``actuator_motors``, or else of ``actuator_outputs``,
+    in PX4's order. Commanded attitudes are those of ``vehicle_attitude_setpoint``, with its thrust from 0 to 1.
     Logs before PX4 1.10 have the angular velocity in ``vehicle_attitude``.
 
     Args:
@@ -123,7 +123,7 @@ class Topic(dict[str, NDArray]):
 def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str, Topic]:
     """Return the first instances of topics, their fields by name, such as ``q[0]`` or ``esc[2].esc_rpm``.
 
-    Where a file is damaged the messages until the next mark of synchronisation are left out.
+    Where a file is damaged, the messages up to the next synchronisation message are left out.
 
     Args:
         path: File.
@@ -131,7 +131,7 @@ def _topics(path: Path, topics: Collection[str], repairs: list[str]) -> dict[str
         repairs: List that descriptions of repairs are appended to.
 
     Raises:
-        DamagedFileError: If it is no ULog, or a topic has no format.
+        DamagedFileError: If the file is not a ULog, or a topic has no format.
     """
     data = path.read_bytes()
     if len(data) < HEADER_SIZE or not data.startswith(MAGIC):

@@ -17,9 +17,9 @@ MAX_MEMBERS = 20_100
 MAX_MEMBER = 16 * 2**20
 """Largest file of an archive that is unpacked, bytes."""
 MAX_TOTAL = 512 * 2**20
-"""Most bytes that are unpacked from an archive."""
+"""Most bytes that may be unpacked from an archive."""
 MIN_TOTAL, MAX_RATIO = 64 * 2**20, 100
-"""Bytes that are unpacked from any archive, and from a larger one as a multiple of its size."""
+"""Bytes that may be unpacked from any archive, and the multiple of its size that may be unpacked from a larger one."""
 MAX_CHAIN = 8
 """Longest chain of references."""
 REMEDY = "Export it again, or use another copy."
@@ -66,7 +66,7 @@ class Archive:
         """Return a value, or the contents of the file it refers to by ``{"$ref": "./name#"}``, and its place.
 
         Raises:
-            ConfigError: If the file is missing, or references form a long chain or a circle.
+            ConfigError: If the file is missing, or references form a cycle or a chain that is too long.
         """
         for _ in range(MAX_CHAIN):
             if not isinstance(value, dict) or "$ref" not in value:

@@ -1,7 +1,7 @@
-"""Light programs of Skybrush: the byte code that its drones run for their LEDs.
+"""Skybrush's light programs: byte code that drones run to control their LEDs.
 
-Commands and arguments are those of libskybrush (``src/lights/commands.h``, ``commands.cpp``), their effects those of
-its ``executor.cpp``; pyledctrl compiles the same code. Durations and times are varints, LEB128, of 20 ms.
+Commands and arguments are as in libskybrush (``src/lights/commands.h``, ``commands.cpp``), and their effects as in its
+``executor.cpp``; pyledctrl compiles the same code. Durations and times are LEB128 varints in units of 20 ms.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def decode_lights(
 ) -> Lights:
     """Return the lights of a light program.
 
-    A drone of the simulation has no remote control and no pyrotechnics: colours from channels are black, as libskybrush
+    A simulated drone has no remote control and no pyrotechnics: colours from channels are black, as libskybrush
     shows them without channels, triggers never fire, and pyro commands do nothing.
 
     Args:
@@ -66,7 +66,7 @@ def decode_lights(
 
 
 class _Machine:
-    """State of a program that runs."""
+    """State of a running program."""
 
     def __init__(self, code: bytes, place: str):
         self.code, self.place, self.at = code, place, 0
@@ -96,7 +96,7 @@ class _Machine:
                 return value
 
     def run(self, end: int, max_commands: int) -> None:
-        """Run until the program ends, or a time, ticks."""
+        """Run until the program ends, or until the time exceeds ``end``, ticks."""
         for _ in range(max_commands):
             if self.at >= len(self.code) or self.now > end or not self.command(self.byte()):
                 return
@@ -126,7 +126,7 @@ class _Machine:
         elif code == JUMP:
             self.jump(self.varint())
         elif code == TRIGGERED_JUMP:
-            if self.byte() & 0x30:  # a rising or falling edge to react to, with the address
+            if self.byte() & 0x30:  # an address follows if the jump reacts to a rising or falling edge
                 self.varint()
         else:
             self.at -= 1
@@ -171,7 +171,7 @@ class _Machine:
         self.loops.clear()
 
     def lights(self) -> Lights:
-        """Return the colours so far: of pieces that begin at one time, the last."""
+        """Return the lights so far; of pieces that begin at the same time, only the last counts."""
         last = {start: (a, b) for start, a, b in self.pieces}
         starts, colors = list(last), np.array(list(last.values()), float) / 255
         return Lights.of_pieces(TICK_DURATION * np.array(starts), colors[:, 0], colors[:, 1])

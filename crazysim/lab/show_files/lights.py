@@ -15,7 +15,7 @@ from crazysim.pytree import PyTree, float_dtype, leaf
 
 
 class Lights(PyTree):
-    """Colours of one drone's LED as pieces of constant or linearly fading colour, with any leading axes for several.
+    """Colours of one drone's LED as pieces of constant or linearly fading colour; leading axes are for several drones.
 
     Before its first piece the LED has the first colour; the last piece is constant and has no end.
     """

@@ -24,14 +24,14 @@ def parse_trajectory(value: object, place: str, yaw_control: object = None) -> t
     """Return the trajectory in a ``trajectory.json``, from the start of the show on, and its encoding.
 
     Each point is ``[t, [x, y, z], [control points]]``: the end of a Bezier curve that begins at the previous point,
-    with up to six inner control points. Times count from ``takeoffTime``; until the first point the vehicle rests
-    there. A fourth coordinate is the yaw, degrees. Keys other than those are ignored.
+    with up to six inner control points. Times count from ``takeoffTime``; the vehicle rests at the first point
+    until its time. A fourth coordinate is the yaw, degrees. Other keys are ignored.
 
     Args:
         value: The JSON object.
         place: File and place in it, for messages.
         yaw_control: Skybrush's ``yawControl`` object, whose setpoints, degrees, are connected linearly and replace the
-            yaw of the points; None for none.
+            yaw of the points; None if there is none.
 
     Raises:
         ConfigError: If the trajectory is invalid; the message names the place.
@@ -114,7 +114,7 @@ def _with_yaw(ends: NDArray, c: NDArray, yaw_control: object, place: str) -> tup
 def format_trajectory(trajectory: Trajectory, encoding: str = "COMPRESSED", yaw: bool = True) -> dict[str, Any]:
     """Return a trajectory as the contents of a ``trajectory.json``.
 
-    A compressed trajectory has curves of degree 1, 3 or 7, any other of up to 7.
+    Curves have degree 1, 3 or 7 in a compressed trajectory, and degree 1 to 7 in any other.
 
     Args:
         trajectory: Trajectory of one vehicle.

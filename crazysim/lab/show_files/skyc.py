@@ -229,8 +229,9 @@ def _integer(text: str, place: str) -> int:
 def save_show(show: Show, path: str | Path) -> None:
     """Write a show as a ``.skyc`` file, which Skybrush reads too.
 
-    Skybrush itself accepts curves of degree 1 to 3 and no yaw: a trajectory without yaw is written without, and in the
-    lowest degree that reproduces it. Lights are byte code; those without fades are written as ``colors`` as well.
+    Skybrush itself accepts curves of degree 1 to 3 and no yaw: a yaw that is zero throughout is left out, and curves
+    have the lowest degree of their encoding that reproduces them. Lights are byte code; those without fades are written
+    as ``colors`` as well.
 
     Args:
         show: Show.

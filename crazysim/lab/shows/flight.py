@@ -26,7 +26,7 @@ RATES = (50, 25, 10, 5)
 MAX_RECORDED = 20_000_000
 """Most poses of a recording, which take 28 bytes each."""
 CHUNK_SAMPLES = 250
-"""Samples that one compiled call flies."""
+"""Number of samples that one compiled call simulates."""
 
 Progress = Callable[[Iterable[int], str], Iterable[int]]
 
@@ -64,8 +64,7 @@ def fly(show: Show, seconds: float | None = None, progress: Progress | None = No
     Args:
         show: Show.
         seconds: Duration, s; None for the duration of the show.
-        progress: Function that returns the items it gets, with a progress bar, ``progress(items, label)``; None for
-            none.
+        progress: Function ``progress(items, label)`` that yields the items and shows a progress bar; None for no bar.
         settings: Further settings of ``Sim``, such as ``drone`` and ``controller``.
     """
     end = show.duration if seconds is None else min(float(seconds), show.duration)
@@ -129,7 +128,7 @@ def _rate(freq: int, seconds: float, n_drones: int) -> int:
 
 
 def _compile_chunk(sim: Sim, n_steps: int) -> Callable[[SimData], tuple[SimData, tuple[Array, Array]]]:
-    """Return a compiled function from data to the data of ``CHUNK_SAMPLES`` samples later, and poses of the samples."""
+    """Return a compiled function that advances data by ``CHUNK_SAMPLES`` samples, and also returns their poses."""
     step, zeros = sim.step_fn, sim.step_fn.zeros(sim.data)
 
     def sample(data: SimData, _: None) -> tuple[SimData, tuple[Array, Array]]:

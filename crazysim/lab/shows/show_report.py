@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from crazysim.lab.shows.flight import ShowFlight
 
 N_LISTED = 5
-"""Pairs that a summary lists."""
+"""Most collisions that a summary lists."""
 
 
 def sampled_approaches(times: ArrayLike, pos: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the least distance of every pair of drones, and the time at which it occurs.
 
-    Between samples the drones are taken to move at constant velocities: its square is a parabola of time, through the
-    closest sample and its neighbours.
+    Between samples the drones are assumed to move at constant velocities, so that the squared distance is a parabola in
+    time. It is fitted through the closest sample and its neighbours.
 
     Args:
         times: Times of the samples, s, in equal steps. (n,)

@@ -55,7 +55,7 @@ def film(
         fps: Frames per second.
         progress: True to show a progress bar, which needs tqdm, where stderr is a terminal.
         night: True to darken the scene, which makes the lights stand out.
-        view: Settings of ``crazysim.media.View`` other than its own.
+        view: Settings of ``crazysim.media.View`` that replace the defaults of ``view_of``.
 
     Raises:
         ImportError: If imageio-ffmpeg, or tqdm for a bar, is not installed.
@@ -73,7 +73,7 @@ def play(flight: ShowFlight, speed: float = 1.0, **view: Any) -> None:
     Args:
         flight: Flight.
         speed: Seconds of the show per second.
-        view: Settings of ``crazysim.media.View`` other than its own.
+        view: Settings of ``crazysim.media.View`` that replace the defaults of ``view_of``.
 
     Raises:
         RenderError: If there is no screen.

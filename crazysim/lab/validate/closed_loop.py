@@ -17,12 +17,12 @@ from crazysim.plugins.sensors import IMU, MotionCapture
 from crazysim.sim.sim import Sim
 
 FREQ = 100
-"""Samples of a flight per second, Hz, at which setpoints are commanded."""
+"""Rate of the samples of a flight, and of commanded setpoints, Hz."""
 COLUMNS = ("t", "px", "py", "pz", "sp_ctrltarget_x", "sp_ctrltarget_y", "sp_ctrltarget_z", "sp_ctrltarget_yaw")
 """Columns of a log of NanoBench (arXiv 2603.09908): time, s, motion capture, m, setpoint, m and degrees."""
 AIRBORNE_SHARE, SETTLING_TIME, LANDING_TIME = 0.9, 2.0, 0.5
-"""A flight is compared from ``SETTLING_TIME`` seconds after its setpoint has reached this share of its median height,
-until ``LANDING_TIME`` seconds before it leaves that height."""
+"""A flight is compared from ``SETTLING_TIME`` seconds after its setpoint has reached ``AIRBORNE_SHARE`` of its median
+height, until ``LANDING_TIME`` seconds before it leaves that height."""
 MAX_DISTANCE = 2.0
 """Distance from the setpoint, m, beyond which a flight has failed; setpoints jump by up to 1.2 m."""
 MAX_LAG = 1.2
@@ -36,7 +36,7 @@ class Flight:
     name: str
     """Name of the log."""
     setpoint: NDArray
-    """Commanded position, relative to the tracked body at rest on the floor, m, and yaw, rad. (n, 4)"""
+    """Commanded position, with the height relative to the tracked body at rest on the floor, m, and yaw, rad. (n, 4)"""
     pos: NDArray
     """Measured position, likewise, m. (n, 3)"""
 
@@ -132,8 +132,8 @@ def commanded_samples(name: str, height: NDArray) -> NDArray:
 def laboratory_estimator(quat_deviation: float = 0.06) -> Estimator:
     """Return the firmware's filter as laboratories with motion capture set it up.
 
-    Positions at rest in NanoBench's logs scatter by 0.1 mm at most. The default of ``quat_deviation``, rad, is what
-    Bitcraze's examples for motion capture set (crazyflie-lib-python, examples/mocap/qualisys_hl_commander.py).
+    Positions at rest in NanoBench's logs scatter by 0.1 mm at most. The default of ``quat_deviation``, rad, is the
+    value in Bitcraze's examples for motion capture (crazyflie-lib-python, examples/mocap/qualisys_hl_commander.py).
     """
     sensors = [IMU.crazyflie(), MotionCapture(noise=1e-4)]
     return Kalman(sensors, deviations={"quat": quat_deviation})

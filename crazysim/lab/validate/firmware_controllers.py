@@ -40,8 +40,8 @@ CASES: dict[str, tuple[Any, str, AirframeSource]] = {
 }
 """Controller, command level and airframe, by name of the recording."""
 MAX_TRUNCATION = 5.0
-"""Most that the firmware's integers take from a motor, PWM: roll, pitch, yaw and motor lose less than one each, and
-where all motors are lowered by the excess of the highest, the difference of two motors counts."""
+"""Largest loss of a motor by the firmware's integer arithmetic, PWM: roll, pitch, yaw and motor lose less than one
+each, and where all motors are lowered by the excess of the highest, the difference of two motors counts."""
 FLOAT32 = 3.0
 """Rounding, PWM: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
 
@@ -53,7 +53,7 @@ def recorded_pwm(name: str) -> NDArray:
 
 
 def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
-    """Return the differences from the compiled firmware in 8 flights of 240 ticks, PWM. (240, 8, 4)
+    """Return the absolute differences from the compiled firmware in 8 flights of 240 ticks, PWM. (240, 8, 4)
 
     Args:
         name: Name of the recording.
@@ -138,7 +138,7 @@ def _compiled_flight(controller: Any, mode: str) -> Any:
 
 
 def controller_numbers(controller: Any, drone: AirframeSource) -> tuple:
-    """Return parameters and memory of a controller for an airframe, N of full PWM, and the curve of the thrust."""
+    """Return parameters and memory of a controller, collective thrust per unit of PWM, N, and the thrust curve."""
     airframe = load_airframe(drone)
     newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
     return controller.params(airframe), controller.memory(airframe), newton, airframe.value("rotors.thrust_curve")[None]
@@ -147,7 +147,7 @@ def controller_numbers(controller: Any, drone: AirframeSource) -> tuple:
 def pwm_of_controller(
     controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250"
 ) -> Array:
-    """Return the same as ``compiled_pwm``, traceable."""
+    """Return the result of ``compiled_pwm``, by a function that JAX can trace."""
     return _flight_pwm(controller, mode, controller_numbers(controller, drone), states, commands)
 
 

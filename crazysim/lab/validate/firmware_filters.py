@@ -90,7 +90,7 @@ def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
 
 
 def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
-    """Return states of the complementary filter in 2 s of 1 ms, every 20 ms, ours and the firmware's.
+    """Return states of the complementary filter in 2 s at steps of 1 ms, every 20 ms, ours and the firmware's.
 
     Args:
         kind: Source of the height: ``"pressure"`` or ``"ground"``.

@@ -40,7 +40,7 @@ def find_logs(folder: Path, pattern: str) -> list[Path]:
 
 
 def open_loop(folder: Path) -> Iterable[Row]:
-    """Yield mean errors of predictions of melon from measured rotor speeds, over ``HORIZONS``, and published ones."""
+    """Yield mean errors of predictions of a melon flight from rotor speeds, at ``HORIZONS``, and published errors."""
     path = find_logs(folder, "melon*")[0]
     log = read_log(path)
     series_errors: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
@@ -66,7 +66,7 @@ def open_loop(folder: Path) -> Iterable[Row]:
 
 
 def closed_loop(folder: Path) -> Iterable[Row]:
-    """Yield simulated over logged tracking errors, flight by flight."""
+    """Yield the ratio of simulated to logged tracking error of each flight."""
     paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
     for row in compare([read_flight(path) for path in paths], estimator=laboratory_estimator()):
         remark = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"

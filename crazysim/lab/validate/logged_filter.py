@@ -58,8 +58,8 @@ def read_filter_log(path: Path) -> dict[str, NDArray]:
 def thrust_attitudes(pos: NDArray, quat: NDArray) -> NDArray:
     """Return the attitudes of a body whose z axis is the mean direction of the thrust in a flight. (n, 4)
 
-    The tracked body is whatever its markers make it, while the filter takes z as the direction of the thrust, which it
-    is for the drone. The direction is the mean of R^T (a + g) from ``SETTLING_TIME`` on, with the acceleration a of the
+    The frame of the tracked body depends on its markers, while the filter assumes that the thrust is along the z axis
+    of the body. The direction is the mean of R^T (a + g) from ``SETTLING_TIME`` on, with the acceleration a of the
     positions, compared with which the mean drag is small.
 
     Args:
@@ -106,12 +106,12 @@ def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float,
 
 
 def compare_filter(folder: Path) -> Iterable[Row]:
-    """Yield errors of the filter over errors of the filter on board, flight by flight, without crashed flights."""
+    """Yield the ratio of our filter's errors to the on-board filter's for each flight that did not crash."""
     flights = {}
     for path in find_logs(folder, "*"):
         try:
             flights[path.stem] = read_filter_log(path)
-        except ConfigError as error:  # others are compared
+        except ConfigError as error:  # the other logs are still compared
             yield Row(path.stem, "filter on board", problem=str(error))
     n = max((len(log["pos"]) for log in flights.values()), default=0)
     for name, log in flights.items():

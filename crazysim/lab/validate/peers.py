@@ -18,7 +18,7 @@ from crazysim.lab.validate.rows import Row
 def mujoco_differences() -> dict[str, float]:
     """Return the largest differences of a thrown body under a constant wrench from C MuJoCo's after 0.5 s.
 
-    Both programs use methods of Runge-Kutta of order 4 with steps of 1 ms, in float64.
+    Both programs use fourth-order Runge-Kutta methods with steps of 1 ms, in float64.
 
     Returns:
         Differences of ``pos``, m, ``vel``, m/s, ``quat`` and ``ang_vel``, rad/s.
@@ -55,7 +55,7 @@ def compare_with_mujoco() -> Iterable[Row]:
 
 
 def compare_with_crazyflow() -> Iterable[Row]:
-    """Yield the distance from Crazyflow's drone after 2 s under its own controllers, in float32."""
+    """Yield the distance between our drone and Crazyflow's after 2 s under Crazyflow's controllers, in float32."""
     weight = 0.0434 * GRAVITY_MAGNITUDE
     state = np.zeros((1, 1, 16), np.float32)
     state[..., [0, 1, 2, 12]] = 0.5, -0.3, 5.2, 1.0

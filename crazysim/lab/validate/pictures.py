@@ -14,8 +14,8 @@ from crazysim.storage import replacing
 def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
     """Write a picture of the rows with a series, one panel for each unit.
 
-    Numbers along the horizontal axis make lines over it, with a logarithmic axis of errors; names make groups of
-    points, with the range of figures that pass.
+    If ``Row.at`` is a number, each series is a line, and the vertical axis is logarithmic. If it is a name, each series
+    is a set of points, and the range of figures that pass is shaded.
 
     Args:
         section: Section with labels of the axes.

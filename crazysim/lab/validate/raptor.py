@@ -1,4 +1,4 @@
-"""Flights of the foundation policy RAPTOR with late commands, here and in the simulator that it was trained in.
+"""Flights of the foundation policy RAPTOR with delayed commands, in crazysim and in the simulator of its training.
 
 The policy (Eschmann, Albani and Loianno, arXiv 2509.11481; package ``foundation-policy``) commands rotor speeds from
 position, rotation matrix, velocity, body rates and its previous action.
@@ -27,14 +27,14 @@ AIRFRAMES = ("cf21B_500", "cf2x_L250", "crazyflie", "bumblebee")
 STEP = 2
 """Step of both simulators, ms."""
 PERIODS = (10, STEP)
-"""Times between two calls of the policy, ms: as in its training, and as on flight controllers.
+"""Times between two calls of the policy, ms: the first as in its training, the second about as on flight controllers.
 
 The authors' firmware calls it every 2.5 ms on PX4, 1 ms on the Crazyflie and 0.5 ms on Betaflight.
 """
 SECONDS = 10
 """Duration of a flight, s."""
 STARTS = 20
-"""Starts of each airframe at each latency."""
+"""Number of starts of each airframe at each latency."""
 DELAYS = (0, 2, 4, 6, 8, 10, 12)
 """Latencies of the commands, ms."""
 
@@ -83,7 +83,7 @@ def hold_goal(
     Args:
         pilot: Policy.
         period: Time between two calls, ms.
-        observe: Function that returns the state as `Pilot.action` takes it.
+        observe: Function that returns the state in the layout of ``Pilot.action``.
         fly: Function that flies for the period with an action.
     """
     away: Any = 0.0
@@ -98,12 +98,12 @@ def hold_goal(
 def hold_in_simulation(
     sim: Sim, top: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int
 ) -> np.ndarray:
-    """Return which drones of a simulation, one a world, RAPTOR holds. (n_worlds,)
+    """Return which drones of a simulation, one per world, RAPTOR holds at their goal. (n_worlds,)
 
     Args:
         sim: Simulation with rotor commands, whose drones start within 0.5 m of the goal along each axis.
         top: Largest rotor speed, rpm. (n_worlds, 1) or ()
-        action: Action before the first, at whose speeds the rotors turn. (n_worlds, 4)
+        action: Action before the first call; the rotors start at its speeds. (n_worlds, 4)
         delay: Delay of the commands, steps. (n_worlds, 1) or ()
         period: Time between two calls of the policy, ms.
     """
@@ -164,7 +164,7 @@ class Quadrotors:
 
     @staticmethod
     def sample(n: int = 256) -> Quadrotors:
-        """Return quadrotors of the ranges that RAPTOR was trained on.
+        """Return quadrotors drawn from the ranges that RAPTOR was trained on.
 
         rl-tools at commit e43ae4bc, ``src/foundation_policy/pre_training/sample_dynamics_parameters.cpp``, about the
         Crazyflie of ``rl/environments/l2f/parameters/dynamics/crazyflie.h``.
@@ -188,7 +188,7 @@ def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndar
     """Return which quadrotors RAPTOR holds in crazysim. (n,)
 
     Args:
-        quadrotors: Quadrotors, one a world.
+        quadrotors: Quadrotors, one per world.
         delay: Delay of the commands, steps.
         period: Time between two calls of the policy, ms.
     """
@@ -260,14 +260,14 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
 
 
 def compare_training_airframes() -> Iterable[Row]:
-    """Yield by how much the shares of held quadrotors of its training differ here and in the simulator of it."""
+    """Yield the difference between crazysim and l2f in the share of training quadrotors that RAPTOR holds."""
     quadrotors = Quadrotors.sample()
     for period in PERIODS:
         for delay in (0, 2, 6, 10):
             ours, theirs = (
                 100 * np.mean(fly(quadrotors, delay // STEP, period)) for fly in (hold_in_crazysim, hold_in_l2f)
             )
-            # rounding decides over quadrotors at the edge of stability: 5 of 256 are 2 points
+            # rounding decides about quadrotors at the edge of stability: 5 of 256 are 2 percentage points
             yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim and l2f",
                       "256 quadrotors of the training", float(abs(ours - theirs)), "points", (0, 2),
                       f"{ours:.1f} % here, {theirs:.1f} % in l2f")  # fmt: skip

@@ -21,14 +21,14 @@ from crazysim.plugins.effects import RotorAerodynamics, Wind
 from crazysim.sim.sim import Sim
 
 FREQ, PERIOD = 1000, 0.1
-"""Steps of our flights per second, Hz, and time between two commands, s."""
+"""Rate of our steps, Hz, and time between two commands, s."""
 WIND = np.array([3.0, -1.0, 0.5])
 """Wind of the flights in moving air, world frame, m/s."""
 START = {"pos": np.array([0.0, 0.0, 50.0]), "vel": np.array([0.5, -0.3, 0.2]), "ang_vel": np.array([0.2, -0.1, 0.3])}
 """States at the start, m, m/s, rad/s."""
 
 States = list[dict[str, NDArray]]
-"""States at several times, by the names of ours."""
+"""States at several times; variables have our names."""
 
 
 def hover_speed(params: dict[str, Any]) -> float:
@@ -42,7 +42,7 @@ def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> 
     Args:
         params: RotorPy's parameters of a multirotor without parasitic drag and translational lift.
         n_worlds: Number of worlds.
-        drag: True for a linear drag of the size that the drag of the rotors has in hover, False for none.
+        drag: True for a linear drag as large as the drag of the rotors in hover, False for none.
     """
     hubs, rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
     linear = -len(hubs) * hover_speed(params) * np.array([params["k_d"], params["k_d"], params["k_z"]])
@@ -58,7 +58,7 @@ def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> 
     tables["drag"] = {"coefficients": linear * drag}
     sim = Sim(n_worlds, drone=tables, control="rotor_vel", integrator="rk4", freq=FREQ)
     p, inertia = sim.data.params, np.diag([params["Ixx"], params["Iyy"], params["Izz"]])
-    # As parameters: in an airframe they are a warning, since the largest moment exceeds the sum of the others.
+    # Set as parameters, as an airframe would cause a warning: the largest moment exceeds the sum of the others.
     changes = {"J": inertia, "J_inv": np.linalg.inv(inertia), "prop_inertia": np.zeros_like(p.prop_inertia)}
     sim.data = sim.data.replace(params=p.replace(**{k: np.asarray(x, p.J.dtype) for k, x in changes.items()}))
     return sim
@@ -106,7 +106,7 @@ def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False
 
 
 def state_differences(a: dict[str, NDArray], b: dict[str, NDArray]) -> dict[str, float]:
-    """Return the differences of two states: of ``quat`` the angle, degrees, of others the length."""
+    """Return the differences of two states: the angle for ``quat``, degrees, and the norm for other variables."""
     differences = {name: float(np.linalg.norm(a[name] - b[name])) for name in a}
     return differences | {"quat": math.degrees(angle_between(a["quat"], b["quat"]))}
 
@@ -151,7 +151,7 @@ def compare_with_rotorpy() -> Iterable[Row]:
         ours = flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
         theirs = rotorpy_flight(params, commands, aero=True)
         slow, fast = (wrenches(params, speed) for speed in (0.1, 3.0))
-    # RotorPy's integrator keeps 1e-10 of each state in each of about 100 steps
+    # RotorPy's integrator has a relative tolerance of 1e-10 in each of about 100 steps
     for name, what, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
                                     ("ang_vel", "angular velocity", "rad/s", 1e-8),
                                     ("rotor_vel", "rotor speeds", "rpm", 1e-4)):  # fmt: skip

@@ -39,7 +39,7 @@ class Row:
 
     @property
     def failed(self) -> bool:
-        """True where the figure is out of its bound, or the comparison failed to run."""
+        """True if the figure is out of its bound, or the comparison failed to run."""
         return bool(self.problem) or (self.bound is not None and not self.bound[0] <= self.figure <= self.bound[1])
 
     @property
@@ -61,7 +61,7 @@ class Section:
     checks: Sequence[Callable[[], Iterable[Row]]]
     """Functions that measure rows."""
     packages: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Packages that must be importable, and their names with version for pip."""
+    """Modules that must be importable, with the requirement for pip of each."""
     absent: str = ""
     """Reason why the section is not measured."""
     logs: bool = False

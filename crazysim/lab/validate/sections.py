@@ -1,4 +1,4 @@
-"""The sections of the page."""
+"""Sections of the validation page."""
 
 from __future__ import annotations
 
