@@ -26,7 +26,7 @@ from crazysim.media.worlds import world_indices
 from crazysim.scene.visual_geoms import visual_geoms
 
 MAX_WORLDS = 64
-"""Most worlds that are shown unless they are listed."""
+"""Largest number of worlds that are shown if ``worlds`` is None."""
 WORLD_MARGIN = 1.0
 """Free space between neighbouring worlds, m."""
 CLOSE_TIMEOUT = 0.5
@@ -36,16 +36,16 @@ log = logging.getLogger(__name__)
 
 
 class Browser(Viewer[Live]):
-    """Viewer in any number of browsers, by viser, which runs in other threads.
+    """Viewer in any number of web browsers, served by viser in other threads.
 
         browser = live.show(Browser(port=8080))
         print(browser.url)
 
-    A click on a drone selects it, and one on a vehicle, load or object follows that. The panel plots any array of the
-    data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
+    A click on a drone selects it; a click on a vehicle, load or object makes the viewer follow it. The panel plots any
+    array of the data, pauses, resets, records, and has the buttons and sliders of the loop. Browsers may come and go.
 
     The address has a new token every time. Whoever has it can watch and command the simulation; others are refused, and
-    so are pages of other sites.
+    so are requests from pages of other sites.
     """
 
     def __init__(
@@ -64,9 +64,10 @@ class Browser(Viewer[Live]):
 
         Args:
             port: Port; 0 for any free one.
-            host: Address to listen at: this machine's alone by default, ``0.0.0.0`` for every network.
+            host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network.
             worlds: Indices of the worlds, shown side by side; None for all, up to ``MAX_WORLDS``.
-            spacing: Distance between their origins, m; None for the size of the first picture and a margin.
+            spacing: Distance between their origins, m; None for the largest horizontal extent of the drones of a world
+                in the first picture, plus a margin.
             trail: Duration of trails, s; 0 for none.
             contacts: True to mark drones that touch something, which is computed for every picture.
             wind: True to draw the wind at every drone.

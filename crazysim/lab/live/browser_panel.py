@@ -20,13 +20,13 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "max")
 TEXT_PERIOD, PLOT_PERIOD = 0.2, 0.1
 """Time between updates of the text and of the plot, s."""
 PLOT_SAMPLE = 0.02
-"""Least simulated time between two samples of a plot, s."""
+"""Shortest simulated time between two samples of a plot, s."""
 PLOT_LENGTH = 500
 """Number of samples of a plot."""
 COLORS = ("#d6452f", "#2a7fd9", "#37a35a", "#d99a1c", "#8a4fbf", "#444444")
 """Colours of the lines of a plot, repeated in this order."""
 MAX_LINES = 16
-"""Most lines of a plot."""
+"""Largest number of lines of a plot."""
 KEY_TIME = 0.25
 """Time for which a button or key of the browser holds a key of the loop, s: browsers report presses only."""
 KEYS = {
@@ -87,11 +87,11 @@ class BrowserPanel:
                     self.plot = choice.value
 
     def update(self, picture: Picture, now: float) -> None:
-        """Show text and plot, each at its rate.
+        """Update the text and the plot, each at its own rate.
 
         Args:
             picture: Picture that is shown.
-            now: Present time, s.
+            now: Present time (``time.perf_counter``), s.
         """
         if now - self._text_at >= TEXT_PERIOD:
             self._text_at = now

@@ -121,7 +121,10 @@ class BrowserScene:
     def pick(
         self, picture: Picture, origin: ArrayLike, direction: ArrayLike
     ) -> tuple[int, SceneBody | None, NDArray | None]:
-        """Return index of the world, body or None, and point of the floor, m, or None, that a ray from the camera hits.
+        """Return what a ray from the camera hits: the index of a world, and a body or a point of its floor.
+
+        The point is in the frame of the world, m. (3,) The body or the point is None; both are, with index 0, if the
+        ray hits nothing.
 
         Args:
             picture: Picture that the user has seen.
@@ -166,7 +169,7 @@ class BrowserScene:
         return np.where(hit, beside, np.inf)
 
     def _add_bodies(self, bodies: NDArray, shapes: list[VisualGeom], picture: Picture) -> None:
-        """Add bodies of equal geoms, one batch for each colour."""
+        """Add bodies that have the same geoms, as one batch for each colour."""
         by_color: dict[tuple, list[VisualGeom]] = defaultdict(list)
         for shape in shapes:
             by_color[tuple(np.round(shape.rgba, 3))].append(shape)
@@ -183,7 +186,7 @@ class BrowserScene:
             self._batches.append((handle, bodies))
 
     def _add_balls(self, name: str, radius: float, pos: NDArray, colors: Any, opacity: float) -> Any:
-        """Add a sphere for each point of all worlds, or None if there are none."""
+        """Add a sphere at each point of all worlds, and return their node, or None if there are no points."""
         if not pos.size:
             return None
         import trimesh
@@ -233,18 +236,18 @@ class BrowserScene:
         pos = finite_rows(bodies[k, picture.followed[1]])
         radius = self._bodies.radius(picture.followed[1])
         self._followed.position = pos
-        if radius != self._followed.radius:  # browsers build the sphere again for it
+        if radius != self._followed.radius:  # only on a change, because browsers rebuild the sphere
             self._followed.radius, self._label.position = radius, (0.0, 0.0, radius)
         self._label.text = picture.name
         self._root.position = -pos if follow else (0.0, 0.0, 0.0)
 
     def _moved(self, pos: NDArray) -> NDArray:
-        """Return positions of every world at the world's place in the grid."""
+        """Return positions in the frame of the grid, from positions in the frame of each world, m."""
         return pos + self.offsets[:, None]
 
 
 def grid_offsets(n: int, spacing: float) -> NDArray:
-    """Return the places of n worlds in a square grid around the origin, m. (n, 3)"""
+    """Return the origins of n worlds in a square grid around the origin, m. (n, 3)"""
     columns = int(np.ceil(np.sqrt(n)))
     row, column = np.divmod(np.arange(n), columns)
     rows = -(-n // columns)
@@ -257,7 +260,7 @@ def rgb_of(colors: NDArray) -> NDArray:
 
 
 def _group_equal_bodies(by_body: dict[int, list[VisualGeom]]) -> list[list[int]]:
-    """Return the bodies in groups of equal geoms."""
+    """Return the bodies, grouped by equal geoms."""
     groups: dict[tuple, list[int]] = defaultdict(list)
     for body, shapes in by_body.items():
         key = tuple(

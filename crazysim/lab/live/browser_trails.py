@@ -32,7 +32,7 @@ class Trails:
         self._samples: deque[NDArray] = deque(maxlen=self._length)
         self._last = -np.inf
         pos = finite_rows(pos)
-        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # towards the floor, as lines are opaque
+        fade = np.linspace(MIN_ALPHA, 1.0, self._length)[:, None, None]  # to the floor's grey; lines are opaque
         shades = np.round(255 * (FLOOR_GREY - fade * (FLOOR_GREY - colors))).astype(np.uint8)
         self._handle = scene.add_line_segments(
             "/world/trails", self._segments(pos), np.repeat(shades.reshape(-1, 1, 3), 2, axis=1), thickness=2.0,
@@ -40,7 +40,7 @@ class Trails:
         )  # fmt: skip
 
     def update(self, time: float, pos: NDArray, visible: bool) -> None:
-        """Add a sample if one is due, and show the trails up to the present positions; a jump in time clears them."""
+        """Add a sample and redraw the trails if a sample is due; a jump back in time clears them."""
         self._handle.visible = visible
         if time < self._last:
             self._samples.clear()

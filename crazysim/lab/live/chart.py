@@ -1,4 +1,4 @@
-"""A plot over time in a corner of a window, by MuJoCo's figures."""
+"""A plot over time in a corner of a window, drawn as a MuJoCo figure."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from crazysim.media.trail import COLORS
 LENGTH = 400
 """Number of samples of a line."""
 MAX_LINES = 6
-"""Most lines."""
+"""Largest number of lines."""
 PART = 0.3
-"""Size of the plot, as a part of the window."""
+"""Width and height of the plot, as a fraction of the window's."""
 
 
 class Chart:
@@ -36,7 +36,7 @@ class Chart:
             figure.linergb[k] = COLORS[k % len(COLORS), :3]
 
     def add(self, picture: Picture) -> None:
-        """Add the values of a picture; another drone, or a jump back in time, begins again."""
+        """Add the values of a picture; the chart restarts for another drone or after a jump back in time."""
         values = picture.plot[:MAX_LINES]
         restarts = self._times and (picture.time < self._times[-1] or len(values) != len(self._values[-1]))
         if restarts or picture.selected != self._selected:

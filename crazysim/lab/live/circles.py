@@ -8,24 +8,24 @@ from numpy.typing import NDArray
 from crazysim.lab.live.loop import Live
 
 HEIGHT = 1.0
-"""Height of the circles, m."""
+"""Height of the circles above the initial positions, m."""
 RADIUS = 0.3
 """Radius of the circles, m."""
 PERIOD = 4.0
-"""Time of a circle, s."""
+"""Duration of one circle, s."""
 CLIMB = 2.0
 """Time in which the drones rise to their circles, s."""
 
 
 class Circles:
-    """Process in which drones rise and fly circles above their initial positions."""
+    """Process that makes the drones rise and fly circles that pass above their initial positions."""
 
     def __init__(self, live: Live, piloted: bool):
-        """Create circles around the drones' present positions.
+        """Create circles that pass above the drones' present positions.
 
         Args:
             live: Loop.
-            piloted: True to let the first drone of the first world hover, for a pilot.
+            piloted: True to leave the first drone of the first world to a pilot once it has risen.
         """
         self._places = np.asarray(live.sim.data.states.pos, float).copy()
         self._piloted = piloted
@@ -42,7 +42,7 @@ class Circles:
 
 
 def circle_commands(places: NDArray, time: float) -> NDArray:
-    """Return state commands of drones that rise above positions, and circle. (n_worlds, n_drones, 16)
+    """Return state commands of drones that rise above positions while they circle. (n_worlds, n_drones, 16)
 
     Args:
         places: Positions, m. (n_worlds, n_drones, 3)

@@ -60,7 +60,7 @@ class Start:
     drone: int | None
     """ID of the drone; None for all."""
     relative: bool = False
-    """True where the trajectory is shifted to start at the present setpoint."""
+    """True if the trajectory is shifted to start at the present setpoint."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def command_of(frame: Message | ShowFile, drone: int | None = None) -> Command:
     """
     if isinstance(frame, ShowFile):
         return LoadShow(parse_show(frame.content, "a received show"))
-    drone = drone if frame.drone is None else frame.drone or None  # 00 is all
+    drone = drone if frame.drone is None else frame.drone or None  # ID 00 addresses all drones
     name, argument = frame.command, frame.argument
     if name in ("upload", "traj"):
         if frame.payload is None:

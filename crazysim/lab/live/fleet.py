@@ -1,4 +1,4 @@
-"""Fleets: the drones of a running simulation, which commands move."""
+"""Fleets: the drones of a running simulation, moved by commands."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from crazysim.trajectories import Trajectory, hover, line
 SPEED = 0.5
 """Mean speed of take-off and landing, m/s."""
 MIN_TIME = 1.0
-"""Least time of take-off and landing, s."""
+"""Shortest duration of take-off and landing, s."""
 MAX_PIECES = 256
-"""Most pieces of a trajectory, by default."""
+"""Default largest number of pieces of a trajectory."""
 DEGREE = 7
 """Highest degree of a trajectory."""
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class Fleet:
-    """The drones of a simulation of one world, each with a trajectory, which commands replace.
+    """The drones of a simulation of one world, each on a trajectory that commands replace.
 
         sim = Sim(n_drones=3, control="state")
         fleet = Fleet(sim)
@@ -42,7 +42,7 @@ class Fleet:
         sim.step(500)
 
     Commands take effect between two steps; nothing is compiled again. A command that cannot be carried out is logged,
-    and the drone continues its trajectory. A new ID is given to the next free drone.
+    and the drone continues its trajectory. A new ID is assigned to the next free drone.
     """
 
     parameters: list[dict[str, float]]
@@ -60,8 +60,8 @@ class Fleet:
 
         Args:
             sim: Simulation of one world with state commands.
-            ids: Drone of each ID that is in use; None for none.
-            max_pieces: Most pieces of a trajectory.
+            ids: Index of the drone of each ID that is in use; None if no ID is in use yet.
+            max_pieces: Largest number of pieces of a trajectory.
             teleport: True to move a drone to the start of the first trajectory that it receives before any other
                 command, as the lab's simulator does.
             name: Name of the plugin that follows the trajectories.
@@ -89,10 +89,10 @@ class Fleet:
         sim.build_default_data()
 
     def apply(self, commands: Iterable[Command]) -> int:
-        """Carry out commands between two steps, and return how many could be carried out.
+        """Carry out commands between two steps, and return the number of those that succeeded.
 
         Args:
-            commands: Commands, in their order; one that cannot be carried out is logged.
+            commands: Commands, in order; one that cannot be carried out is logged.
         """
         n = 0
         for command in commands:
@@ -229,7 +229,7 @@ def _move(point: NDArray, height: float) -> Trajectory:
 
 
 def _without_padding(trajectory: Trajectory) -> Trajectory:
-    """Return one trajectory of a stacked record without the pieces that have no length."""
+    """Return one trajectory of a stacked record without the zero-length pieces that pad its end."""
     ends = np.asarray(trajectory.ends, float)
     n = max(int(np.searchsorted(ends, ends[-1])) + 1, 1)
     cut = jax.tree.map(np.asarray, trajectory)

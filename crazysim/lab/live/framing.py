@@ -1,8 +1,8 @@
-"""Messages in a stream of bytes: where each begins and ends, however the stream is split.
+"""Framing of a stream of bytes: where each message begins and ends, however the stream is split.
 
 The stream has the lab's messages ``<ID>_CMDSTART_<command>_<argument>_EOF`` and ``CMDSTART_<command>_<argument>_EOF``,
 whose argument may be a JSON object with any characters, ``REQ_<ID>``, ``START``, and shows: a zip archive followed by
-``SKYC``. Nothing is searched for inside JSON or archives: their own structure shows where they end.
+``SKYC``. End markers inside JSON and archives are ignored: where these end follows from their own structure.
 """
 
 from __future__ import annotations
@@ -63,9 +63,11 @@ class ShowFile:
 class Frames:
     """Buffer of a stream.
 
-    frames = Frames()
-    for message in frames.feed(received):
-        ...
+        frames = Frames()
+        for message in frames.feed(received):
+            ...
+
+    The bytes may be split anywhere between the calls of ``feed``.
     """
 
     def __init__(self) -> None:
@@ -79,14 +81,15 @@ class Frames:
 
     @property
     def pending(self) -> bool:
-        """True where the buffer holds the start of a message."""
+        """True if the buffer holds the start of a message."""
         return bool(self._buffer)
 
     def feed(self, received: bytes) -> Iterator[Message | Request | ShowFile]:
-        """Yield the messages that are complete with these bytes.
+        """Add bytes to the buffer, and yield the messages that they complete.
 
         Raises:
-            FramingError: If bytes that are not a message follow, or a message is too long. The stream is lost then.
+            FramingError: If bytes that are not a message follow, or a message is too long. The rest of the
+                stream cannot be read.
         """
         self._buffer += received
         while (message := self._next()) is not None:
@@ -120,7 +123,7 @@ class Frames:
         return None
 
     def _may_begin(self, front: bytes) -> bool:
-        """Return True where these bytes may be the start of a message."""
+        """Return True if these bytes may be the start of a message."""
         if any(start.startswith(front[: len(start)]) for start in MESSAGE_STARTS) and len(front) <= MAX_TEXT:
             rest = front[len(b"CMDSTART_") :]
             return not front.startswith(b"CMDSTART_") or bool(re.fullmatch(rb"\d{0,4}|(\d{1,4}_)?[a-z]{0,20}", rest))
@@ -162,7 +165,7 @@ class Frames:
         return message
 
     def _end_of_json(self, brace: int) -> int | None:
-        """Return the end of a JSON object; every byte is examined once, however it arrives."""
+        """Return the end of a JSON object; each byte is examined only once, however the bytes arrive."""
         self._at = max(self._at, brace)
         while (token := TOKEN_PATTERN.search(self._buffer, self._at)) is not None:
             kind = token[0]
@@ -170,7 +173,7 @@ class Frames:
                 if token.end() >= len(self._buffer):
                     self._at = token.start()
                     return None
-                self._at = token.end() + 1  # the escaped character
+                self._at = token.end() + 1  # skip the escaped character
                 continue
             self._at = token.end()
             if kind == b'"':

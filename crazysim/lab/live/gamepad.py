@@ -1,4 +1,4 @@
-"""Gamepads, read through GLFW, which MuJoCo installs and which has the layouts of all common ones."""
+"""Gamepads, read through GLFW, which is installed with MuJoCo and has the layouts of all common gamepads."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class Gamepad:
     """Sticks of a gamepad, for ``Pilot(sticks=[Gamepad()])``.
 
     The left stick climbs and turns, the right one flies forwards and sideways: mode 2 of model flying. Buttons call
-    functions of the loop: ``gamepad.bind("a", lambda live: live.reset())``. A gamepad that is pulled out counts as
-    released until it is back.
+    functions of the loop: ``gamepad.bind("a", lambda live: live.reset())``. The sticks of a gamepad that
+    is unplugged count as released until it is connected again.
     """
 
     def __init__(self, number: int | None = None, glfw: Any = None):
         """Open a gamepad.
 
         Args:
-            number: Number of the gamepad, from 0; None for the first there is.
+            number: Number of the gamepad, from 0; None for the first that is connected.
             glfw: Module with the functions of GLFW; None for ``glfw``.
 
         Raises:

@@ -17,7 +17,7 @@ class Snapshot:
     step: int
     """Control step."""
     data: SimData
-    """Data of the simulation; immutable, so that a snapshot costs the memory of its arrays only."""
+    """Data of the simulation; immutable, so a snapshot needs no copy."""
     commands: NDArray | None
     """Commands that processes had written; None before the first. (n_worlds, n_drones, k)"""
 
@@ -29,13 +29,13 @@ class History:
         """Create an empty history.
 
         Args:
-            length: Most snapshots to keep in addition to the first.
+            length: Largest number of snapshots to keep in addition to the first.
         """
         self._first: Snapshot | None = None
         self._latest: deque[Snapshot] = deque(maxlen=length)
 
     def add(self, snapshot: Snapshot) -> None:
-        """Add a snapshot, unless there is one of that step, as after a jump back."""
+        """Add a snapshot, unless there is one of its step or a later one, as after a jump back."""
         if self._first is None:
             self._first = snapshot
         elif snapshot.step > (self._latest[-1] if self._latest else self._first).step:

@@ -20,10 +20,10 @@ class HostTrajectory(NamedTuple):
     ends: NDArray
     """End of each piece, s since the start. (n_pieces,)"""
     coefficients: NDArray
-    """Coefficients of x, y, z, m, and yaw, rad, constant term first, of the piece's time divided by its length.
-    (n_pieces, 4, degree + 1)"""
+    """Coefficients of the polynomials of x, y, z, m, and yaw, rad, constant term first. Their variable is the time
+    since the start of the piece divided by its duration. (n_pieces, 4, degree + 1)"""
     repeats: bool
-    """True where the trajectory starts again after its end."""
+    """True if the trajectory starts again after its end."""
 
     @staticmethod
     def of(trajectory: Trajectory) -> HostTrajectory:
@@ -63,7 +63,7 @@ def _powers(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def host_trajectories(trajectories: Trajectory | Sequence[Trajectory]) -> list[HostTrajectory]:
-    """Return trajectories on the host: of one record, with or without a leading axis, or of a sequence."""
+    """Return the trajectories of a record, with or without a leading axis, or of a sequence of records, on the host."""
     if not isinstance(trajectories, Trajectory):
         return [HostTrajectory.of(t) for t in trajectories]
     if np.ndim(trajectories.ends) == 1:

@@ -18,7 +18,7 @@ from crazysim.sim.sim import Sim
 
 
 class Interaction:
-    """The part of ``Live`` that viewers and people use."""
+    """The part of ``Live`` that viewers and users interact with."""
 
     sim: Sim
     """The simulation."""
@@ -29,14 +29,15 @@ class Interaction:
     values: dict[str, float]
     """Present values of the sliders, by name."""
     selected: tuple[int, int] | None
-    """World and drone that are plotted and piloted, and followed unless ``follow`` chose another; None for none."""
+    """World and drone that are plotted, piloted and, unless ``follow`` chose another body, followed; None for none."""
     lights: NDArray
     """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
     (n_worlds, n_drones, 3)"""
     quantities: dict[str, Callable[[Self], ArrayLike]]
-    """Further quantities that viewers can plot: by name, functions of the loop that return numbers. (k,)"""
+    """Further quantities that viewers can plot, by name: functions of the loop that return numbers. (k,)"""
     on_click: Callable[[Self, int, NDArray], object] | None
-    """Function that is called with the loop, a world and a point of its ground, m, that was clicked in a viewer."""
+    """Function that is called with the loop, the world and the point of its ground, m, when a viewer is
+    clicked; None for none."""
 
     def __init__(self, sim: Sim):
         self.sim = sim
@@ -48,7 +49,7 @@ class Interaction:
         self._posted: deque[Callable[[Self], object]] = deque()
 
     def button(self, name: str, call: Callable[[Self], object], key: str | None = None) -> None:
-        """Add a button to viewers that are shown from now on, and a key that does the same."""
+        """Add a button to viewers that are shown from now on, and optionally a key that calls the same function."""
         self.controls.append(Button(name, partial(call, self), key))
         if key is not None:
             self.keyboard.bind(key, call)
@@ -86,7 +87,7 @@ class Interaction:
         return [control for control in self.controls if isinstance(control, Slider)]
 
     def turn(self, parts: float) -> None:
-        """Move the chosen slider by some parts of its range, as keys do."""
+        """Move the chosen slider by a fraction of its range, as the keys do."""
         if self._sliders:
             slider = self._sliders[self._slider]
             self.set_value(slider.name, self.values[slider.name] + parts * (slider.high - slider.low))
@@ -111,7 +112,7 @@ class Interaction:
 
     @property
     def followed(self) -> tuple[int, str, int] | None:
-        """World, kind and index of the body that viewers mark and follow: the selected drone, or ``follow``'s."""
+        """World, kind and index of the body that viewers mark and follow: the selected drone or ``follow``'s body."""
         if self._followed is not None or self.selected is None:
             return self._followed
         return self.selected[0], DRONE, self.selected[1]

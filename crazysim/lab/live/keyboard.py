@@ -33,7 +33,7 @@ class Keyboard(Generic[L]):
         self._pressed.append(key)
 
     def hold(self, key: str, seconds: float) -> None:
-        """Hold a key for a while, s, for viewers that do not report when it is released; calls nothing."""
+        """Hold a key for a while, s, for viewers that do not report its release; the key's function is not called."""
         self._held[key] = time.monotonic() + seconds
 
     def release(self, key: str) -> None:

@@ -1,4 +1,4 @@
-"""Links to drones, simulated and real, that take the same commands and give the same states."""
+"""Links to drones, simulated and real, that accept the same commands and return the same states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Link(Protocol):
     """Name of the drone."""
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command of one drone: numbers of ``sim.state_control``, ``attitude_control`` and so on. (k,)"""
+        """Send a command to the drone: the numbers that ``sim.state_control``, ``attitude_control``, ... take. (k,)"""
         ...
 
     def state(self) -> DroneState:
@@ -47,7 +47,7 @@ class SimLink:
         self.name = swarm.names[self.drone]
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Send a command of one drone."""
+        """Send a command to the drone."""
         with self.swarm.lock:
             self.swarm.commanders[self.drone].command(level, values)
 
@@ -107,7 +107,7 @@ class TrainedPolicy:
     def __init__(
         self, policy: Callable[[dict[str, NDArray]], ArrayLike], meta: Mapping[str, Any], goal: ArrayLike = (0, 0, 1)
     ):
-        """Check that the observations follow from a drone's state.
+        """Check that the observations can be computed from a drone's state.
 
         Args:
             policy: Function of the observations that returns an action from -1 to 1.

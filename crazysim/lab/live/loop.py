@@ -29,11 +29,11 @@ from crazysim.sim.sim import Sim
 from crazysim.storage import Closing
 
 SLICE = 0.01
-"""Longest sleep, s, after which clicks and keys are handled."""
+"""Longest sleep before clicks and keys are handled again, s."""
 ALARM = 0.02
-"""Lateness of a control step that is logged, s."""
+"""Lateness of a control step above which a warning is logged, s."""
 ALARM_PERIOD = 10.0
-"""Time from one such warning to the next, s."""
+"""Shortest time between two such warnings, s."""
 
 V = TypeVar("V", bound="Viewer[Live]")
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ class Live(Interaction, Closing):
     step: int
     """Control steps since the last reset."""
     flown: int
-    """Control steps since the beginning, which resets do not set back."""
+    """Control steps since the loop was created; resets and jumps do not set it back."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class Live(Interaction, Closing):
         snapshot_s: float = 1.0,
         n_snapshots: int = 60,
     ):
-        """Prepare; ``run`` starts.
+        """Create a loop; ``run`` starts it.
 
         Args:
             sim: Simulation, which continues from its present state.
@@ -73,7 +73,7 @@ class Live(Interaction, Closing):
             speed: Simulated seconds per second, or ``"max"`` for as fast as possible.
             fps: Pictures per second, at any speed.
             snapshot_s: Simulated time between snapshots for ``go_to``, s.
-            n_snapshots: Most snapshots to keep.
+            n_snapshots: Largest number of snapshots to keep in addition to the first.
         """
         control_freq = positive_integer("control_freq", control_freq)
         if sim.freq % control_freq:
@@ -133,7 +133,7 @@ class Live(Interaction, Closing):
         self.paused = not self.paused
 
     def advance(self, n_steps: int = 1) -> None:
-        """Advance by control steps as fast as possible, even while paused: the single step of a paused simulation."""
+        """Advance by control steps as fast as possible, even while paused, for single steps."""
         n_steps = positive_integer("n_steps", n_steps)
         self._between_steps(lambda _: self._advance(n_steps))
 
@@ -144,7 +144,7 @@ class Live(Interaction, Closing):
     def go_to(self, time: float) -> None:
         """Go to a time since the last reset, s: forwards as fast as possible, backwards from the snapshot before it.
 
-        Processes and events take part; the method ``reset(live)`` of processes is called after a jump backwards.
+        Processes and events are called on the way. After a jump backwards, ``reset(live)`` of the processes is called.
         """
         if not np.isfinite(time) or time < 0:
             raise ConfigError(f"expected a time of 0 s or more, got {time!r}")
@@ -172,10 +172,11 @@ class Live(Interaction, Closing):
 
         Args:
             process: Function; must not wait. Its method ``reset(live)``, if it has one, is called after resets.
-            freq: Rate of the calls in simulated time, Hz, a divisor of the rate of control steps; None for every one.
+            freq: Rate of the calls in simulated time, Hz, a divisor of the rate of control steps; None for every
+                control step.
             name: Name in messages; None for the name of the function.
-            on_error: ``"raise"`` to end ``run`` with its errors, ``"report"`` to log them and continue, for sources
-                outside, such as motion capture.
+            on_error: ``"raise"`` to end ``run`` with its errors, ``"report"`` to log them and continue, for external
+                sources such as motion capture.
         """
         if not callable(process):
             raise ConfigError(f"expected a function of the loop, got {process!r}")
@@ -188,14 +189,14 @@ class Live(Interaction, Closing):
         return self._processes[-1]
 
     def at(self, time: float, call: Callable[[Live], object], name: str | None = None) -> None:
-        """Call a function of the loop once the simulation reaches a time, again after every reset."""
+        """Call a function of the loop when the simulation reaches a time, s, and again after every reset."""
         step = int(np.ceil(time * self.control_freq - 1e-6)) if np.isfinite(time) else -1
         if step < self.step:
             raise ConfigError(f"expected a time of {self.time:g} s or later, got {time!r}")
         self._events[step].append(Event(step, partial(call, self), name or getattr(call, "__name__", "event")))
 
     def show(self, viewer: V) -> V:
-        """Show the simulation in a viewer, and return that; ``run`` ends when all viewers have been closed.
+        """Show the simulation in a viewer, and return the viewer; ``run`` ends when all viewers have been closed.
 
         Raises:
             RenderError: If this machine cannot show it, or a port is in use.
@@ -208,7 +209,7 @@ class Live(Interaction, Closing):
     def record(self, path: str | Path, freq: float = 50.0) -> Path:
         """Record poses from now on, and return the path of the file: a new one, numbered if ``path`` exists.
 
-        Each sample is written as it comes: the file is complete up to the moment of a crash. Load it with
+        Each sample is written at once, so after a crash the file is complete up to that moment. Load it with
         ``crazysim.media.Flight.load``.
 
         Args:
@@ -239,7 +240,7 @@ class Live(Interaction, Closing):
     # Running --------------------------------------------------------------------------------------------------------
 
     def run(self, seconds: float | None = None) -> LiveReport:
-        """Run for some simulated time, until ``stop``, Ctrl-C, or until all viewers are closed; return the figures.
+        """Run for some simulated time, or until ``stop``, Ctrl-C or the closing of all viewers; return a report.
 
         Args:
             seconds: Simulated time, s; None for no end.
@@ -375,7 +376,7 @@ class Live(Interaction, Closing):
 
 
 KEY_TURN = 0.05
-"""Part of a slider's range by which a key moves it."""
+"""Fraction of a slider's range by which a key moves it."""
 
 
 def _scale(factor: float) -> Callable[[Live], None]:

@@ -1,4 +1,4 @@
-"""Pace of a live simulation: when each control step is due, and how well that was kept."""
+"""Pace of a live simulation: when each control step is due, and how late it began."""
 
 from __future__ import annotations
 
@@ -22,17 +22,21 @@ TOLERANCE = 2e-3
 MAX_LAG = 0.25
 """Lag above which the loop drops the lost time instead of catching up, s."""
 BIN_WIDTH = 1e-4
-"""Resolution of the statistics of lateness, s."""
+"""Width of the bins of the statistics of lateness, s."""
 SWITCH_INTERVAL = 5e-4
-"""Time after which another thread of Python gives way to the loop, s."""
+"""Time after which another Python thread yields to the loop, s."""
 N_BINS = 5000
-"""Number of their bins; the last one holds everything above."""
+"""Number of bins of the statistics of lateness; the last one also holds everything above."""
 N_LISTED = 3
-"""Most processes that a report lists."""
+"""Largest number of processes that a report lists."""
 
 
 def check_speed(speed: Speed) -> Speed:
-    """Return a speed, checked."""
+    """Check a speed, and return it.
+
+    Raises:
+        ConfigError: If it is neither a positive number nor ``"max"``.
+    """
     if speed == "max":
         return "max"
     if isinstance(speed, (bool, str)) or not np.isfinite(speed) or speed <= 0:
@@ -47,13 +51,13 @@ class LiveReport:
     simulated_s: float
     """Simulated time, s."""
     wall_s: float
-    """Time without pauses, s."""
+    """Wall-clock time without pauses, s."""
     steps: int
     """Number of control steps."""
     late: int
     """Number of control steps that began more than ``TOLERANCE`` late."""
     lateness_999: float
-    """Lateness that 99.9% of the control steps kept below, s; 0 at ``speed="max"``."""
+    """Lateness that 99.9% of the control steps did not exceed, s; 0 at ``speed="max"``."""
     worst: float
     """Greatest lateness, s."""
     worst_at: float
@@ -63,9 +67,9 @@ class LiveReport:
     pictures: int
     """Number of pictures sent to viewers."""
     slowest: str
-    """Processes by their longest call, the longest first; empty without processes."""
+    """Processes with the longest calls, the longest first; empty without processes."""
     failures: int
-    """Number of errors that were reported and passed over."""
+    """Number of errors that were logged without ending the run."""
 
     @property
     def factor(self) -> float:
@@ -73,7 +77,7 @@ class LiveReport:
         return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
 
     def __str__(self) -> str:
-        """Return the figures for reading."""
+        """Return the report as text."""
         lines = [f"{self.simulated_s:.2f} s in {self.wall_s:.2f} s: {self.factor:.2f} times real time"]
         if self.worst > 0:
             lines.append(
@@ -92,7 +96,7 @@ class LiveReport:
 
 
 class Pace:
-    """Times at which control steps are due, and statistics of their lateness in constant memory."""
+    """Due times of control steps, and statistics of their lateness in constant memory."""
 
     steps: int
     """Number of control steps so far."""
@@ -111,7 +115,7 @@ class Pace:
         Args:
             dt: Simulated time between control steps, s.
             speed: Simulated seconds per second, or ``"max"``.
-            clock: Returns the time, s.
+            clock: Function that returns the time, s.
         """
         self._dt, self._clock = dt, clock
         self._speed: Speed = check_speed(speed)
@@ -135,7 +139,7 @@ class Pace:
         self._due = self._clock()
 
     def due_in(self) -> float:
-        """Return the time until the next control step is due, s; not positive if it is."""
+        """Return the time until the next control step is due, s; zero or negative if it is due already."""
         return 0.0 if self._speed == "max" else self._due - self._clock()
 
     def record_step(self, time: float) -> float:
@@ -159,7 +163,7 @@ class Pace:
         return lateness
 
     def quantile(self, part: float) -> float:
-        """Return the lateness that a part of the control steps, 0 to 1, kept below, s."""
+        """Return the lateness that a fraction of the control steps, 0 to 1, did not exceed, s."""
         total = self._counts.sum()
         if not total:
             return 0.0
@@ -174,9 +178,9 @@ class Pace:
         Args:
             processes: Processes of the loop.
             simulated_s: Simulated time, s.
-            wall_s: Time without pauses, s.
+            wall_s: Wall-clock time without pauses, s.
             pictures: Number of pictures.
-            failures: Number of errors of viewers and recordings that were passed over.
+            failures: Number of logged errors of requests, viewers and recordings; those of the processes are added.
         """
         longest = sorted(processes, key=lambda process: -process.longest)[:N_LISTED]
         slowest = ", ".join(f"{p.name} {1e3 * p.longest:.1f} ms at {p.longest_at:.2f} s" for p in longest)
@@ -189,10 +193,10 @@ class Pace:
 
 @contextlib.contextmanager
 def protect_loop() -> Iterator[None]:
-    """Keep other threads of Python and the garbage collector from delaying the loop."""
+    """Keep other Python threads and the garbage collector from delaying the loop."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
-    gc.freeze()  # the objects of JAX and MuJoCo are not examined again: that takes 0.1 s and more
+    gc.freeze()  # exempt the objects of JAX and MuJoCo, whose collection takes 0.1 s and more
     try:
         yield
     finally:

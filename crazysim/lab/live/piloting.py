@@ -16,14 +16,14 @@ Sticks = Callable[[Live], NDArray]
 """Function of the loop that returns forward, left, up and turn left, each from -1 to 1. (4,)"""
 
 KEYS = (("up", "down"), ("left", "right"), ("w", "s"), ("a", "d"))
-"""Keys of forward and back, left and right, up and down, turn left and right."""
+"""Pairs of keys: forward and back, left and right, up and down, turn left and turn right."""
 MAX_LEAD = 0.7
-"""Most time by which the setpoint leads the drone at full speed, s: after a stick is released, or a drone is held
-back, the setpoint is not far away."""
+"""Longest time by which the setpoint leads the drone at full speed, s. It keeps the setpoint close after a stick is
+released or while the drone is held back."""
 
 
 def keyboard_sticks(live: Live) -> NDArray:
-    """Return the sticks that the arrow keys and W, S, A, D stand for. (4,)"""
+    """Return the deflections of the sticks that the arrow keys and W, S, A, D represent. (4,)"""
     return np.array([live.keyboard.axis(*keys) for keys in KEYS])
 
 
@@ -49,8 +49,9 @@ def move_setpoint(setpoint: ArrayLike, sticks: ArrayLike, dt: float, speed: floa
 class Pilot:
     """Pilot of the selected drone, a process of a live loop: ``live.add(Pilot())``.
 
-    Arrow keys move the setpoint forwards, backwards and sideways as the drone is turned, W and S up and down, A and D
-    turn it. The drone follows by its state controller. A click on the ground in a viewer sends the drone there.
+    Arrow keys move the setpoint forwards, backwards and sideways, relative to its yaw; W and S move it up and down; A
+    and D turn it. The state controller makes the drone follow. With ``live.on_click = pilot.go_to``, a click
+    on the ground in a viewer sends the drone there.
     """
 
     def __init__(
@@ -64,11 +65,11 @@ class Pilot:
         """Choose sticks and limits.
 
         Args:
-            sticks: Sources of deflections, which are added up and limited: ``keyboard_sticks``, a ``Gamepad``.
+            sticks: Sources of deflections, whose sum is clipped to -1 to 1: ``keyboard_sticks``, a ``Gamepad``.
             speed: Speed at full deflection, m/s.
             yaw_rate: Yaw rate at full deflection, rad/s.
-            low: Least position of the setpoint, m. (3,)
-            high: Greatest position, m. (3,)
+            low: Lower limits of the setpoint's position, world frame, m. (3,)
+            high: Upper limits, m. (3,)
         """
         for name, value in (("speed", speed), ("yaw_rate", yaw_rate)):
             if not np.isfinite(value) or value <= 0:
@@ -92,9 +93,10 @@ class Pilot:
         hold_setpoint(command, point)
 
     def go_to(self, live: Live, world: int, point: ArrayLike) -> None:
-        """Move the setpoint of the selected drone, if it is in that world, over a point at its present height.
+        """Move the setpoint of the selected drone, if it is in that world, above a point.
 
-        The state controllers limit their position errors, so that the drone flies there without overturning.
+        The setpoint keeps its height, but rises to at least 0.5 m and the lower limit. The state controllers limit
+        their position errors, so that the drone flies there without overturning.
 
         Args:
             live: Loop.

@@ -14,13 +14,13 @@ from crazysim.errors import ConfigError
 OnError = Literal["raise", "report"]
 """Reaction of the loop to an error of a process: end with it, or log it and continue."""
 MIN_LOG_INTERVAL = 1.0
-"""Least time between two log messages of one kind, s."""
+"""Shortest time between two log messages of one kind, s."""
 
 log = logging.getLogger(__name__)
 
 
 class RateLimit:
-    """Permission to log one message in some time."""
+    """Limit to one log message per period."""
 
     def __init__(self, period: float = MIN_LOG_INTERVAL):
         """Create a limit that permits the first message.
@@ -41,7 +41,7 @@ class RateLimit:
 
 @dataclass
 class Process:
-    """A function that is called every so many control steps, with figures of its calls."""
+    """A function that is called every ``period`` control steps, with statistics of its calls."""
 
     name: str
     """Name in messages."""
@@ -54,7 +54,7 @@ class Process:
     on_error: OnError = "raise"
     """``"raise"`` or ``"report"``."""
     longest: float = 0.0
-    """Longest call, s."""
+    """Duration of the longest call, s."""
     longest_at: float = 0.0
     """Simulated time at which it began, s."""
     failures: int = 0
@@ -62,7 +62,7 @@ class Process:
     _may_warn: RateLimit = field(default_factory=RateLimit, repr=False)
 
     def run(self, now: float) -> None:
-        """Call the function at a simulated time, s, and measure it."""
+        """Call the function and measure the duration; ``now`` is the simulated time, s."""
         start_time = time.perf_counter()
         try:
             self.call()
@@ -79,7 +79,7 @@ class Process:
 
 @dataclass(frozen=True)
 class Event:
-    """A function that is called once the simulation reaches a time."""
+    """A function that is called when the simulation reaches a time."""
 
     step: int
     """Control step before which it is called."""

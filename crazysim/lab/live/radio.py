@@ -1,6 +1,7 @@
 """Real Crazyflies over ``cflib``, with the commands of the simulator.
 
-Nothing is sent without ``Radio(..., arm=True)``: a link without it opens no radio, checks commands and refuses them.
+Nothing is sent without ``Radio(..., arm=True)``: otherwise the link opens no radio, and it checks commands but then
+refuses them.
 """
 
 from __future__ import annotations
@@ -31,18 +32,18 @@ LOG = {
 }
 """Log variables of each part of the state."""
 UNITS = {"ang_vel": math.pi / 180, "acc": GRAVITY_MAGNITUDE}
-"""Units of log variables that differ from ``DroneState``: degrees/s and multiples of the standard gravity."""
+"""Factors to the units of ``DroneState`` from those of log variables: degrees/s and multiples of standard gravity."""
 
 log = logging.getLogger(__name__)
 
 
 class Radio(Closing):
-    """Link to a real Crazyflie that stands on the ground; a ``Link``.
+    """``Link`` to a real Crazyflie, which must stand on the ground when it is created.
 
     | Level | Packet of cflib | |
     | --- | --- | --- |
     | ``state`` | ``send_full_state_setpoint`` | position and velocity in steps of 1 mm and 1 mm/s |
-    | ``attitude`` | ``send_setpoint``, absolute roll, pitch and yaw | thrust in 65535 steps of the largest |
+    | ``attitude`` | ``send_setpoint``, absolute roll, pitch and yaw | thrust in 65535 steps up to the largest thrust |
     | ``body_rate`` | ``send_setpoint`` with rates | the same |
     """
 
@@ -61,7 +62,7 @@ class Radio(Closing):
         Args:
             uri: URI of cflib, such as ``radio://0/80/2M/E7E7E7E701``.
             arm: True to connect, arm the drone and let commands be sent.
-            airframe: Airframe, whose largest thrust scales collective thrust.
+            airframe: Airframe, whose largest thrust corresponds to full collective thrust.
             period_ms: Time between two states, ms, a multiple of 10.
             max_height: Largest height of a state command, m; higher ones are an error.
             crazyflie: ``cflib.crazyflie.Crazyflie``, or an object with its interface; None for a new one.
@@ -113,7 +114,7 @@ class Radio(Closing):
             self.close()
             raise ConfigError(f"expected log variables of {uri} within {timeout:g} s, got none. Use a newer firmware.")
         self._cf.supervisor.send_arming_request(True)
-        self._cf.commander.send_setpoint(0, 0, 0, 0)  # crtp_commander_rpyt.c ignores thrust until it was zero once
+        self._cf.commander.send_setpoint(0, 0, 0, 0)  # crtp_commander_rpyt.c ignores thrust until it has been zero once
 
     def state(self) -> DroneState:
         """Return the latest state that the drone has sent, with the time on the drone's clock."""
@@ -149,7 +150,7 @@ class Radio(Closing):
         self._set_mode(level)
         thrust = round(65535 * min(max(x[3] / self._most, 0.0), 1.0))
         roll, pitch, yaw = np.degrees(x[:3])
-        # Legacy yaw rates turn to the right; absolute yaw does not.
+        # In this packet, positive yaw rates turn right, but positive absolute yaw turns left.
         commander.send_setpoint(roll, pitch, yaw if level == Control.attitude else -yaw, thrust)
 
     def send_pose(self, frame: Frame, body: str) -> None:
@@ -162,7 +163,7 @@ class Radio(Closing):
             self._cf.loc.send_extpose(frame.pos[k], frame.quat[k])
 
     def sleep(self, seconds: float) -> None:
-        """Wait, s."""
+        """Wait for a time, s."""
         time.sleep(seconds)
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Recordings of a live simulation, written as they come."""
+"""Recordings of a live simulation, written sample by sample."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Recordings:
     def add(self) -> None:
         """Write a sample if one is due, at the start and after every control step.
 
-        A recording that cannot be written, as on a full disk, ends, and the flight continues.
+        If writing fails, as on a full disk, the recording ends and the flight continues.
         """
         if self._recorder is None:
             return
@@ -77,6 +77,6 @@ class Recordings:
 
 
 def free_path(path: Path) -> Path:
-    """Return a path, or one with a number behind its name, that does not exist."""
+    """Return the path if it does not exist, or else a path with a number after its name that does not."""
     candidates = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in count(2))
     return path if not path.exists() else next(p for p in candidates if not p.exists())

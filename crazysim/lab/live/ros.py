@@ -41,7 +41,7 @@ MESSAGES = {
     "Imu": "sensor_msgs.msg",
     "Float64": "std_msgs.msg",
 }
-"""Message classes, and the ROS packages that have them."""
+"""Message classes, and the Python modules of ROS that contain them."""
 DEPTH = 10
 """Length of the queues of publishers and subscriptions."""
 
@@ -60,12 +60,14 @@ def ros_messages() -> Any:
 class RosBridge:
     """Topics of the drones of a swarm, and of objects of the scene.
 
-    rclpy.init()
-    bridge = RosBridge(swarm, rclpy.create_node("crazysim"))
-    while rclpy.ok():
-        rclpy.spin_once(bridge.node, timeout_sec=0)
-        bridge.update()
-        swarm.advance(0.01)
+        rclpy.init()
+        bridge = RosBridge(swarm, rclpy.create_node("crazysim"))
+        while rclpy.ok():
+            rclpy.spin_once(bridge.node, timeout_sec=0)
+            bridge.update()
+            swarm.advance(0.01)
+
+    Commands are carried out in the callbacks of the node.
     """
 
     def __init__(
@@ -120,7 +122,7 @@ class RosBridge:
                 node.create_subscription(kind, f"/{name}/{topic}", self._guarded(k, take), DEPTH)
 
     def __call__(self, live: Live) -> None:
-        """Publish, as a process of a live loop."""
+        """Publish messages that are due, as a process of a live loop."""
         del live
         self.update()
 
@@ -180,7 +182,7 @@ class RosBridge:
     # Commands -------------------------------------------------------------------------------------------------------
 
     def _guarded(self, drone: int, take: Callable[[int, Any], None]) -> Callable[[Any], None]:
-        """Return the callback of a subscription: a refused command is reported."""
+        """Return the callback of a subscription, which reports refused commands."""
 
         def callback(message: Any) -> None:
             with self.swarm.lock:

@@ -18,13 +18,13 @@ from crazysim.sim.sim import Sim
 DRONE = "drone"
 """Kind of drones."""
 MARK_RADIUS = 0.12
-"""Radius of the sphere around a marked drone, and the smallest around other bodies, m."""
+"""Radius of the sphere that marks a drone, and smallest radius of the spheres that mark other bodies, m."""
 MAX_TRAILS = 256
-"""Largest number of bodies of a world with trails for all; in larger worlds only drones have trails."""
+"""Largest number of bodies of a world up to which all have trails; with more bodies, only drones have them."""
 
 
 class SceneBody(NamedTuple):
-    """A body of every world."""
+    """A body, which every world has."""
 
     kind: str
     """``"drone"``, or the name of the objects in the scene, such as ``"cars"``, ``"load"`` or a handle's name."""
@@ -72,7 +72,7 @@ class SceneBodies:
         self.owner = np.array([of_mocap.get(mocap, -1) for mocap in range(len(names))], int)
         for mocap in np.flatnonzero(self.owner < 0):
             kind, k = names[mocap]
-            base = parts[kind]  # parts are in the order of their bodies, equally many for each
+            base = parts[kind]  # parts are in the order of their bodies, with the same number for each
             self.owner[mocap] = places[base, k * counts[base] // counts[kind]]
         self.low, self.high = _boxes(len(names), shapes)
 
@@ -124,7 +124,7 @@ def _mocap_names(sim: Sim) -> list[tuple[str, int]]:
 
 
 def _parts(kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the kinds of a plugin that are parts of another, ``cars_wheel`` of ``cars``, and that one."""
+    """Return the kinds of a plugin that are parts of another, as ``cars_wheel`` of ``cars``, each with the other."""
     parts = []
     for kind in kinds:
         bases = [base for base in kinds if kind.startswith(f"{base}_")]

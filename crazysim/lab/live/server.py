@@ -1,6 +1,6 @@
 """Servers and listeners: threads that turn messages from the network into commands in a queue.
 
-Nothing but a queue is shared with the simulation, which takes commands out of it between two steps.
+They share only a queue with the simulation, which removes commands from it between two steps.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from crazysim.lab.live.framing import Frames, FramingError, Message, Request, Sh
 from crazysim.storage import Closing
 
 DRONE_PORT, STREAM_PORT = 7000, 7002
-"""Ports of the lab's test server, for commands to single drones and for the stream of all."""
+"""Ports of the lab's test server, for commands to single drones and for the stream to all drones."""
 MAX_QUEUE = 10_000
-"""Most commands that wait for the simulation."""
+"""Largest number of commands that wait for the simulation."""
 MAX_PEERS = 64
-"""Most connections at one time."""
+"""Largest number of simultaneous connections to a port."""
 TIMEOUT = 10.0
 """Time in which a message that has begun must be complete, s."""
 POLL = 0.2
-"""Time after which a thread that waits for bytes checks whether it is to stop, s."""
+"""Interval at which a thread that waits for bytes checks if it must stop, s."""
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class CommandQueue(Closing):
         self._queue: queue.Queue[Command] = queue.Queue(MAX_QUEUE)
 
     def commands(self) -> list[Command]:
-        """Return the commands that have arrived until this call, in their order; others wait for the next one."""
+        """Return the commands that have arrived before this call, in order; later ones wait for the next call."""
         commands = []
         with contextlib.suppress(queue.Empty):
             for _ in range(self._queue.qsize()):
@@ -57,9 +57,9 @@ class CommandQueue(Closing):
 
 
 class CommandServer(CommandQueue):
-    """Server for the lab's protocol, in other threads.
+    """Server for the lab's protocol, which runs in other threads.
 
-    At ``drone_port`` a client takes the control of one drone with ``REQ_07``, answered by ``ACK_07`` or, if the drone
+    At ``drone_port`` a client takes control of one drone with ``REQ_07``, answered by ``ACK_07`` or, if the drone
     does not exist or another client has it, ``ACK_00``. Its commands, ``CMDSTART_takeoff_0.5_EOF`` for example, are
     answered by ``ACK``, or ``ERR`` if they are invalid. At ``stream_port`` messages name their drone,
     ``07_CMDSTART_takeoff_0.5_EOF``; shows and ``START`` are accepted too.
@@ -82,10 +82,10 @@ class CommandServer(CommandQueue):
 
         Args:
             drones: IDs that clients may request.
-            host: Address to listen at; this machine's alone by default, ``0.0.0.0`` for every network. The protocol has
-                no passwords.
+            host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network. The
+                protocol has no passwords.
             drone_port: Port for commands to single drones; 0 for any free one.
-            stream_port: Port for the stream of all; 0 for any free one.
+            stream_port: Port for the stream to all drones; 0 for any free one.
             timeout: Time in which a message that has begun must be complete, s.
 
         Raises:
@@ -115,7 +115,7 @@ class CommandServer(CommandQueue):
 
     @property
     def stream_port(self) -> int:
-        """Port for the stream of all."""
+        """Port for the stream to all drones."""
         return self._listeners[1].server_address[1]
 
     def close(self) -> None:
@@ -172,8 +172,9 @@ class CommandServer(CommandQueue):
 class StreamListener(CommandQueue):
     """Client of a server's stream of commands, such as port 7002 of the lab's test server, in another thread.
 
-    The simulation is one of many receivers there. Every valid message is answered by ``ACK``. When the server
-    disconnects or sends something else, the listener stops and ``alive`` is False; the fleet keeps flying.
+    The simulation may be one of many receivers. Every valid command is answered by ``ACK``; others are logged. When
+    the server disconnects or sends bytes that are not a message, the listener stops and ``alive`` becomes False; the
+    fleet keeps flying.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = STREAM_PORT, timeout: float = TIMEOUT):
@@ -182,7 +183,7 @@ class StreamListener(CommandQueue):
         Args:
             host: Address of the server.
             port: Port of the stream.
-            timeout: Time in which a connection, and a message that has begun, must be complete, s.
+            timeout: Time within which the connection, and each message that has begun, must be complete, s.
 
         Raises:
             ConfigError: If there is no server.
@@ -196,7 +197,7 @@ class StreamListener(CommandQueue):
 
     @property
     def alive(self) -> bool:
-        """True while the connection stands."""
+        """True while the connection is open."""
         return self._thread.is_alive()
 
     def close(self) -> None:
@@ -251,7 +252,7 @@ class _Listener(socketserver.ThreadingTCPServer):
 
 @contextlib.contextmanager
 def _logged(name: str) -> Iterator[None]:
-    """Log why a connection ends, in place of an error."""
+    """Log the reason why a connection ends instead of raising an error."""
     try:
         yield
         log.info("%s disconnected", name)
@@ -283,7 +284,7 @@ def _frames(peer: socket.socket, stopped: threading.Event, timeout: float) -> It
             return
         for frame in frames.feed(received):
             deadline = None
-            peer.settimeout(timeout)  # of the answer
+            peer.settimeout(timeout)  # for the answer
             yield frame
             peer.settimeout(POLL)
         if not frames.pending:

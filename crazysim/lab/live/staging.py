@@ -1,4 +1,4 @@
-"""Commands of a live simulation, one array that processes write into, staged once per control step; its compilation."""
+"""Staging of the commands that processes write, once per control step, and compilation of the step."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from crazysim.core.functional import staged_leaves
 from crazysim.sim.sim import Sim
 
 DEFAULT_COMMAND = np.eye(16)[12]
-"""State command of a drone that has had none: the origin, level. (16,)"""
+"""State command of a drone that has not received one: level at the origin. (16,)"""
 
 
 class StagedCommands:
-    """The command of every drone, as the simulation's command level has it; staged while it is in use."""
+    """The command of every drone, at the simulation's command level; staged once ``array`` has been read."""
 
     def __init__(self, sim: Sim):
         """Start from the commands of the simulation; a drone without a state command hovers at its position."""
@@ -51,7 +51,7 @@ class StagedCommands:
 
 
 def compile_step(sim: Sim, n_steps: int) -> None:
-    """Compile the step before anything waits for it: run some steps, and restore the data."""
+    """Compile the step ahead of time: run ``n_steps`` steps, and restore the data."""
     with sim.lock:
         data = sim.data
         sim.step(n_steps)

@@ -18,7 +18,7 @@ class Button:
     call: Callable[[], object]
     """Function."""
     key: str | None = None
-    """Key that does the same; None for none."""
+    """Key that calls the same function; None for none."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ Control = Button | Slider
 
 
 class Viewer(Generic[L]):
-    """Base of viewers of a loop ``L``, which calls the methods in its thread; they must not wait."""
+    """Base of viewers of a loop ``L``, which calls their methods in its thread; the methods must not wait."""
 
     def open(self, live: L) -> None:
         """Show the simulation of a loop from now on, with the controls that it has.

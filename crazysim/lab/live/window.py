@@ -31,9 +31,9 @@ from crazysim.scene.scene_window import require_screen
 from crazysim.scene.visual_geoms import visual_geoms
 
 START = 60.0
-"""Longest time until the window must be open, s."""
+"""Longest time to wait for the window to open, s."""
 STOP = 3.0
-"""Longest time in which it must close, s."""
+"""Longest time to wait for it to close, s."""
 LENGTH = struct.Struct("<Q")
 """Length in front of each message to the process of the window."""
 
@@ -45,10 +45,10 @@ class Window(Viewer[Live]):
     """Viewer in a window, ``live.show(Window())``; show several for several views.
 
     The mouse turns, moves and zooms the view. A double click on a drone selects it, one on a vehicle, load or object
-    follows that, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses, a full stop
-    makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [ and ] move the
-    chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws in a process of
-    its own, at the highest rate possible, and never delays the simulation.
+    makes viewers follow it, and one on the ground calls ``live.on_click``. Keys go to ``live.keyboard``: space pauses,
+    a full stop makes a single step, backspace resets, tab selects the next drone, plus and minus change the speed, [
+    and ] move the chosen slider, an apostrophe chooses the next one, R records, escape ends the run. The window draws
+    in a process of its own, at the highest rate possible, and never delays the simulation.
     """
 
     worlds: Sequence[int] = (0,)

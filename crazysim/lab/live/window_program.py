@@ -25,7 +25,7 @@ from crazysim.scene.render import camera_id
 from crazysim.scene.scene_window import SceneWindow
 
 IDLE_TIME = 0.005
-"""Time between two looks for a new picture, s."""
+"""Time between two checks for a new picture, s."""
 REDRAW_TIME = 0.03
 """Longest time between two drawings, s: the mouse moves the view even when no new picture arrives."""
 DOUBLE_CLICK_TIME = 0.35

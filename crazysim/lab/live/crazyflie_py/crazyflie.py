@@ -70,7 +70,7 @@ class Crazyflie:
         self._command(lambda c: c.take_off(targetHeight, duration), groupMask)
 
     def land(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
-        """Sink to a height, m, within a time, s, and stop the motors."""
+        """Descend to a height, m, within a time, s, and stop the motors."""
         self._command(lambda c: c.land(targetHeight, duration), groupMask)
 
     def goTo(self, goal: ArrayLike, yaw: float, duration: float, relative: bool = False, groupMask: int = 0) -> None:
@@ -78,7 +78,7 @@ class Crazyflie:
         self._command(lambda c: c.go_to(goal, yaw, duration, relative), groupMask)
 
     def uploadTrajectory(self, trajectoryId: int, pieceOffset: int, trajectory: Trajectory) -> None:
-        """Store a trajectory; the offset is not used, since pieces are not kept in the memory of commands."""
+        """Store a trajectory; the offset is ignored, since each trajectory is stored under its number."""
         self._command(lambda c: c.upload(trajectoryId, trajectory.path()))
 
     def startTrajectory(
@@ -89,7 +89,7 @@ class Crazyflie:
         relative: bool = True,
         groupMask: int = 0,
     ) -> None:
-        """Follow a stored trajectory, in ``timescale`` times its duration, from the present setpoint if relative."""
+        """Follow a stored trajectory, stretched by ``timescale``, from the present setpoint if relative."""
         self._command(lambda c: c.start_trajectory(trajectoryId, timescale, relative, reverse), groupMask)
 
     def notifySetpointsStop(self, remainValidMillisecs: float = 100, groupMask: int = 0) -> None:
@@ -117,7 +117,7 @@ class Crazyflie:
         self._command(lambda c: c.hover(vx, vy, yaw_rate, z_distance))
 
     def setLEDColor(self, r: float, g: float, b: float) -> None:
-        """Set the colour of the light, 0 to 1, by the effect for one colour of ``ring.effect``."""
+        """Set the colour of the LEDs, 0 to 1, and choose the solid-colour effect by ``ring.effect``."""
         self.setParam("ring.effect", LED_SOLID)
         for color, value in zip(("Red", "Green", "Blue"), np.clip([r, g, b], 0.0, 1.0).tolist(), strict=True):
             self.setParam(f"ring.solid{color}", int(255 * value))
@@ -147,7 +147,7 @@ class Crazyflie:
         """Return name, time, bits of the supervisor, battery voltage, V, state of the power management and radio.
 
         The battery's values come from the plugin ``Battery``; without it the battery is never empty. There is no radio:
-        its strength is perfect, and no packets are counted.
+        the signal is perfect, and no packets are counted.
         """
         now, c = self._swarm.time, self._commander
         supervisor = (0 if c.locked else 1) | c.armed << 1 | c.armed << 3 | c.motors_on << 4 | c.locked << 6
@@ -199,7 +199,7 @@ class CrazyflieServer:
         self._all(lambda cf: cf.takeoff(targetHeight, duration, groupMask))
 
     def land(self, targetHeight: float, duration: float, groupMask: int = 0) -> None:
-        """Make all sink to a height, m, within a time, s, and stop their motors."""
+        """Make all descend to a height, m, within a time, s, and stop their motors."""
         self._all(lambda cf: cf.land(targetHeight, duration, groupMask))
 
     def goTo(self, goal: ArrayLike, yaw: float, duration: float, groupMask: int = 0) -> None:

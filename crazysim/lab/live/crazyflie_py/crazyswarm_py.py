@@ -14,13 +14,13 @@ from crazysim.lab.live.swarm import Swarm
 from crazysim.sim.sim import Sim
 
 CONFIGURATION = Path("crazyflies.yaml")
-"""File with the drones of ``Crazyswarm()``, where there is one in the working directory."""
+"""File in the working directory that describes the drones of ``Crazyswarm()``; optional."""
 
 _chosen_swarm: Swarm | None = None
 
 
 def use(swarm: Swarm | None) -> None:
-    """Make the next ``Crazyswarm()`` of a script fly this swarm; None for a new one."""
+    """Make the next ``Crazyswarm()`` of a script use this swarm; None to let it create one."""
     global _chosen_swarm
     _chosen_swarm = swarm
 

@@ -86,7 +86,7 @@ class Trajectory:
         return len(self.polynomials)
 
     def eval(self, t: float) -> TrajectoryOutput:
-        """Return the point at a time, s; beyond the ends, the end point."""
+        """Return the point at a time, s; before the start and after the end, the nearest end point."""
         path = self.path()
         derivatives = path.derivatives(t, 2)
         return TrajectoryOutput(

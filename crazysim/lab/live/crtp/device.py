@@ -1,7 +1,7 @@
 """A simulated Crazyflie at the other end of CRTP: answers to packets, and packets that it sends unasked.
 
-Ports, channels and layouts are as in cflib 0.1.34 and crazyflie-firmware, protocol version 12. A packet is a byte
-with port and channel, and up to 30 more. Packets of another form are reported and ignored.
+Ports, channels and layouts are as in cflib 0.1.34 and crazyflie-firmware, protocol version 12. A packet is a header
+byte with port and channel, then up to 30 bytes of data. Malformed packets are reported and ignored.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from crazysim.lab.live.swarm import Swarm
 PROTOCOL = 12
 """Version of the protocol."""
 MAX_DATA = 30
-"""Largest number of bytes behind the header."""
+"""Largest number of bytes after the header."""
 MAX_BLOCKS, MAX_VARIABLES = 16, 128
 """Largest numbers of log blocks and of their variables (``Log`` of cflib)."""
 MAX_LOG = 26
@@ -45,7 +45,7 @@ TRAJECTORY_MEMORY, LED_MEMORY, DECK_MEMORY = 0x12, 0x10, 0x19
 DECKS = bytes([3]) + bytes(8 * 32)
 """Memory of decks: its version, and eight invalid descriptions, since no deck has memory."""
 MAX_LINES = 256
-"""Most packets of console text that wait for a client."""
+"""Largest number of packets of console text that wait for a client; beyond it, the oldest are dropped."""
 
 CONSOLE, PARAM, COMMANDER, MEM, LOGGING, LOCALIZATION, GENERIC, HIGH_LEVEL, SUPERVISOR, PLATFORM, LINK = (
     0, 2, 3, 4, 5, 6, 7, 8, 9, 13, 15,
@@ -61,9 +61,9 @@ class LogBlock:
     """Variables that are sent together."""
 
     variables: list[tuple[int, str]]
-    """Number in the table and format of each."""
+    """Number in the table, and format, of each variable."""
     period: float | None = None
-    """Time between two packets, s; None while it is stopped."""
+    """Time between two packets, s; None while the block is stopped."""
     due: float = 0.0
     """Time of the next packet, s."""
 
@@ -77,8 +77,8 @@ class CrtpDevice:
         Args:
             swarm: Swarm.
             drone: Index or name of the drone.
-            log: Further log variables by ``group.name``: their type in C, and functions of the drone's state and its
-                commander.
+            log: Further log variables by ``group.name``, each with its C type and a function of the drone's state and
+                commander that returns its value.
 
         Raises:
             ConfigError: If the drone or a type does not exist.
@@ -145,13 +145,13 @@ class CrtpDevice:
         name = self.log.variables[k].name
         try:
             value = float(self.readings[name][1](state, self.commander))  # type: ignore[arg-type]
-        except Exception as error:  # of a reading that a user has added
+        except Exception as error:  # raised by a reading that a user has added
             self.swarm.reports.add("refused", self.name, self.swarm.time, f"log variable {name} failed: {error}")
             value = math.nan
         return pack(layout, value)
 
     def _report(self, text: str) -> None:
-        """Report a refused command, on the drone's console too."""
+        """Report a refused command, also on the drone's console."""
         self.swarm.reports.add("refused", self.name, self.swarm.time, text)
         line = f"{text}\n".encode("ascii", "replace")
         self._console.extend(line[k : k + MAX_DATA] for k in range(0, len(line), MAX_DATA))
@@ -194,7 +194,7 @@ class CrtpDevice:
     # Setpoints ------------------------------------------------------------------------------------------------------
 
     def _setpoint(self, channel: int, data: bytes) -> list[Packet]:
-        """Take roll, pitch, yaw and thrust in the modes of ``flightmode``; no thrust stops the motors.
+        """Apply roll, pitch, yaw and thrust in the modes of ``flightmode``; zero thrust stops the motors.
 
         crtp_commander_rpyt.c reads pitch and yaw rate with the opposite sign, and yaw with the sign of the world frame.
         """
@@ -210,7 +210,7 @@ class CrtpDevice:
         return []
 
     def _force(self, thrust: int) -> float:
-        """Return the collective thrust, N, of 16 bits: full scale is the largest thrust of all rotors."""
+        """Return the collective thrust, N, of a 16-bit value; full scale is all rotors at their largest thrust."""
         airframe = self.swarm.sim.airframes[self.drone]
         return thrust / 65535 * airframe.n_rotors * float(np.max(airframe.value("rotors.thrust_max")))
 
@@ -240,7 +240,7 @@ class CrtpDevice:
     # Tables ---------------------------------------------------------------------------------------------------------
 
     def _contents(self, port: int, table: Table, data: bytes) -> list[Packet]:
-        """Answer requests of a table of contents, of version 2."""
+        """Answer a request to a table of contents, version 2 of its protocol."""
         if data[0] == 3:
             head = struct.pack("<BHI", 3, len(table.variables), table.checksum)
             return [(port, 0, head + (bytes([MAX_BLOCKS, MAX_VARIABLES]) if port == LOGGING else b""))]
@@ -276,7 +276,7 @@ class CrtpDevice:
         return [(LOGGING, 1, bytes([command, identity, code]))]
 
     def _define(self, command: int, identity: int, data: bytes) -> int:
-        """Create a log block or append to it, and return the code of an error or 0."""
+        """Create a log block or append to it, and return an error code, or 0 for success."""
         if command == 6 and identity in self.blocks:
             return errno.EEXIST
         if command == 7 and identity not in self.blocks:
@@ -330,7 +330,7 @@ class CrtpDevice:
         return [(PARAM, 3, data[:3] + bytes([errno.ENOENT]))]
 
     def _set(self, name: str, value: float) -> None:
-        """Set a parameter; one that is refused keeps its value, which is the answer."""
+        """Set a parameter; if that is refused, it is reported and the parameter keeps its value."""
         try:
             self.swarm.set_parameter(self.drone, name, value)
         except ConfigError as error:

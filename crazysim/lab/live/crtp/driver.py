@@ -16,7 +16,8 @@ _drivers: dict[int, type] = {}
 def add_cflib_driver(swarm: Swarm) -> list[str]:
     """Make the drones of a swarm in this process available to ``cflib``; return their URIs, ``sim://cf1`` and so on.
 
-    It may be called before or after ``cflib.crtp.init_drivers()``. A later swarm hides an earlier one of equal names.
+    It may be called before or after ``cflib.crtp.init_drivers()``. Where names of drones are equal, the swarm that was
+    added last takes precedence.
 
     Raises:
         ConfigError: If cflib is not installed.
@@ -41,7 +42,7 @@ def remove_cflib_driver(swarm: Swarm) -> None:
 
 
 def _driver(swarm: Swarm) -> type:
-    """Return the class of links to a swarm, as cflib makes them."""
+    """Return a cflib driver class for links to a swarm."""
     from cflib.crtp.crtpdriver import CRTPDriver
     from cflib.crtp.crtpstack import CRTPPacket
     from cflib.crtp.exceptions import WrongUriType
@@ -70,7 +71,7 @@ def _driver(swarm: Swarm) -> type:
                     self._enqueue(answer)
 
         def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
-            """Return the next packet; None if none arrives within a time, s."""
+            """Return the next packet, or None if none arrives within a time, s; a negative time waits forever."""
             try:
                 return self._queue.get(wait != 0, None if wait < 0 else wait)
             except queue.Empty:

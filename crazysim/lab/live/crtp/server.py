@@ -19,20 +19,20 @@ from crazysim.storage import Closing
 PORT = 19850
 """First port; cflib scans ten from here on."""
 POLL = 0.1
-"""Longest time until the thread notices that the server is closed, s."""
+"""Longest time until the thread ends after ``close``, s."""
 
 log = logging.getLogger(__name__)
 
 
 class CrtpServer(Closing):
-    """Drones of a swarm on UDP, answered by a thread."""
+    """UDP server for the drones of a swarm; a thread answers the clients."""
 
     def __init__(self, swarm: Swarm, host: str = "127.0.0.1", port: int = PORT):
-        """Listen, once a step of the swarm is compiled: clients do not wait that long.
+        """Compile a step of the swarm, since clients would time out during compilation, and then listen.
 
         Args:
-            swarm: Swarm, which something else advances, such as ``swarm.start()``.
-            host: Address to listen at; this machine's alone by default, ``0.0.0.0`` for every network.
+            swarm: Swarm. The server does not advance it; use ``swarm.start()``, for example.
+            host: Address to listen at; by default only this machine can connect. ``0.0.0.0`` for every network.
             port: Port of the first drone; 0 for any free ones.
 
         Raises:
@@ -90,13 +90,13 @@ class CrtpServer(Closing):
                         self._clients[k] = address
                     for answer in self.devices[k].handle(packet):
                         self._sockets[k].sendto(answer, address)
-                except OSError:  # of a client that is gone
+                except OSError:  # the client is gone
                     continue
                 except Exception:  # the other drones still get answers
                     log.exception("%s: a packet was not answered", self.swarm.names[k])
 
     def _send_due(self) -> None:
-        """Send the log packets that are due; the swarm calls it after every control step."""
+        """Send the log and console packets that are due; the swarm calls it after every control step."""
         for device, peer, client in zip(self.devices, self._sockets, self._clients, strict=True):
             if client is not None:
                 for packet in device.due():

@@ -16,7 +16,7 @@ from crazysim.trajectories.bezier import power_coefficients
 PIECE_SIZE = 132
 """Size of an uncompressed piece, bytes: 8 coefficients each of x, y, z and yaw, and the duration."""
 N_POINTS = (0, 1, 3, 7)
-"""Number of further control points of each type of a compressed coordinate (``CompressedSegment`` of cflib)."""
+"""Number of control points after the first, for each type of compressed coordinate (``CompressedSegment`` of cflib)."""
 
 
 def handle_generic(commander: Commander, data: bytes) -> None:
@@ -24,7 +24,7 @@ def handle_generic(commander: Commander, data: bytes) -> None:
 
     Raises:
         ConfigError: If the commander refuses it, or the type is not supported.
-        struct.error: If it has a wrong length.
+        struct.error: If its length is wrong.
     """
     kind, content = data[0], data[1:]
     if kind == 0:
@@ -48,7 +48,7 @@ def handle_generic(commander: Commander, data: bytes) -> None:
 
 
 def unpack_quat(packed: int) -> NDArray:
-    """Return the quaternion, xyzw, of 32 bits: the index of the largest component, then the others, 10 bits each."""
+    """Return a quaternion, xyzw, from 32 bits: index of the largest component, then the others in 10 bits each. (4,)"""
     largest, quat = packed >> 30, np.zeros(4)
     for i in (i for i in (3, 2, 1, 0) if i != largest):
         size = (packed & 0x1FF) / 0x1FF / math.sqrt(2)
@@ -109,7 +109,7 @@ def _polynomial_trajectory(memory: bytes, offset: int, n: int) -> HostTrajectory
     """Return the trajectory of polynomials in memory."""
     if not n or offset + PIECE_SIZE * n > len(memory):
         raise ConfigError(f"expected 1 or more pieces within {len(memory)} bytes, got {n} from {offset} on")
-    with np.errstate(invalid="ignore"):  # of NaN, which is refused below
+    with np.errstate(invalid="ignore"):  # NaN is refused below
         numbers = np.frombuffer(memory, "<f4", 33 * n, offset).astype(float).reshape(n, 33)
     durations, c = numbers[:, 32], numbers[:, :32].reshape(n, 4, 8)
     _require_durations(durations)
@@ -120,7 +120,7 @@ def _polynomial_trajectory(memory: bytes, offset: int, n: int) -> HostTrajectory
 def _bezier_trajectory(memory: bytes, offset: int) -> HostTrajectory:
     """Return the trajectory of Bezier curves in memory: a start, then segments of control points.
 
-    A segment without duration ends it, whatever number of pieces was sent with its definition (pptraj_compressed.c).
+    A segment of duration 0 ends it; the number of pieces in its definition is ignored (pptraj_compressed.c).
     Positions are in mm, yaw in tenths of degrees, durations in ms.
     """
     units = np.array([0.001, 0.001, 0.001, math.radians(0.1)])

@@ -30,10 +30,10 @@ READ_ONLY_BIT = 0x40
 OUT_OF_RANGE_DISTANCE = 32767
 """Distance if no object is within range, mm (``mrGetMeasurementAndRestart`` in multiranger.c)."""
 RANGES = {"down": "zrange"}
-"""Log variables of directions that have another name."""
+"""Name of the log variable in the group ``range``, for each direction with a different name."""
 
 Reading = Callable[[DroneState, Commander], float]
-"""Value of a log variable of a drone."""
+"""Function that returns the value of a log variable from a drone's state and commander."""
 
 
 class Variable(NamedTuple):
@@ -44,7 +44,7 @@ class Variable(NamedTuple):
     ctype: str
     """Type in C."""
     read_only: bool = False
-    """True where it cannot be written."""
+    """True if it cannot be written."""
 
 
 class Table:
@@ -74,7 +74,7 @@ class Table:
 
 
 def pack(layout: str, value: float) -> bytes:
-    """Return a number in a format; integers are rounded, and all are clipped to the range of the format."""
+    """Return a packed number, clipped to the range of its format; for integers it is rounded, and 0 if not finite."""
     if layout in ("<f", "<e"):
         largest = 3.4e38 if layout == "<f" else 65504.0
         return struct.pack(layout, value if math.isnan(value) else min(max(value, -largest), largest))

@@ -1,8 +1,8 @@
 """Motion capture systems of laboratories, read through the package ``motioncapture`` (libmotioncapture).
 
-That package holds Python's global lock while it waits for the network (seen with its version 1.1, for OptiTrack and
-Vicon), which would stop the simulation with the source. It therefore runs in another process, and a thread reads
-the frames from a pipe.
+That package holds Python's global interpreter lock while it waits for the network (seen with its version 1.1, for
+OptiTrack and Vicon), which would stop the simulation too. It therefore runs in another process, and a thread reads the
+frames from a pipe.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SYSTEMS = ("optitrack", "vicon", "qualisys", "vrpn", "nokov", "motionanalysis")
 WORKER_PROGRAM = Path(__file__).with_name("worker.py")
 """Program that runs the package."""
 MAX_LINE = 1 << 20
-"""Longest line of the worker, characters."""
+"""Longest line of the worker, bytes."""
 
 
 class MotionCaptureSource(ThreadSource):

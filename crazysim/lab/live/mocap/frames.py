@@ -69,7 +69,7 @@ class Convention:
             )
 
     def to_world(self, pos: ArrayLike, quat: ArrayLike) -> tuple[NDArray, NDArray]:
-        """Return positions, m (..., 3), and attitudes, xyzw (..., 4), in the world frame, of poses of the source."""
+        """Return poses of the source in the world frame: positions, m (..., 3), and attitudes, xyzw (..., 4)."""
         pos, quat = np.asarray(pos, float) * self.unit, np.asarray(quat, float)
         if self.quat == "wxyz":
             quat = quat[..., [1, 2, 3, 0]]

@@ -19,12 +19,12 @@ from crazysim.scene.objects import Handle
 
 
 class PlaybackData(PyTree):
-    """Poses at equal intervals, and the time at which each world begins."""
+    """Poses at equal intervals, and the time of the recording at which each world begins."""
 
     pos: Array = leaf("shared", 3)
     """Positions, world frame, m. (n_samples, n_objects, 3)"""
     quat: Array = leaf("shared", 3)
-    """Attitudes, body to world, xyzw, of the same sign from sample to sample. (n_samples, n_objects, 4)"""
+    """Attitudes, body to world, xyzw; the sign does not flip between successive samples. (n_samples, n_objects, 4)"""
     vel: Array = leaf("shared", 3)
     """Velocities, world frame, m/s. (n_samples, n_objects, 3)"""
     freq: Array = leaf("shared", 0)

@@ -30,7 +30,7 @@ class MocapRecorder(Closing):
     """Writer of a recording."""
 
     def __init__(self, path: str | Path):
-        """Create a file, or replace one.
+        """Create a file; an existing one is replaced.
 
         Raises:
             ConfigError: If it cannot be written.
@@ -91,10 +91,9 @@ def _poll(content: bytes, names: list[str]) -> Poll:
 class ReplaySource(MocapSource):
     """Frames of a recording.
 
-    By ``"poll"``, each poll returns the frames of the recorded poll of the same number: a simulation that is stepped as
-    the recorded one gives the same run, bit for bit. By ``"time"``, each frame comes when as much simulated time
-    has passed since the start as there was between it and the first frame, for a simulation that is stepped in
-    another way.
+    With ``by="poll"``, the k-th poll returns the frames of the k-th recorded poll, so a simulation that is stepped as
+    the recorded one was reproduces the run bit for bit. With ``by="time"``, a frame that arrived t seconds after the
+    first frame is returned at simulated time t; use it for a simulation that is stepped differently.
     """
 
     def __init__(self, path: str | Path, by: str = "poll"):

@@ -22,7 +22,7 @@ from crazysim.trajectories import Trajectory
 log = logging.getLogger(__name__)
 
 CAPACITY = 4096
-"""Number of frames that wait for the reader; the oldest are lost beyond: 17 s at 240 Hz."""
+"""Largest number of frames that wait for the reader, 17 s at 240 Hz; beyond it, the oldest are lost."""
 
 
 class Poll(NamedTuple):
@@ -42,7 +42,7 @@ class MocapSource(Closing):
     name: str = "mocap"
     """Name in reports."""
     simulated: bool = False
-    """True where the frames follow simulated time, which a reset sets back."""
+    """True if the frames follow simulated time, which a reset sets back."""
 
     def poll(self, step: int, freq: int) -> Poll:
         """Return the frames that have arrived since the last call.
@@ -63,7 +63,7 @@ class MocapSource(Closing):
 
 
 class FunctionSource(MocapSource):
-    """Poses as a function of simulated time, sampled at a rate in simulated time; a run can be repeated bit for bit."""
+    """Poses as a function of simulated time, sampled at a fixed rate; a run can be repeated bit for bit."""
 
     simulated = True
 
@@ -77,7 +77,7 @@ class FunctionSource(MocapSource):
         """Sample a function.
 
         Args:
-            function: Position and attitude of each body by name, as the convention has them, at a time, s.
+            function: Function of time, s, that returns position and attitude of each body by name, in the convention.
             freq: Frames per second, Hz.
             convention: Convention of the poses; None for crazysim's.
             name: Name in reports.
@@ -88,7 +88,7 @@ class FunctionSource(MocapSource):
         self._function, self._convention, self._next = function, convention or Convention(), 0
 
     def poll(self, step: int, freq: int) -> Poll:
-        """Return the frames up to the present simulated time; after a reset, the first frame follows again."""
+        """Return the frames up to the present simulated time; after a reset, they begin again with the first."""
         now = step / freq
         last = int(np.floor(now * self.freq + 1e-9))
         if last < self._next - 1:
@@ -130,7 +130,7 @@ class ThreadSource(MocapSource):
     """Base of sources that wait for frames in a thread, such as network clients.
 
     A subclass yields frames from ``stream`` in the convention of its system. An error there ends the source, not the
-    simulation; ``ended`` has the reason.
+    simulation, and ``ended`` gives the reason.
     """
 
     def __init__(self, name: str, convention: Convention | None = None):
@@ -170,7 +170,7 @@ class ThreadSource(MocapSource):
         return self._ended
 
     def close(self) -> None:
-        """Stop the thread; a source that does not answer is left behind after a second."""
+        """Stop the thread; a thread that does not end within a second is abandoned."""
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join(1.0)
@@ -196,8 +196,8 @@ class RealTimeSource(ThreadSource):
         """Send the frames of a function of time.
 
         Args:
-            source: Source, whose time begins with ``start``.
-            speed: Speed of its time, 1.
+            source: Source, whose time is 0 when the thread starts.
+            speed: Speed of the source's time relative to real time, 1.
         """
         super().__init__(f"real-time {source.name}")
         self._source, self._speed = source, speed

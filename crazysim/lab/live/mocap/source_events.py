@@ -9,7 +9,7 @@ from typing import NamedTuple
 log = logging.getLogger(__name__)
 
 MAX_REPORTS = 1000
-"""Number of reports that are kept."""
+"""Largest number of reports that are kept."""
 
 
 class Report(NamedTuple):
@@ -26,7 +26,7 @@ class Report(NamedTuple):
 
 
 class Reports:
-    """The latest reports, and counts of all. The first and every tenth, hundredth, ... of a kind and name is logged."""
+    """The latest reports, and counts of all. Report 1, 10, 100, ... of each kind and name is logged."""
 
     def __init__(self) -> None:
         self.latest: deque[Report] = deque(maxlen=MAX_REPORTS)

@@ -16,9 +16,9 @@ from crazysim.lab.live.mocap.source_events import Reports
 N_INTERVALS = 32
 """Number of intervals between frames whose median is the period of the source."""
 MAX_COORDINATE = 1e6
-"""Coordinates from here on are invalid, m."""
+"""Magnitude from which a coordinate is invalid, m."""
 CLOCK_AGE = 10.0
-"""Age of the least delay, s, after which it is forgotten: clocks drift."""
+"""Age after which the smallest delay is replaced, since clocks drift, s."""
 
 
 @dataclass(frozen=True)
@@ -26,19 +26,20 @@ class Rules:
     """Limits beyond which frames or bodies are reported or refused."""
 
     max_speed: float = setting(default=10.0, low=0.0)
-    """Largest speed of a body, m/s; a body that is faster has jumped."""
+    """Largest speed of a body, m/s; a faster motion counts as a jump."""
     slack: float = setting(default=0.05, low=0.0)
-    """Longest distance that is not a jump, m."""
+    """Distance that a body may move beyond ``max_speed`` times the elapsed time before it counts as a jump, m."""
     confirm: int = setting(default=3, low=1)
-    """Number of consecutive frames that agree on a new place after which a jump is accepted."""
+    """Number of consecutive frames that must agree on a new position before a jump is accepted."""
     late: float = setting(default=0.05, low=0.0)
-    """Delay of a frame over the least one seen that is reported, s."""
+    """Delay beyond the smallest recent delay above which a frame is reported as late, s."""
     lost: float = setting(default=0.2, low=0.0)
     """Time without a valid pose after which a body counts as lost, s."""
     stalled: float = setting(default=0.2, low=0.0)
     """Time without a frame after which the source counts as stalled, s."""
     restart: float = setting(default=1.0, low=0.0)
-    """Step back of the source's clock that counts as its restart, s; a smaller one is an old frame."""
+    """Backward step of the source's clock above which the source counts as restarted, s; after a smaller step the frame
+    counts as old."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -98,11 +99,11 @@ class Tracker:
 
     @property
     def stalled(self) -> bool:
-        """True where the source has sent no frame for too long."""
+        """True if the source has sent no frame for longer than ``Rules.stalled``."""
         return self._stalled
 
     def accept(self, frame: Frame) -> bool:
-        """Take a frame, and return True unless it was refused."""
+        """Process a frame, and return True unless it was refused."""
         now, rules = frame.stamp, self.rules
         if not np.isfinite(now):
             self._report("invalid", self.source, frame.received, f"time {now}")
@@ -127,7 +128,7 @@ class Tracker:
         self._watch_delay(now, frame.received - now)
         self._stamp = now
         self.n_frames += 1
-        with np.errstate(over="ignore", invalid="ignore"):  # of numbers that are refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused below
             self._take_bodies(frame, now)
         missing = self.seen & ~self._lost & (now - self._stamps > rules.lost) & np.isfinite(self._stamps)
         for k in np.flatnonzero(missing):
@@ -141,7 +142,7 @@ class Tracker:
         self._least_delay, self._least_at, self._stamp, self._received = np.inf, -np.inf, None, None
 
     def advance(self, now: float, lost: int = 0, ended: str | None = None) -> None:
-        """Check at the end of a poll that the source is alive.
+        """Report, at the end of a poll, lost frames and a source that has stalled or ended.
 
         Args:
             now: Time of the poll, s.
@@ -165,7 +166,7 @@ class Tracker:
         self.reports.add(kind, name, time, text)
 
     def _watch_interval(self, now: float, interval: float) -> None:
-        """Find the period of the source, then report gaps."""
+        """Estimate the period of the source from the first intervals; after that, report gaps."""
         if self._period is None:
             self._intervals.append(interval)
             if len(self._intervals) == N_INTERVALS:
@@ -175,14 +176,14 @@ class Tracker:
             self._report("dropped", self.source, now, f"{n} frames missing in {interval:.4f} s")
 
     def _watch_delay(self, now: float, delay: float) -> None:
-        """Report frames that took longer than the quickest one; the clocks may differ by any constant."""
+        """Report frames that took much longer than the quickest one; the clocks may differ by any constant."""
         if delay < self._least_delay or now - self._least_at > CLOCK_AGE:
             self._least_delay, self._least_at = delay, now
         elif delay - self._least_delay > self.rules.late:
             self._report("late", self.source, now, f"{delay - self._least_delay:.3f} s after the quickest frame")
 
     def _rows(self, names: tuple[str, ...], now: float) -> tuple[NDArray, NDArray]:
-        """Return the entries of a frame that are used, and the rows of their bodies."""
+        """Return the indices of the frame's entries that are used, and the rows of their bodies in the tracker."""
         mapping = self._maps.get(names)
         if mapping is None:
             twice = sorted({name for name in names if names.count(name) > 1} & set(self._rows_of))
@@ -230,7 +231,7 @@ class Tracker:
         self._stamps[rows], self.seen[rows], self._lost[rows] = now, True, False
 
     def _suspects(self, rows: NDArray, pos: NDArray, far: NDArray, ok: NDArray, now: float) -> NDArray:
-        """Return True where a body that jumped has been at its new place often enough. (n,)"""
+        """Return True for bodies that jumped and have stayed at their new position for ``confirm`` frames. (n,)"""
         accepted = np.zeros(len(rows), bool)
         for i in np.flatnonzero(~ok):
             k = rows[i]

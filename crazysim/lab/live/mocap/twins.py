@@ -34,11 +34,11 @@ HIDDEN_POSITION = (0.0, 0.0, -100.0)
 
 @dataclasses.dataclass(frozen=True)
 class Twin:
-    """Object that stands for a real one.
+    """Simulated object that represents a real one.
 
-    The body is turned by ``turn`` in the tracked frame, angles of ``fixed`` that are not None are replaced, and its
-    frame then stands at ``offset`` in the body's own axes. With a ``parent`` it is a part of a skeleton: its position
-    follows from the parent's pose and its own measurement.
+    The measured attitude is first turned by ``turn``; then the angles in ``fixed`` replace the measured ones, and
+    ``offset``, in the resulting axes, is added to the position. With a ``parent``, the object is a part of a skeleton:
+    its position follows from the parent's pose and its own measurement.
     """
 
     what: Any = "box"
@@ -50,7 +50,8 @@ class Twin:
     turn: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
     """Roll, pitch and yaw of the body in the tracked frame, rad. (3,)"""
     fixed: Sequence[float | None] = (None, None, None)
-    """Roll, pitch and yaw of the body in the world frame that replace the measured ones, rad; None for measured."""
+    """Roll, pitch and yaw of the body in the world frame that replace the measured ones, rad;
+    None to keep a measured angle."""
     parent: str | None = None
     """Name of the body in the stream that carries this one; None if it moves freely."""
     at: Sequence[float] = setting(default=(0.0, 0.0, 0.0), shapes=((3,),))
@@ -76,7 +77,7 @@ class Twin:
 
 
 def twin_of(name: str, twins: Mapping[str, Twin]) -> Twin | None:
-    """Return the twin whose key is the longest that a name of the stream starts with; None without one."""
+    """Return the twin with the longest key that a name of the stream starts with, or None if there is no such key."""
     keys = [key for key in twins if name.startswith(key)]
     return twins[max(keys, key=len)] if keys else None
 
@@ -91,7 +92,7 @@ class Twins(Closing):
 
     ``update`` reads all frames that have arrived, applies the rules of ``Tracker``, and writes all poses and velocities
     into ``data.objects`` of every world at once. Contact reports, ``ContactResponse``, range finders and images then
-    include the objects as any others. A reset returns objects to their first poses until the next update.
+    include them like any other objects. A reset returns objects to their first poses until the next update.
     """
 
     def __init__(
@@ -103,13 +104,13 @@ class Twins(Closing):
         rules: Rules | None = None,
         record: str | None = None,
     ):
-        """Add the objects to the scene, which is compiled once when it is used.
+        """Add the objects to the scene, which is compiled once, when it is next used.
 
         Args:
             sim: Simulation.
             source: Source of the poses.
-            twins: Twins by the beginning of their names. A name takes the twin of the longest key that it starts with.
-            names: Names of the bodies in the stream; ``discover`` finds them. Others are reported and ignored.
+            twins: Twins by prefix of the names in the stream. A name takes the twin of the longest matching prefix.
+            names: Names of the bodies in the stream; ``discover`` finds them. Other bodies are reported and ignored.
             rules: Limits of the rules; None for the defaults.
             record: Path of a recording to write; None for none.
         """
@@ -178,11 +179,11 @@ class Twins(Closing):
         sim.data = data.replace(objects=objects.replace(pos=new[0], quat=new[1], vel=new[2]))
 
     def freeze(self, *names: str) -> None:
-        """Keep bodies at their poses and ignore the source; all bodies without names."""
+        """Keep bodies at their present poses and ignore the source; without names, all bodies."""
         self._frozen[self._indices(names)] = True
 
     def thaw(self, *names: str) -> None:
-        """Make frozen bodies follow the source again; all bodies without names."""
+        """Make frozen bodies follow the source again; without names, all bodies."""
         self._frozen[self._indices(names)] = False
 
     def pose(self, name: str) -> tuple[NDArray, NDArray, NDArray]:
@@ -198,7 +199,7 @@ class Twins(Closing):
         Args:
             source: Source in simulated time, such as ``ReplaySource(path, by="time")``. Rules, offsets and skeletons
                 are applied to its frames.
-            seconds: Time to take from it, s.
+            seconds: Duration to sample, s.
             freq: Samples per second, Hz; poses between them are interpolated.
             start: Time of the recording at the reset of a world, s. () or (n_worlds,)
             name: Name of the plugin.
@@ -260,7 +261,7 @@ class Twins(Closing):
 
 
 def discover(source: MocapSource, twins: Mapping[str, Twin], seconds: float = 1.0) -> tuple[str, ...]:
-    """Return the names of a running source's bodies that have a twin, after listening for some time, s."""
+    """Return the names of a running source's bodies that have a twin, after polling it for a time, s."""
     wait, names = threading.Event(), dict[str, None]()
     for k in range(max(round(seconds / 0.05), 1)):
         for frame in source.poll(k, 20).frames:

@@ -14,20 +14,20 @@ from crazysim.lab.live.sitl.measured import Measurements, frd, ned, quat_ned
 PORT = 9002
 """Port at which a simulation listens."""
 FORMATS = {18458: "<HHI16H", 29569: "<HHI32H"}
-"""Packets with 16 and 32 outputs by their first number: rate, count and widths of pulses, us."""
+"""Layouts of packets with 16 and 32 outputs, by first number; rate, count and pulse widths, us, follow it."""
 PULSE_MIN, PULSE_MAX = 1000.0, 2000.0
-"""Pulses of a motor that is off and of one at full power, us: ``MOT_PWM_MIN`` and ``MOT_PWM_MAX``."""
+"""Pulse widths for a motor that is off and for one at full power, us: ``MOT_PWM_MIN`` and ``MOT_PWM_MAX``."""
 
 
 class ArduPilot(FirmwareLink):
     """A process of ArduPilot that was started with ``--model JSON:ADDRESS``; it waits for each answer.
 
-    The interface follows ``libraries/SITL/examples/JSON`` of ArduPilot/ardupilot. ArduPilot has no HIL messages of
-    MAVLink any more.
+    The interface follows ``libraries/SITL/examples/JSON`` of ArduPilot/ardupilot. ArduPilot no longer supports the HIL
+    messages of MAVLink.
 
-    It receives what the ``IMU`` measures. The interface has no fields for the others: ArduPilot simulates satellite
-    navigation, barometer and compass itself, with the errors of its parameters ``SIM_*``, from the true position,
-    velocity and attitude.
+    It receives the measurements of the ``IMU``. The interface has no fields for other sensors: ArduPilot
+    simulates satellite navigation, barometer and compass itself, with the errors of its parameters ``SIM_*``, from
+    the true position, velocity and attitude.
     """
 
     positions = ((1, -1), (-1, 1), (1, 1), (-1, -1))

@@ -14,7 +14,7 @@ from crazysim.lab.live.sitl.measured import HALF_TURN_COSINE, ZURICH, Measuremen
 from crazysim.tables import range_between, read_numbers
 
 PORTS = (9002, 9003, 9004)
-"""Ports of the motors, which Betaflight sends, and of the state and the remote control, which it receives."""
+"""Ports for motor packets, which Betaflight sends, and for state and remote-control packets, which it receives."""
 N_CHANNELS = 16
 LARGEST_PULSE = 65535
 """Largest pulse that a packet of the remote control holds, us."""
@@ -24,12 +24,13 @@ class Betaflight(FirmwareLink):
     """A process ``betaflight_SITL``, which runs in real time.
 
     Packets follow ``src/platform/SIMULATOR`` of betaflight/betaflight (commit 301d01ab). The firmware adapts
-    its clock to the simulation's but does not wait for it, and answers each packet of the state with at most one of the
-    motors.
+    its clock to the simulation's but does not wait for it, and answers each state packet with at most one motor
+    packet.
 
-    It receives what ``IMU`` and ``GPS`` measure, and the pressure at the height that the ``Barometer`` measures, which
-    a firmware with ``gazebo`` replaces by that at the altitude of the ``GPS``. Its attitude is the true one, which it
-    uses instead of its estimate unless it was built with ``USE_IMU_CALC``, and from which it simulates a compass.
+    It receives the measurements of ``IMU`` and ``GPS``, and the pressure at the height that ``Barometer`` measures; a
+    firmware with ``gazebo`` replaces this by the pressure at the altitude of the ``GPS``. It also receives the true
+    attitude, from which it simulates a compass and which it uses instead of its own estimate unless it was built with
+    ``USE_IMU_CALC``.
     """
 
     positions = ((-1, -1), (1, -1), (-1, 1), (1, 1))
@@ -52,7 +53,7 @@ class Betaflight(FirmwareLink):
             host: Address of the process.
             ports: Ports of the motors, the state and the remote control.
             gazebo: True for a firmware with ``ENABLE_GAZEBO_BRIDGE=1``, the default of its build.
-            origin: Place of the world's origin.
+            origin: Geodetic position of the world's origin.
             rc_freq: Packets of the remote control per second, Hz.
 
         Raises:
@@ -91,7 +92,7 @@ class Betaflight(FirmwareLink):
         latitude, longitude, altitude = self.origin.geodetic_position(measured.gps_pos)
         if self.gazebo:
             quat = (w, x, -y, -z)  # the Gazebo bridge conjugates with a half turn about x
-            self._start = self._start or (latitude, longitude)  # the bridge mirrors places at the first one
+            self._start = self._start or (latitude, longitude)  # the bridge mirrors positions about the first one
             latitude, longitude = (2 * x - y for x, y in zip(self._start, (latitude, longitude), strict=True))
         else:
             quat = HALF_TURN_COSINE * np.array([w - z, x - y, x + y, w + z])  # in the axes north, west, up

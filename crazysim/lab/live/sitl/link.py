@@ -17,13 +17,13 @@ from crazysim.storage import Closing
 from crazysim.tables import POSITIVE, range_between, read_number, read_numbers
 
 ROUNDING = 1e-6
-"""Tolerance of times for the rounding of sums of periods, s."""
+"""Tolerance for rounding errors in sums of periods, s."""
 MAX_DATAGRAM = 65535
 """Longest datagram, bytes."""
 LAST_PORT = 65535
 """Largest number of a port."""
 MAX_DRAIN_TIME = 0.1
-"""Longest time for reading the packets that are there once the time to wait is over, s, however fast others arrive."""
+"""Longest time for reading the waiting packets after the timeout, s, even if more keep arriving."""
 TIMEOUT = range_between(high=1e6, positive=True)
 """Range of a time to wait, s."""
 
@@ -31,20 +31,20 @@ TIMEOUT = range_between(high=1e6, positive=True)
 class FirmwareLink(Closing):
     """Link to the process of a firmware that flies one quadrotor.
 
-    ``positions`` are signs of x (forward) and y (left) of motors 1 to 4, ``yaw_torque_signs`` the signs of the torque
-    about z (up) with which each acts on the body: positive for a rotor that turns clockwise, seen from above.
+    ``positions`` are the signs of x (forward) and y (left) of motors 1 to 4. ``yaw_torque_signs`` are the signs of the
+    torques about z (up) that their rotors exert on the body: positive for a rotor that turns clockwise seen from above.
     """
 
     positions: ClassVar[tuple[tuple[int, int], ...]]
     yaw_torque_signs: ClassVar[tuple[int, ...]]
     remedy: ClassVar[str]
-    """Remedy for an airframe whose rotors turn the other way round, for a message."""
+    """Remedy for an airframe whose rotors turn in the opposite senses, for an error message."""
     lockstep: ClassVar[bool]
     """True for a firmware that waits for the simulation, False for one that follows another clock."""
 
     @abstractmethod
     def send(self, measured: Measurements) -> None:
-        """Send the measurements of an instant."""
+        """Send the measurements of one exchange."""
 
     @abstractmethod
     def receive(self, timeout: float) -> NDArray | None:
@@ -68,7 +68,7 @@ class Rate:
         self._period, self._next = 1 / read_number(name, freq, POSITIVE), 0.0
 
     def is_due(self, time: float) -> bool:
-        """Return True if it is due at a simulated time, s, and schedule the next one."""
+        """Return True if the action is due at a simulated time, s, and then schedule the next one."""
         if time < self._next - ROUNDING:
             return False
         self._next = max(self._next + self._period, time)
@@ -81,7 +81,7 @@ def check_address(host: str, port: int, least: int = 0) -> None:
     Args:
         host: Name or address of a host.
         port: Port.
-        least: Least port; 0 allows any free one.
+        least: Smallest valid port; 0 allows any free one.
     """
     if not isinstance(host, str):
         raise ConfigError(f"expected host as text, got {short_repr(host)}. Use '127.0.0.1'.")
@@ -119,7 +119,7 @@ class Datagrams(Closing):
                 self._socket.sendto(packet, self._sender)
 
     def newest(self, timeout: float, read: Callable[[bytes], NDArray | None]) -> NDArray | None:
-        """Return the contents of the newest packet that has any, or None if none arrived in time.
+        """Return the contents of the newest valid packet, or None if none arrived in time.
 
         Args:
             timeout: Time to wait for one, s; 0 to read only what has arrived.
@@ -133,7 +133,7 @@ class Datagrams(Closing):
                 packet, sender = self._socket.recvfrom(MAX_DATAGRAM)
             except (TimeoutError, BlockingIOError):
                 break
-            except ConnectionRefusedError:  # of a packet that was sent to a program that does not listen
+            except ConnectionRefusedError:  # an earlier packet went to a program that does not listen
                 packet, sender = b"", self._sender
             contents, now = read(packet), time.monotonic()
             if contents is not None:

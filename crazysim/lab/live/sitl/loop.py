@@ -1,4 +1,4 @@
-"""Simulations that firmware flies: measurements out, motor commands in, for one process for each drone."""
+"""Simulations flown by firmware: one process per drone receives measurements and sends motor commands."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from crazysim.storage import Closing
 from crazysim.tables import NOT_NEGATIVE, read_number
 
 FIELD = np.array([0.0, 2e-5, -4.5e-5])
-"""Magnetic field where there is no ``Magnetometer``, world frame, T: about the field in central Europe."""
+"""Magnetic field without a ``Magnetometer``, world frame, T: roughly the field in central Europe."""
 SILENCE_LIMIT = 1.0
 """Time of a run within which a firmware must send motor commands, s."""
 GPS_FREQ = 5
-"""Rate of satellite navigation where there is no ``GPS``, Hz."""
+"""Rate of satellite navigation without a ``GPS``, Hz."""
 SENSOR_KINDS = (IMU, Barometer, Magnetometer, GPS)
 """Sensors whose measurements firmware receives."""
 MOUNTED_SENSORS = (IMU, Magnetometer)
-"""Sensors whose frame is turned against the body."""
+"""Sensors whose frame may be rotated relative to the body."""
 
 
 class SoftwareInTheLoop(Closing):
     """Processes of a firmware that fly the drones of a simulation, one each.
 
-    The plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation measure; an ``IMU`` without
-    errors is added where there is none, and in place of the others the true values are sent. Which of them a firmware
-    receives is stated by its link.
+    The plugins ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` of the simulation provide the measurements. If the
+    ``IMU`` is missing, one without errors is added; if another sensor is missing, the true values are sent. The
+    docstring of each link states which measurements its firmware receives.
     """
 
     def __init__(
@@ -62,8 +62,9 @@ class SoftwareInTheLoop(Closing):
             sim: Simulation at the level ``rotor_vel``.
             links: Links to the firmware, one for each drone, in the order of worlds.
             freq: Exchanges per second, Hz, a divisor of ``sim.freq``; None for one in every step.
-            motors: Meaning of a motor command from 0 to 1: part of the largest speed of a rotor, or of its thrust.
-            reversed: True for a firmware that is set up for rotors that turn the other way round.
+            motors: Meaning of a motor command from 0 to 1: fraction of a rotor's largest speed, or of its
+                largest thrust.
+            reversed: True for a firmware that is set up for rotors that turn in the opposite senses.
             timeout: Time to wait for the motor commands of a firmware in lockstep, s.
         """
         self.sim, self.timeout, self.motors = sim, read_number("timeout", timeout, TIMEOUT), motors
@@ -111,7 +112,7 @@ class SoftwareInTheLoop(Closing):
         seconds = read_number("seconds", seconds, NOT_NEGATIVE)
         if speed is None:
             speed = "max" if all(link.lockstep for link in self.links) else 1.0
-        if not self._compiled:  # a firmware that follows another clock does not wait
+        if not self._compiled:  # without lockstep, a firmware does not wait for compilation
             compile_step(self.sim, self._n_steps)
             self._compiled = True
         dt, began = self._n_steps / self.sim.freq, time.monotonic()
@@ -144,11 +145,11 @@ class SoftwareInTheLoop(Closing):
         sim.rotor_vel_control(self._rotor_vel.reshape(sim.n_worlds, sim.n_drones, 4))
 
     def measure(self) -> list[Measurements]:
-        """Return the measurements of every drone; new ones are those since the last exchange."""
+        """Return the measurements of every drone; ``new`` contains the sensors with data since the last exchange."""
         return self._measurements()[0]
 
     def _measurements(self) -> tuple[list[Measurements], NDArray]:
-        """Return the measurements of every drone, and when the sensors took them. (n_links, n_kinds)"""
+        """Return the measurements of every drone, and counts of when they were taken. (n_links, n_kinds)"""
         states, time_now = self.sim.data.states, self._exchanges * self._n_steps / self.sim.freq
         pos, quat, vel, ang_vel = (_rows(x) for x in (states.pos, states.quat, states.vel, states.ang_vel))
         values, taken = zip(*map(self._latest, SENSOR_KINDS), strict=True)
@@ -182,9 +183,9 @@ class SoftwareInTheLoop(Closing):
         return measurements, when
 
     def _latest(self, kind: type[Sensor]) -> tuple[Any, NDArray | None]:
-        """Return the latest measurements of a sensor, vectors in the body frame, and when they were taken, in steps.
+        """Return the latest measurements of a sensor, vectors in the body frame, and the steps that took them.
 
-        Before the first measurement they are the values of a perfect sensor. Without the sensor they are missing.
+        Before the first measurement, they are the values of a perfect sensor. Without the sensor, both are None.
         """
         sensor = self._sensors[kind]
         if sensor is None:
@@ -200,7 +201,7 @@ class SoftwareInTheLoop(Closing):
         return _rows(value), taken
 
     def _check_heard(self, since: float, seconds: float) -> None:
-        """Check that motor commands of every firmware arrived after a time of ``time.monotonic``, ``seconds`` ago."""
+        """Check that every firmware has sent commands since a time (``time.monotonic``), ``seconds`` ago."""
         for link, heard in zip(self.links, self._heard, strict=True):
             if heard <= since:
                 raise _silence_error(link, seconds)
@@ -220,7 +221,7 @@ class SoftwareInTheLoop(Closing):
 
 
 def _as_links(links: object) -> tuple[FirmwareLink, ...]:
-    """Return links to firmware."""
+    """Check links to firmware, and return them as a tuple."""
     sequence = (links,) if isinstance(links, FirmwareLink) else links
     if not isinstance(sequence, Sequence) or not all(isinstance(link, FirmwareLink) for link in sequence):
         raise ConfigError(
@@ -247,7 +248,7 @@ def _silence_error(link: FirmwareLink, seconds: float) -> ConfigError:
 
 
 def motor_order(airframe: Airframe, link: FirmwareLink, reversed: bool = False) -> NDArray:
-    """Return which rotor of an airframe each motor of a firmware drives. (4,)"""
+    """Return the index of the rotor of an airframe that each motor of a firmware drives. (4,)"""
     if airframe.n_rotors != 4:
         raise ConfigError(f"expected an airframe with 4 rotors, got {airframe.name!r} with {airframe.n_rotors}")
     signs = [tuple(map(int, np.sign(pos[:2]))) for pos in airframe.value("rotors.position")]

@@ -17,11 +17,11 @@ from crazysim.plugins.sensors.sensor import Sensor
 METRES_PER_DEGREE = 6371000.0 * np.pi / 180
 """Length of a degree of latitude on a sphere with the mean radius of the earth (IUGG), m."""
 MAX_LATITUDE = 89.0
-"""Largest latitude, degrees: the plane that touches the earth has no longitudes at a pole."""
+"""Largest latitude, degrees; longitude is undefined on the tangent plane at a pole."""
 MIN_ALTITUDE, MAX_ALTITUDE = -1000.0, 11000.0
-"""Altitudes of the lowest layer of the standard atmosphere, m, whose pressures are sent: up to the tropopause."""
+"""Limits of the origin's altitude, m: the lowest layer of the standard atmosphere, up to the tropopause."""
 HALF_TURN_COSINE = np.sqrt(0.5)
-"""Cosine and sine of half a quarter turn, 1."""
+"""Cosine and sine of 45 degrees, half of a quarter turn, 1."""
 
 
 class Measurements(NamedTuple):
@@ -54,7 +54,7 @@ class Measurements(NamedTuple):
     """Magnetic field, body frame, T. (3,)"""
     new: frozenset[type[Sensor]]
     """Sensors with a new measurement: ``IMU``, ``Barometer``, ``Magnetometer`` and
-    ``GPS``. All of them in the first."""
+    ``GPS``. The first measurements name all."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Origin:
         check_settings(self)
 
     def geodetic_position(self, pos: NDArray) -> tuple[float, float, float]:
-        """Return latitude and longitude, degrees, and altitude, m, on the plane that touches the earth here.
+        """Return latitude and longitude, degrees, and altitude, m, on the plane tangent to the earth at the origin.
 
         Args:
             pos: Position, world frame, m. (3,)
@@ -92,7 +92,7 @@ class Origin:
 
 
 def as_origin(origin: object) -> Origin:
-    """Return an origin."""
+    """Check an origin, and return it."""
     if not isinstance(origin, Origin):
         raise ConfigError(f"expected an Origin, got {short_repr(origin)}. Use Origin(latitude, longitude, altitude).")
     return origin
@@ -103,22 +103,22 @@ ZURICH = Origin(47.397742, 8.545594, 488.0)
 
 
 def frd(vector: NDArray) -> NDArray:
-    """Return a vector of the body's axes forward, left, up in those forward, right, down. (3,)"""
+    """Convert a vector from the body axes forward, left, up to forward, right, down. (3,)"""
     return vector * np.array([1.0, -1.0, -1.0])
 
 
 def ned(vector: NDArray) -> NDArray:
-    """Return a vector of the world's axes east, north, up in those north, east, down. (3,)"""
+    """Convert a vector from the world axes east, north, up to north, east, down. (3,)"""
     return np.array([vector[1], vector[0], -vector[2]])
 
 
 def quat_ned(quat: NDArray) -> NDArray:
-    """Return the attitude of the body's axes forward, right, down in the world's north, east, down, wxyz. (4,)
+    """Return the attitude of the body (forward, right, down) in the world (north, east, down), wxyz. (4,)
 
     The quaternion of ENU to NED, ``(x + y) / sqrt(2)``, times the attitude, times the quaternion of FRD to FLU, ``x``.
 
     Args:
-        quat: Attitude of forward, left, up in east, north, up, xyzw. (4,)
+        quat: Attitude of the body (forward, left, up) in the world (east, north, up), xyzw. (4,)
     """
     x, y, z, w = quat
     return HALF_TURN_COSINE * np.array([w + z, x + y, x - y, w - z])

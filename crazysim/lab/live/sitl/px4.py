@@ -26,21 +26,21 @@ START = 0.02
 TEMPERATURE = 25.0
 """Temperature that is reported, degrees Celsius."""
 GAUSS, HECTOPASCAL = 1e-4, 100.0
-"""T in a gauss, Pa in a hectopascal."""
+"""One gauss in T, and one hectopascal in Pa."""
 CHUNK = 65536
-"""Most bytes that are read at once."""
+"""Largest number of bytes that are read at once."""
 
 
 class Px4(FirmwareLink):
     """A process of PX4 that was started without a simulator, as ``make px4_sitl none_iris``.
 
     PX4 is the client of a TCP connection, and in lockstep with the simulation: it advances its clock when a
-    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts it needs the clock and does not
-    answer: until the first answer the simulation keeps real time with its motors off. It answers to measurements of the
-    gyroscope alone, so its motor commands stay in force where the ``IMU`` has no new one.
+    ``HIL_SENSOR`` arrives, and answers with ``HIL_ACTUATOR_CONTROLS``. While it starts, it needs the clock but does not
+    answer; until the first answer, the simulation runs in real time with its motors off. PX4 answers only to new
+    measurements of the gyroscope; without one from the ``IMU``, its last motor commands stay in force.
 
-    It receives what ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS`` measure, each when a measurement is new. It
-    treats a sensor whose measurements never change as broken: give all of them noise. The true state in
+    It receives each new measurement of ``IMU``, ``Barometer``, ``Magnetometer`` and ``GPS``. It treats a sensor whose
+    measurements never change as broken, so give every sensor noise. The true state in
     ``HIL_STATE_QUATERNION`` is for its log; its accelerations are the ``IMU``'s.
     """
 
@@ -57,7 +57,7 @@ class Px4(FirmwareLink):
         Args:
             host: Address to listen at.
             port: Port, 4560 plus the number of the instance.
-            origin: Place of the world's origin.
+            origin: Geodetic position of the world's origin.
             connect_timeout: Time to wait for PX4 when the first measurements are sent, s.
 
         Raises:

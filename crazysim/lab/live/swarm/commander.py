@@ -1,9 +1,9 @@
 """Commander of one drone: the choice of the active setpoint, as in the firmware of the Crazyflie.
 
 High-level commands plan smooth moves. Streamed setpoints take precedence until they stop: after 0.5 s without one the
-drone stays in its place, after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
-commander.h of crazyflie-firmware). Each of them discards the plan of a high-level command, and a plan that is made
-while they are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
+drone holds its position, and after 2 s its motors stop (``COMMANDER_WDT_TIMEOUT_STABILIZE`` and ``_SHUTDOWN`` in
+commander.h of crazyflie-firmware). Each streamed setpoint discards the plan of a high-level command, and a plan
+that is made while setpoints are in force begins at the drone's own state (``commanderSetSetpoint`` in commander.c, and
 ``crtpCommanderHighLevelGetSetpoint`` in crtp_commander_high_level.c). Until the first command, and after landing, the
 motors are off.
 """
@@ -26,12 +26,12 @@ from crazysim.lab.live.swarm.state import DroneState, EstimateFrame
 STABILIZE, SHUTDOWN = 0.5, 2.0
 """Time without a streamed setpoint after which the drone holds its position, and after which its motors stop, s."""
 MAX_COORDINATE = 1e3
-"""Largest coordinate of a command, m, and largest number of any command."""
+"""Largest magnitude of a coordinate, m, and of most other numbers in commands."""
 SINK_SPEED, MAX_SINK = 0.3, 1.0
-"""Speed at which the setpoint continues down where a landing has ended above its height, m/s, and its distance, m."""
+"""Speed, m/s, and largest distance, m, of the setpoint's further descent if a landing ends above its height."""
 LANDED_HEIGHT, RESTING_SPEED, REST_TIME = 0.01, 0.02, 0.5
-"""Height above the target of a landing at which the motors stop, m; or vertical speed, m/s, below which a drone counts
-as standing, and the time after the end of the landing from which it does, s."""
+"""The motors stop at or below this height above the target of a landing, m, or if the vertical speed is below this
+limit, m/s, more than this time after the planned end of the landing, s."""
 MIN_DURATION, MAX_DURATION = 1e-3, 1e4
 """Limits of durations, s, and of factors of durations, 1."""
 N_TRAJECTORIES = 256
@@ -77,7 +77,7 @@ class Commander:
 
     @property
     def finished(self) -> bool:
-        """True where no planned move is under way."""
+        """True if no planned move is in progress."""
         return self._plan is None or self._plan.finished(self.now)
 
     def goal(self) -> NDArray:
@@ -92,7 +92,7 @@ class Commander:
         return self._motion()
 
     def in_group(self, mask: int) -> bool:
-        """Return True if a command for a group of drones is for this one."""
+        """Return True if a command with this group mask, 0 for all drones, addresses this one."""
         return mask == 0 or (mask & self.group) != 0
 
     # High-level commands --------------------------------------------------------------------------------------------
@@ -102,7 +102,8 @@ class Commander:
         self._vertical(height, duration, yaw, lands=False)
 
     def land(self, height: float, duration: float, yaw: float | None = None) -> None:
-        """Descend to a height, m, and stop the motors there, or where the drone stands; None keeps the yaw.
+        """Descend to a height, m, and stop the motors there, or where the drone comes to rest; a yaw of None
+        keeps the present one.
 
         A drone that is still higher at the end, because its controller lags or has an offset, descends further.
         """
@@ -127,7 +128,7 @@ class Commander:
         Args:
             identity: Number of the trajectory.
             path: Its path.
-            compressed: True for one that the firmware keeps compressed, and can neither stretch nor reverse.
+            compressed: True for one that the firmware stores compressed, which it can neither stretch nor reverse.
         """
         if not 0 <= identity < N_TRAJECTORIES:
             raise ConfigError(f"expected the number of a trajectory from 0 to {N_TRAJECTORIES - 1}, got {identity}")
@@ -174,7 +175,7 @@ class Commander:
     # Streamed setpoints ---------------------------------------------------------------------------------------------
 
     def command(self, level: Control | str, values: ArrayLike) -> None:
-        """Stream a command of the simulator, as to ``sim.state_control`` and so on, for this drone. (k,)"""
+        """Stream a command for this drone: the numbers that ``sim.state_control``, ... take. (k,)"""
         level = Control(level)
         self._require(level)
         size = {Control.state: 16, Control.rotor_vel: np.size(values)}.get(level, 4)
@@ -281,7 +282,7 @@ class Commander:
             return self._streamed(dt)
         if plan is None or not plan.finished(now) or plan.lands:
             return _state_command(*self.goal())
-        if self._held is None or self._held[0] is not plan:  # not evaluated again for a drone that hovers
+        if self._held is None or self._held[0] is not plan:  # evaluated only once while the drone hovers
             self._held = plan, _state_command(plan.at(now)[0], np.zeros(4), np.zeros(4))
         return self._held[1]
 
@@ -342,7 +343,7 @@ class Commander:
     def _motion_start(self, command: str) -> NDArray:
         """Return where a high-level command begins: at the setpoint in force, or at the drone while setpoints stream.
 
-        One that the stream keeps from taking effect is reported.
+        A command that has no effect because of the stream is reported.
         """
         self._require(Control.state)
         if self._stream is None:

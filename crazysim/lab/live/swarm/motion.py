@@ -12,7 +12,7 @@ from crazysim.lab.live.host_trajectory import HostTrajectory
 NO_JERK_INVERSE = np.linalg.inv(
     [[k * (k - 1) * (k - 2) if d == 3 else [1, k, k * (k - 1)][d] for k in range(4, 8)] for d in range(4)]
 )
-"""Inverse of the powers 4 to 7 of a polynomial and its derivatives 1, 2, 3 at the end of its unit interval. (4, 4)"""
+"""Inverse of the matrix of the powers 4 to 7 and their derivatives 1, 2, 3 at the end of the unit interval. (4, 4)"""
 
 
 class PlannedMotion(NamedTuple):
@@ -25,11 +25,11 @@ class PlannedMotion(NamedTuple):
     timescale: float = 1.0
     """Factor of its duration, 1."""
     reversed: bool = False
-    """True where it is followed from its end to its start."""
+    """True if it is followed from its end to its start."""
     shift: NDArray = np.zeros(4)
     """Offset of position, m, and yaw, rad. (4,)"""
     lands: bool = False
-    """True where the motors are stopped at its end."""
+    """True if the motors stop at its end."""
 
     @property
     def end(self) -> float:

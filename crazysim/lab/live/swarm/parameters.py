@@ -1,4 +1,4 @@
-"""Parameters of a simulated Crazyflie: their types and values, and the light that some of them set."""
+"""Parameters of a simulated Crazyflie: their types and values, and the LEDs that some of them control."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Parameter(NamedTuple):
     value: float = 0.0
     """Value at the start."""
     read_only: bool = False
-    """True where it cannot be written."""
+    """True if it cannot be written."""
     simulated: bool = True
-    """True where another value has its effect; others keep their value."""
+    """True if a new value has an effect in the simulation; other parameters refuse new values."""
 
 
 PARAMETERS: dict[str, Parameter] = {
@@ -64,7 +64,7 @@ PARAMETERS: dict[str, Parameter] = {
 
 
 def parameters_of(airframe: Airframe, multi_ranger: bool) -> dict[str, Parameter]:
-    """Return the parameters of a drone, including its deck of ranges and its attitude gains.
+    """Return the parameters of a drone, including its multi-ranger deck and its attitude gains.
 
     Args:
         airframe: Airframe; one without the gains of ``controller="pid"`` has no group ``pid_attitude``.
@@ -151,11 +151,11 @@ class Light:
         return self._begin + share * (self._target - self._begin)
 
     def fades(self, now: float) -> bool:
-        """Return True until the end of a fade; time that has gone back to zero ends it."""
+        """Return True until the end of a fade; a reset of the time ends it too."""
         return self._start <= now < self._start + self._duration
 
     def changed(self, values: Mapping[str, float], name: str, now: float) -> None:
-        """Take the colour of new values of parameters.
+        """Update the colour from new values of parameters.
 
         Args:
             values: Values by name.

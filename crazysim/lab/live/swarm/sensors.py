@@ -1,4 +1,4 @@
-"""Readings of a drone's plugins, as the decks and the power management of a Crazyflie have them."""
+"""Readings of a drone's plugins, as the decks and the power management of a Crazyflie report them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def battery_of(sim: Sim, drone: int) -> BatteryState:
 
 
 def ranges_of(sim: Sim, drone: int) -> dict[str, float]:
-    """Return the distances that a ``MultiRanger``, or a ``RangeFinder``, measures along ``MULTI_RANGER``, m, by name.
+    """Return the distances that a ``MultiRanger``, or a ``RangeFinder``, measures along ``MULTI_RANGER_DIRECTIONS``, m.
 
     They are infinite if no object is within range. Other directions, and drones without the sensor, are missing.
     Before the first measurement of a ``MultiRanger`` they are the true distances.

@@ -43,7 +43,7 @@ class EstimateFrame(NamedTuple):
     turn: float
     """Angle about the vertical, rad."""
     shift: NDArray
-    """Position of the world's origin, m. (3,)"""
+    """Position of the world's origin in the frame of the estimate, m. (3,)"""
 
     @staticmethod
     def from_pose(pos: NDArray, yaw: float, pose: NDArray) -> EstimateFrame:

@@ -40,8 +40,8 @@ class Swarm(Closing):
         swarm["cf1"].take_off(1.0, 2.0)
         swarm.advance(3.0)
 
-    States come from the filter of ``Sim(estimator=...)`` and its ``IMU``; without a filter they are the true ones.
-    Commands come from other threads or from the same one; ``lock`` protects them. The simulation advances by
+    States come from the filter of ``Sim(estimator=...)`` and its ``IMU``; without a filter they are the true states.
+    Commands may come from any thread; hold ``lock`` while another thread advances. The simulation advances by
     ``advance``, by ``start`` in real time, by a loop that calls the swarm, such as ``Live.add(swarm)``, or by a loop
     that ``advance`` runs, after ``run_in(live)``.
     """
