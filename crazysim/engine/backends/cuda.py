@@ -2,7 +2,8 @@
 
 NVRTC comes with JAX's CUDA packages. Its PTX is part of the compiled step, in a custom call (``PTX_TARGET``) with which
 XLA hands it to the driver, so JAX's compilation cache never returns a kernel for another GPU. Kernels need no other
-package, no compiler on the machine, and no Python at run time.
+package, no compiler on the machine, and no Python at run time. With ``CRAZYSIM_JAX_FALLBACKS=1`` a handler in Python
+(``ffi_handlers``) launches them instead.
 """
 
 from __future__ import annotations
