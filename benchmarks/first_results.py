@@ -20,7 +20,7 @@ import time
 from measure import machine
 
 from crazysim import __version__
-from crazysim.cache import VARIABLE
+from crazysim.cache import CACHE_VARIABLE
 
 CASES = {
     "step": """
@@ -76,7 +76,7 @@ def main() -> None:
 
 def measure_cases(case: str, cache: str) -> tuple[float, float]:
     """Return the wall time and the CPU time of a process, s."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {VARIABLE: cache}
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {CACHE_VARIABLE: cache}
     program = f"import crazysim\n{CASES[case]}"
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-c", program], env=environment, check=True, stdout=subprocess.DEVNULL)

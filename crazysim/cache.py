@@ -24,17 +24,17 @@ import jax
 
 from crazysim import jaxcompat
 from crazysim.errors import ConfigError
-from crazysim.storage import FOLDER_REMEDY, distrust, make_private
+from crazysim.storage import FOLDER_REMEDY, make_private, untrusted_reason
 
-VARIABLE = "CRAZYSIM_CACHE"
+CACHE_VARIABLE = "CRAZYSIM_CACHE"
 """Environment variable with the folder to use, or ``off``."""
 MAX_CACHE_BYTES = 1_000_000_000
 """Size of all files, bytes, above which the oldest are removed when the cache is first used: about 5,000 programs."""
 SHARE_AFTER_TRIM = 0.8
 """Fraction of the limit to which a removal reduces the size, so that not every process has to remove files."""
-MIN_FREE = 50_000_000
+MIN_FREE_BYTES = 50_000_000
 """Free space below which a disk counts as full, bytes: the programs of some simulations."""
-PATTERNS = ("*-cache", "*-atime", "xla_gpu_per_fusion_autotune_cache_dir/*", "xla_gpu_kernel_cache_file",
+CACHE_FILE_PATTERNS = ("*-cache", "*-atime", "xla_gpu_per_fusion_autotune_cache_dir/*", "xla_gpu_kernel_cache_file",
             "crazysim/*.so", "crazysim/*.ptx", "crazysim/*.cubin")  # fmt: skip
 """Names of the files that JAX, XLA and the engine write; other files in the folder are never removed."""
 CPU_INFO = Path("/proc/cpuinfo")
@@ -50,7 +50,8 @@ def caches_folder() -> Path:
         return Path.home() / ".cache" / "crazysim"
     except RuntimeError:
         raise ConfigError(
-            f"expected a home folder for compiled programs, got none. Set XDG_CACHE_HOME, or {VARIABLE}, to a folder."
+            "expected a home folder for compiled programs, got none. "
+            f"Set XDG_CACHE_HOME, or {CACHE_VARIABLE}, to a folder."
         ) from None
 
 
@@ -63,12 +64,12 @@ def default_cache() -> Path | None:
     Raises:
         ConfigError: If ``CRAZYSIM_CACHE`` is not set and the user has no home folder.
     """
-    root = _root()
+    root = _root_folder()
     return None if root is None else root / f"cpu-{hashlib.sha256(cpu_features().encode()).hexdigest()[:8]}"
 
 
-def _root() -> Path | None:
-    variable = os.environ.get(VARIABLE, "")
+def _root_folder() -> Path | None:
+    variable = os.environ.get(CACHE_VARIABLE, "")
     if variable.lower() in ("off", "0", "false", "no"):
         return None
     if not variable:
@@ -77,7 +78,8 @@ def _root() -> Path | None:
         return Path(variable).expanduser().absolute()  # the working directory may change
     except RuntimeError:
         raise ConfigError(
-            f"expected a folder in {VARIABLE}, got {variable!r}, whose user has no home folder. Use an absolute path."
+            f"expected a folder in {CACHE_VARIABLE}, got {variable!r}, whose user has no home folder. "
+            "Use an absolute path."
         ) from None
 
 
@@ -99,25 +101,28 @@ def folder() -> Path | None:
     configured = jaxcompat.cache_folder()
     if configured is not None:
         return Path(configured)
-    return _prepare_default(*map(os.environ.get, (VARIABLE, "XDG_CACHE_HOME", "HOME")))
+    return _prepared_default_folder(*map(os.environ.get, (CACHE_VARIABLE, "XDG_CACHE_HOME", "HOME")))
 
 
 @functools.cache
-def _prepare_default(*environment: str | None) -> Path | None:
+def _prepared_default_folder(*environment: str | None) -> Path | None:
     """Return the default folder, prepared, if it can be used in this environment."""
     del environment  # the folder follows from it
     try:
         path = default_cache()
         if path is not None:
-            _prepare(path.parent, path)
+            _prepare_folder(path.parent, path)
     except ConfigError as error:
         message = f"compiled programs are not kept: {error}"
-        print(message if VARIABLE in message else f"{message} Set {VARIABLE} to its path, or to off.", file=sys.stderr)
+        print(
+            message if CACHE_VARIABLE in message else f"{message} Set {CACHE_VARIABLE} to its path, or to off.",
+            file=sys.stderr,
+        )
         return None
     return path
 
 
-def _prepare(root: Path, path: Path) -> None:
+def _prepare_folder(root: Path, path: Path) -> None:
     """Make the folder of a cache, and remove the oldest files if they are too many.
 
     Args:
@@ -135,15 +140,15 @@ def _prepare(root: Path, path: Path) -> None:
         raise ConfigError(
             f"expected a folder for compiled programs, got {str(path)!r}: {error}. Use another."
         ) from error
-    if reason := distrust(path):
+    if reason := untrusted_reason(path):
         raise ConfigError(
             f"expected a folder that only this user can write, got {str(path)!r}: {reason}. {FOLDER_REMEDY}"
         )
     if not os.access(path, os.R_OK | os.W_OK | os.X_OK):
         raise ConfigError(f"expected a folder that can be written, got {str(path)!r}. Use another.")
-    if free < MIN_FREE:
+    if free < MIN_FREE_BYTES:
         raise ConfigError(
-            f"expected {MIN_FREE / 1e6:g} MB of free space for compiled programs, got {free / 1e6:.1f} MB in "
+            f"expected {MIN_FREE_BYTES / 1e6:g} MB of free space for compiled programs, got {free / 1e6:.1f} MB in "
             f"{str(path)!r}. Free some, or use another folder."
         )
     trim(root)
@@ -175,7 +180,7 @@ def enable_cache(
     path = default_cache() if cache_path is None else Path(cache_path).absolute()
     if path is None:
         return None
-    _prepare(path if cache_path is not None else path.parent, path)
+    _prepare_folder(path if cache_path is not None else path.parent, path)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", min_entry_size_bytes)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time_secs)
@@ -227,12 +232,13 @@ def enable_for_command() -> None:
     enable_cache()
     if is_new:
         print(
-            f"compiled programs are kept in {path}, {MAX_CACHE_BYTES / 1e9:g} GB at most; {VARIABLE}=off keeps none",
+            f"compiled programs are kept in {path}, {MAX_CACHE_BYTES / 1e9:g} GB at most; "
+            f"{CACHE_VARIABLE}=off keeps none",
             file=sys.stderr,
         )
 
 
-PATIENCE = 1.0
+ANNOUNCE_AFTER = 1.0
 """Time after which unfinished work is announced, s."""
 
 _announced: set[str] = set()
@@ -253,15 +259,15 @@ def announce(work: str, seconds: str) -> None:
 
 
 @contextlib.contextmanager
-def announce_if_slow(work: str, seconds: str, patience: float = PATIENCE) -> Iterator[None]:
+def announce_if_slow(work: str, seconds: str, announce_after: float = ANNOUNCE_AFTER) -> Iterator[None]:
     """Keep the programs of long work, and announce it where it has not ended after some time.
 
     Args:
         work: Name of the work, such as ``"compiling the gradient"``.
         seconds: Duration on two cores, such as ``"10 to 40 s"``.
-        patience: Time after which it is announced, s.
+        announce_after: Time after which it is announced, s.
     """
-    timer = threading.Timer(patience, announce, (work, seconds))
+    timer = threading.Timer(announce_after, announce, (work, seconds))
     timer.daemon = True
     timer.start()
     try:
@@ -279,7 +285,7 @@ def trim(folder: Path, limit: int = MAX_CACHE_BYTES) -> None:
         limit: Largest size of all programs, bytes.
     """
     files = []
-    for pattern in PATTERNS:
+    for pattern in CACHE_FILE_PATTERNS:
         for path in (*folder.glob(pattern), *folder.glob(f"cpu-*/{pattern}")):
             with contextlib.suppress(OSError):  # another process has removed it
                 status = path.lstat()

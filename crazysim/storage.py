@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from crazysim.errors import ConfigError, DamagedFileError
 
-PICTURES = (".png", ".jpg", ".svg", ".pdf")
-"""Suffixes of pictures that are written."""
-MAX_TOML = 2**20
+PICTURE_SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
+"""Suffixes of the formats in which figures are saved."""
+MAX_TOML_BYTES = 2**20
 """Largest TOML file, bytes; the built-in ones have up to 12,000."""
 MAX_ARRAYS = 10_000
 """Largest number of arrays in an ``.npz`` file."""
-MAX_UNPACKED, MAX_RATIO = 2**30, 100
+MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO = 2**30, 100
 """Limit of bytes unpacked from an ``.npz`` file: the first number, or the second times its size if that is more."""
 FOLDER_REMEDY = "Remove it, since its files may not be yours, or use another."
 """End of the message for a folder that is refused."""
@@ -41,12 +41,12 @@ def is_file(path: str | Path) -> bool:
         return False
 
 
-def read_bytes(path: str | Path, at_most: int) -> bytes:
+def read_bytes(path: str | Path, max_bytes: int) -> bytes:
     """Return the contents of a file.
 
     Args:
         path: The file.
-        at_most: Largest size, bytes.
+        max_bytes: Largest size, bytes.
 
     Raises:
         ConfigError: If it does not exist, cannot be read, or is larger.
@@ -55,25 +55,25 @@ def read_bytes(path: str | Path, at_most: int) -> bytes:
         raise ConfigError(f"expected an existing file, got {str(path)[:200]!r}")
     try:
         size = Path(path).stat().st_size
-        if size > at_most:
-            raise ConfigError(f"expected a file of at most {at_most} bytes, got {size} in {path}")
+        if size > max_bytes:
+            raise ConfigError(f"expected a file of at most {max_bytes} bytes, got {size} in {path}")
         return Path(path).read_bytes()
     except OSError as error:
         raise ConfigError(f"expected a file that can be read, got {str(path)!r}: {error}") from error
 
 
-def read_text(path: str | Path, at_most: int) -> str:
+def read_text(path: str | Path, max_bytes: int) -> str:
     """Return the contents of a text file, without a byte order mark.
 
     Args:
         path: The file.
-        at_most: Largest size, bytes.
+        max_bytes: Largest size, bytes.
 
     Raises:
         ConfigError: If it does not exist, cannot be read, is larger, or is not text in UTF-8.
     """
     try:
-        return read_bytes(path, at_most).decode("utf-8-sig")
+        return read_bytes(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"expected text in {path}, got bytes that are not UTF-8: {error}. Save it as UTF-8."
@@ -88,9 +88,9 @@ def read_toml(path: str | Path, guide: str) -> dict[str, Any]:
         guide: Page that describes the format, for messages.
 
     Raises:
-        ConfigError: If it cannot be read, is larger than ``MAX_TOML``, or is not TOML.
+        ConfigError: If it cannot be read, is larger than ``MAX_TOML_BYTES``, or is not TOML.
     """
-    text = read_text(path, MAX_TOML)
+    text = read_text(path, MAX_TOML_BYTES)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also of dates that do not exist
@@ -176,9 +176,10 @@ def write_figure(figure: Any, path: str | Path, dpi: float) -> None:
     """Write a figure of matplotlib as a whole or not at all; the suffix of the file is the format.
 
     Raises:
-        ConfigError: If the suffix is not in ``PICTURES``, the folder does not exist, or the file cannot be written.
+        ConfigError: If the suffix is not in ``PICTURE_SUFFIXES``, the folder does not exist, or the file cannot be
+            written.
     """
-    check_writable(path, PICTURES)
+    check_writable(path, PICTURE_SUFFIXES)
     with replacing(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower(), dpi=dpi)
 
@@ -208,25 +209,25 @@ def check_writable(path: str | Path, suffixes: Sequence[str] = ()) -> None:
 class ZipReader:
     """A zip archive whose files are unpacked within bounds."""
 
-    def __init__(self, file: BinaryIO, place: str, max_files: int, max_file: int, max_total: int):
+    def __init__(self, file: BinaryIO, name: str, max_files: int, max_file_bytes: int, max_total_bytes: int):
         """Open an archive.
 
         Args:
             file: The archive, which stays open.
-            place: Name of the archive, for messages.
+            name: Name of the archive, for messages.
             max_files: Largest number of files.
-            max_file: Largest file that is unpacked, bytes.
-            max_total: Largest number of bytes that are unpacked in all.
+            max_file_bytes: Largest file that is unpacked, bytes.
+            max_total_bytes: Largest number of bytes that are unpacked in all.
 
         Raises:
             ConfigError: If it has more files.
             Exception: Of any type, if it is damaged; see ``reading``.
         """
         self._zip = zipfile.ZipFile(file)
-        self._place, self._max_file, self._max_total, self._unpacked = place, max_file, max_total, 0
+        self._name, self._max_file, self._max_total, self._unpacked = name, max_file_bytes, max_total_bytes, 0
         members = self._zip.infolist()
         if len(members) > max_files:
-            raise ConfigError(f"expected at most {max_files} files, got {len(members)} in {place}")
+            raise ConfigError(f"expected at most {max_files} files, got {len(members)} in {name}")
         self._members = {str(PurePosixPath(member.filename)): member for member in members}
         self.names = self._members.keys()
         """Names of the files."""
@@ -243,40 +244,42 @@ class ZipReader:
         if member.file_size > self._max_file or self._unpacked > self._max_total:
             raise ConfigError(
                 f"expected files of at most {self._max_file} bytes, {self._max_total} in all, got more in "
-                f"{self._place}: {name}"
+                f"{self._name}: {name}"
             )
         with self._zip.open(member) as file:
             return file.read(member.file_size)  # with a length no more is unpacked, even if the archive holds more
 
 
-def read_arrays(file: BinaryIO, place: str) -> dict[str, NDArray]:
+def read_arrays(file: BinaryIO, name: str) -> dict[str, NDArray]:
     """Return the arrays of an ``.npz`` file, after comparing their checksums.
 
     Args:
         file: The file.
-        place: Name of the file, for messages.
+        name: Name of the file, for messages.
 
     Raises:
         ConfigError: If it unpacks to much more than its size.
         Exception: Of any type, if it is damaged; see ``reading``.
     """
-    limit = max(MAX_UNPACKED, MAX_RATIO * file.seek(0, os.SEEK_END))
-    archive = ZipReader(file, place, MAX_ARRAYS, limit, limit)
+    limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * file.seek(0, os.SEEK_END))
+    archive = ZipReader(file, name, MAX_ARRAYS, limit, limit)
     # A whole member is read before NumPy parses it: the checksum of a member is compared only at its end.
-    return {name.removesuffix(".npy"): _array(archive.read(name), f"{place}: {name}") for name in archive.names}
+    return {
+        member.removesuffix(".npy"): _parse_array(archive.read(member), f"{name}: {member}") for member in archive.names
+    }
 
 
-def _array(content: bytes, place: str) -> NDArray:
+def _parse_array(content: bytes, name: str) -> NDArray:
     """Return the array of a ``.npy`` file, after a check that its header states no more bytes than follow it."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(file)
-    stated, left = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
-    if min(shape, default=0) < 0 or (stated > left and not dtype.hasobject):
+    stated_bytes, following_bytes = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
+    if min(shape, default=0) < 0 or (stated_bytes > following_bytes and not dtype.hasobject):
         raise ConfigError(
-            f"expected an array of the {left} bytes that follow its header, got a header of shape {shape} in {place}. "
-            "Write the file again."
+            f"expected an array of the {following_bytes} bytes that follow its header, "
+            f"got a header of shape {shape} in {name}. Write the file again."
         )
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
@@ -291,7 +294,7 @@ def make_private(folder: Path) -> None:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
 
-def distrust(path: Path) -> str:
+def untrusted_reason(path: Path) -> str:
     """Return the reason why another user could have written a file or folder, for a message; empty if none could.
 
     Args:

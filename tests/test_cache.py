@@ -43,7 +43,7 @@ def settings(monkeypatch):
     names = ("jax_compilation_cache_dir", *(f"jax_persistent_cache_{name}" for name in names))
     before = {name: getattr(jax.config, name) for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
-    for name in (cache.VARIABLE, "XDG_CACHE_HOME"):
+    for name in (cache.CACHE_VARIABLE, "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     yield
     for name, value in before.items():
@@ -57,7 +57,7 @@ def test_the_folder_is_that_of_the_variable_or_in_the_folder_of_caches(settings,
     assert default_cache().parent == tmp_path / ".cache" / "crazysim" / "jax"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert default_cache().parent == tmp_path / "xdg" / "crazysim" / "jax"
-    monkeypatch.setenv(cache.VARIABLE, "~/mine")
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "~/mine")
     assert enable_cache() == default_cache()
     assert default_cache().parent == tmp_path / "mine"
     assert jax.config.jax_compilation_cache_dir == str(default_cache())
@@ -66,7 +66,7 @@ def test_the_folder_is_that_of_the_variable_or_in_the_folder_of_caches(settings,
 def test_a_relative_folder_does_not_follow_the_working_directory(settings, monkeypatch, tmp_path):
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(cache.VARIABLE, "kept")
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "kept")
     used = cache.folder()
     assert enable_cache("own") == tmp_path / "own"
     jax.config.update("jax_compilation_cache_dir", None)
@@ -78,7 +78,7 @@ def test_each_kind_of_cpu_has_a_folder_of_its_own(settings, monkeypatch, tmp_pat
     """XLA's programs are machine code whose key does not hold the features of the CPU."""
     info = tmp_path / "cpuinfo"
     monkeypatch.setattr(cache, "CPU_INFO", info)
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "kept"))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
     folders = set()
     for features in ("fpu avx512f", "fpu avx2", "fpu avx512f"):
         info.write_text(f"flags : {features}\n")
@@ -87,7 +87,7 @@ def test_each_kind_of_cpu_has_a_folder_of_its_own(settings, monkeypatch, tmp_pat
 
 
 def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkeypatch, tmp_path):
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = [getattr(jax.config, name) for name in names]
 
@@ -114,7 +114,7 @@ def test_programs_of_a_block_are_kept_and_jax_is_left_as_it_was(settings, monkey
 
 def test_a_block_leaves_the_cache_of_a_block_of_another_thread_open(settings, monkeypatch, tmp_path):
     """JAX closes its cache without a lock: another thread that opens it meanwhile would fail."""
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
 
     def enter():
         with keep_programs():
@@ -199,7 +199,7 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
         monkeypatch.delenv("XDG_CACHE_HOME")
         monkeypatch.delenv("HOME")
         monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for a user without an entry in passwd
-    cache._prepare_default.cache_clear()
+    cache._prepared_default_folder.cache_clear()
     for _ in range(2):
         with keep_programs():
             jax.jit(_inner)(jnp.ones(3))
@@ -207,14 +207,14 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert told.startswith("compiled programs are not kept: expected ")
-    assert cache.VARIABLE in told
+    assert cache.CACHE_VARIABLE in told
     with pytest.raises(ConfigError, match="expected"):
         enable_cache()
-    cache._prepare_default.cache_clear()
+    cache._prepared_default_folder.cache_clear()
 
 
 def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_path, capsys):
-    monkeypatch.setenv(cache.VARIABLE, "off")
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "off")
     enable_for_command()
     assert enable_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
@@ -223,7 +223,7 @@ def test_off_keeps_nothing_unless_a_folder_is_named(settings, monkeypatch, tmp_p
 
 
 def test_a_command_tells_once_and_leaves_the_cache_that_jax_has(settings, monkeypatch, tmp_path, capsys):
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "kept"))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "kept"))
     enable_for_command()
     told = capsys.readouterr().err
     assert told.count("\n") == 1
@@ -233,7 +233,7 @@ def test_a_command_tells_once_and_leaves_the_cache_that_jax_has(settings, monkey
     enable_for_command()
     kept = str(default_cache())
     assert jax.config.jax_compilation_cache_dir == kept
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "other"))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "other"))
     enable_for_command()
     assert jax.config.jax_compilation_cache_dir == kept
     assert capsys.readouterr().err == ""
@@ -241,7 +241,7 @@ def test_a_command_tells_once_and_leaves_the_cache_that_jax_has(settings, monkey
 
 def test_a_command_runs_where_the_folder_cannot_be_used(settings, monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "file"))
     enable_for_command()
     assert jax.config.jax_compilation_cache_dir is None
     assert capsys.readouterr().err.startswith("compiled programs are not kept: expected a folder")
@@ -299,13 +299,11 @@ def test_long_work_is_announced_once_for_each_kind(settings, capsys):
 
 
 def test_work_that_lasts_is_announced_and_work_that_ends_at_once_is_not(settings, capsys, monkeypatch):
-    monkeypatch.setattr(cache, "PATIENCE", 3600.0)
-    with announce_if_slow("compiling what is cached", "5 s"):
+    with announce_if_slow("compiling what is cached", "5 s", announce_after=3600.0):
         pass
     assert capsys.readouterr().err == ""
     shown = threading.Event()
-    monkeypatch.setattr(cache, "PATIENCE", 0.0)
     monkeypatch.setattr(cache, "announce", lambda *args: (announce(*args), shown.set()))
-    with announce_if_slow("compiling what lasts", "5 s"):
+    with announce_if_slow("compiling what lasts", "5 s", announce_after=0.0):
         assert shown.wait(60), "the notice comes while the work is done"
     assert capsys.readouterr().err.startswith("compiling what lasts: 5 s on two cores")

@@ -31,7 +31,7 @@ from crazysim.lab.identify import (
     read_log,
     with_speeds,
 )
-from crazysim.storage import PICTURES, check_writable, write_file
+from crazysim.storage import PICTURE_SUFFIXES, check_writable, write_file
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> None:
     if options.out.exists():
         raise ConfigError(f"expected a new file, got {str(options.out)!r}, which exists. Choose another name.")
     if options.plot is not None:
-        check_writable(options.plot, PICTURES)
+        check_writable(options.plot, PICTURE_SUFFIXES)
     if options.dynamics != "first_principles" and options.network is not None:
         raise ConfigError(
             f"expected no --network with --dynamics {options.dynamics}, which has no residual. "

@@ -117,13 +117,13 @@ def _nvrtc() -> str:
 def _cache() -> str:
     from crazysim import jaxcompat
     from crazysim.cache import default_cache
-    from crazysim.storage import distrust
+    from crazysim.storage import untrusted_reason
 
     configured = jaxcompat.cache_folder()
     folder = default_cache() if configured is None else Path(configured)
     if folder is None:
         return "off"
-    reason = distrust(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
+    reason = untrusted_reason(folder / "crazysim") if (folder / "crazysim").is_dir() else ""
     size = _size(folder) if folder.is_dir() else "not there yet"
     return f"{folder}: {size}" + (f", kernels refused: {reason}" if reason else "")
 

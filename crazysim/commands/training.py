@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands.options import DefaultsFormatter, given_options
-from crazysim.storage import PICTURES, check_writable
+from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -125,7 +125,7 @@ def evaluate(options: argparse.Namespace) -> None:
     from crazysim.train.training import load_policy
 
     if options.plot is not None:
-        check_writable(options.plot, PICTURES)
+        check_writable(options.plot, PICTURE_SUFFIXES)
     policy, config, _ = load_policy(options.folder, options.task)
     env = config.with_device(options.device).make_env(options.worlds)
     key = None if options.seed is None else jax.random.key(options.seed)

@@ -20,7 +20,7 @@ from types import ModuleType
 from crazysim.cache import caches_folder
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError
-from crazysim.storage import distrust, make_private
+from crazysim.storage import make_private, untrusted_reason
 
 GUIDE = "docs/guides/tasks.md"
 _CLASSES: dict[str, type[Task]] = {}
@@ -113,7 +113,7 @@ def load_noted_task(reference: str, names: Container[str]) -> type[Task] | str:
             f"expected a task that you have named on this machine, got {reference!r} from the files of a run, which "
             f"others could have made. {remedy}"
         )
-    if place.endswith(".py") and (reason := distrust(Path(place))):
+    if place.endswith(".py") and (reason := untrusted_reason(Path(place))):
         raise ConfigError(f"expected a file that only you can write, got {place!r}: {reason}. {remedy}")
     return load_task(reference, names)
 
@@ -179,7 +179,7 @@ def _list_path() -> Path:
 def _read_list() -> list[str]:
     with contextlib.suppress(ConfigError):
         path = _list_path()
-        if path.is_file() and not distrust(path):
+        if path.is_file() and not untrusted_reason(path):
             return path.read_text(encoding="utf-8").splitlines()
     return []
 
@@ -189,7 +189,7 @@ def _add_to_list(reference: str) -> None:
     with contextlib.suppress(OSError, ConfigError):
         path = _list_path()
         make_private(path.parent)
-        if distrust(path.parent) or reference in _read_list():
+        if untrusted_reason(path.parent) or reference in _read_list():
             return
         with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags, 0o600)) as file:
             file.write(f"{reference}\n")

@@ -11,7 +11,7 @@ import pytest
 
 from crazysim.engine.backends import kernel_cache
 from crazysim.errors import ConfigError
-from crazysim.storage import distrust
+from crazysim.storage import untrusted_reason
 from crazysim.utils import enable_cache
 
 OTHERS = 12345
@@ -67,9 +67,9 @@ def test_a_folder_that_others_can_replace_is_refused(cache):
     shared = cache / "crazysim"
     assert kernel_cache.folder() == shared
     cache.chmod(0o777)
-    assert str(cache) in distrust(shared)
+    assert str(cache) in untrusted_reason(shared)
     cache.chmod(0o1777)  # as of /tmp: others can add files, but rename and remove only their own
-    assert not distrust(shared)
+    assert not untrusted_reason(shared)
 
 
 @as_root
@@ -86,9 +86,9 @@ def test_a_folder_in_one_of_another_user_is_refused(cache):
     """Who owns a folder can put another one in the place of what is in it."""
     shared = kernel_cache.folder()
     os.chown(cache, OTHERS, OTHERS)
-    assert distrust(shared) == f"the user {OTHERS} can replace it, who owns {cache}"
+    assert untrusted_reason(shared) == f"the user {OTHERS} can replace it, who owns {cache}"
     os.chown(cache, 65534, 65534)  # root, as containers and network file systems show it
-    assert not distrust(shared)
+    assert not untrusted_reason(shared)
 
 
 @as_root

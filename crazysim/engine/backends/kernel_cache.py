@@ -29,7 +29,7 @@ from pathlib import Path
 
 from crazysim import cache
 from crazysim.errors import warn
-from crazysim.storage import FOLDER_REMEDY, distrust, make_private
+from crazysim.storage import FOLDER_REMEDY, make_private, untrusted_reason
 
 DIGEST_LENGTH = 24
 """Hexadecimal digits of a hash in a name: 96 bits."""
@@ -55,7 +55,7 @@ def folder() -> Path:
         with contextlib.suppress(OSError):
             make_private(shared)
         if shared.is_dir():
-            if reason := distrust(shared):
+            if reason := untrusted_reason(shared):
                 _refuse(shared, reason)
             elif os.access(shared, os.W_OK | os.R_OK):
                 _sweep_once(shared)
@@ -124,7 +124,7 @@ def sweep(cache_folder: Path, pattern: str) -> None:
     for path in cache_folder.glob(pattern):
         with contextlib.suppress(OSError):
             status = path.lstat()
-            if not _is_abandoned(path.name, time.time() - status.st_mtime) or distrust(path):
+            if not _is_abandoned(path.name, time.time() - status.st_mtime) or untrusted_reason(path):
                 continue
             if stat.S_ISDIR(status.st_mode):
                 shutil.rmtree(path, ignore_errors=True)
@@ -155,7 +155,7 @@ def _is_abandoned(name: str, age: float) -> bool:
 def find(cache_folder: Path, key: str) -> Iterator[Path]:
     """Yield the intact files of a key. Damaged files are removed, and files of other users are left out."""
     for path in sorted(cache_folder.glob(f"{key}-*")):
-        if path.suffix == ".tmp" or distrust(path):
+        if path.suffix == ".tmp" or untrusted_reason(path):
             continue
         try:
             intact = path.stem == f"{key}-{digest(path.read_bytes())}"
