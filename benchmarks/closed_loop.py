@@ -13,7 +13,7 @@ import argparse
 import json
 from pathlib import Path
 
-from crazysim.lab.validate.closed_loop import compare, laboratory_estimator, read_flight
+from crazysim.lab.validate.closed_loop import compare_tracking, laboratory_estimator, read_flight
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
             f"expected .npz files with {' or '.join(args.names)} in their names in {args.folder}, got none"
         )
     estimator = None if args.truth else laboratory_estimator(args.quat_deviation)
-    for row in compare([read_flight(path) for path in paths], args.drone, estimator):
+    for row in compare_tracking([read_flight(path) for path in paths], args.drone, estimator):
         numbers = {
             "logged_m": round(row.logged, 3),
             "simulated_m": round(row.simulated, 3),

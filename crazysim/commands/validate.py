@@ -13,8 +13,8 @@ from pathlib import Path
 import crazysim
 from crazysim.commands.options import DefaultsFormatter
 from crazysim.lab.validate import NAMES, Row, validate
-from crazysim.lab.validate.page import bound_text, page
-from crazysim.lab.validate.pictures import draw
+from crazysim.lab.validate.page import bound_text, format_page
+from crazysim.lab.validate.pictures import draw_section
 from crazysim.lab.validate.rows import Section
 from crazysim.lab.validate.sections import sections
 from crazysim.storage import check_writable, write_file
@@ -42,13 +42,13 @@ def run(options: argparse.Namespace) -> int:
     rows = validate(options.data, options.only)
     selected = [section for section in sections(options.data) if section.name in options.only]
     for section in selected:
-        if section.missing:
-            print(f"left out {section.name}: {section.missing}")
+        if section.problem:
+            print(f"left out {section.name}: {section.problem}")
     pictures = _draw(selected, rows, options.out.parent)
-    write_file(options.out, page(selected, rows, _provenance(selected), pictures))
+    write_file(options.out, format_page(selected, rows, _provenance(selected), pictures))
     for row in rows:
         if row.failed:
-            print(f"failed: {row.what}: {row.problem or f'{row.text}, {bound_text(row.bound)} passes'}")
+            print(f"failed: {row.quantity}: {row.problem or f'{row.text}, {bound_text(row.bound)} passes'}")
     print(f"wrote {options.out}: {len(rows)} rows, {sum(row.failed for row in rows)} failed")
     return int(any(row.failed for row in rows))
 
@@ -62,7 +62,7 @@ def _draw(selected: Sequence[Section], rows: Sequence[Row], folder: Path) -> dic
             continue
         pictures[section.name] = f"{PICTURES}/validation_{section.name}.png"
         try:
-            draw(section, section_rows, folder / pictures[section.name])
+            draw_section(section, section_rows, folder / pictures[section.name])
         except ImportError as error:
             print(f"no pictures: {error}")
             return {}
@@ -77,7 +77,7 @@ def _provenance(selected: Sequence[Section]) -> str:
         commit = f", commit {result.stdout.strip()}" if result.returncode == 0 else ""
     except OSError:
         commit = ""
-    packages = dict(item for section in selected if not section.missing for item in section.packages.items())
+    packages = dict(item for section in selected if not section.problem for item in section.packages.items())
     others = [name.partition("==")[0] for name in packages.values()]
     programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy", *others))
     return (

@@ -30,10 +30,10 @@ def test_the_motors_are_those_of_the_firmware(name):
     assert 0.05 < np.mean(expected == 0) < 0.5
     assert 0.05 < np.mean(expected == 65535) < 0.5
     smooth = flown.pwm_differences(name)
-    assert smooth.max() < flown.MAX_TRUNCATION + flown.FLOAT32
+    assert smooth.max() < flown.MAX_TRUNCATION + flown.MAX_ROUNDING
     assert np.mean(smooth < 4) > 0.998
     whole = flown.pwm_differences(name, whole_numbers=True)
-    assert whole.max() < 1.0 + flown.FLOAT32
+    assert whole.max() < 1.0 + flown.MAX_ROUNDING
     assert np.mean(whole < 0.5) > 0.9  # equal; rounding of float32 moves a number across an integer
 
 
@@ -102,7 +102,7 @@ def test_gradients_are_finite_at_rest_and_at_saturation(controller):
     commands[:, 1, :3] = 50.0
 
     def total(commands):
-        return flown.pwm_of_controller(controller, "state", jnp.asarray(states), commands).sum()
+        return flown.traceable_pwm(controller, "state", jnp.asarray(states), commands).sum()
 
     gradient = jax.jit(jax.grad(total))(jnp.asarray(commands))
     assert np.all(np.isfinite(gradient))

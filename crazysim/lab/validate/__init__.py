@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from crazysim.errors import ConfigError
-from crazysim.lab.validate.rows import Row, measure
+from crazysim.lab.validate.rows import Row, measure_sections
 from crazysim.lab.validate.sections import NAMES, sections
 
 __all__ = ["NAMES", "Row", "validate"]
@@ -29,4 +29,4 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
         raise ConfigError(
             f"expected a folder with logs, got {str(data)!r}. Give one with folders idsia or nanobench in it."
         )
-    return measure([section for section in sections(folder) if section.name in only])
+    return measure_sections([section for section in sections(folder) if section.name in only])

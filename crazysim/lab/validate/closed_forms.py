@@ -21,7 +21,7 @@ from crazysim.sim.sim import Sim
 
 INERTIA = (2e-5, 3e-5, 5e-5)
 """Moments of inertia of a body, all different, about the size of a Crazyflie's, kg m^2."""
-SPIN = (4.0, 1.0, 7.0)
+TUMBLE_ANG_VEL = (4.0, 1.0, 7.0)
 """Angular velocity of a tumbling body, rad/s."""
 
 
@@ -66,7 +66,7 @@ def with_states(data: SimData, **changes: Any) -> SimData:
     return data.replace(states=states.replace(**{k: jnp.asarray(v) for k, v in new.items()}))
 
 
-def turn(vector: NDArray) -> Array:
+def quat_from_rotvec(vector: NDArray) -> Array:
     """Return the quaternion, xyzw, of a nonzero rotation vector, rad. (4,)"""
     angle = float(np.linalg.norm(vector))
     return jnp.asarray([*(vector / angle * math.sin(angle / 2)), math.cos(angle / 2)])
@@ -121,7 +121,10 @@ def precession() -> Iterable[Row]:
         sim = free_body("rk4", 500, w, np.diag([a, a, c]))
         sim.step(250)
         quat = state_of(sim)["quat"]
-        exact = rotation.multiply(turn(np.array([a, a, c]) * w / a * t), turn(np.array([0, 0, w[2] * (1 - c / a) * t])))
+        exact = rotation.multiply(
+            quat_from_rotvec(np.array([a, a, c]) * w / a * t),
+            quat_from_rotvec(np.array([0, 0, w[2] * (1 - c / a) * t])),
+        )
         angle = angle_between(exact, quat)
     # One step turns by 0.019 rad. The bound is ten times 250 * 0.019^5 / 120, which is the error for a linear system,
     # because Euler's equations are not linear.
@@ -220,7 +223,7 @@ def dzhanibekov() -> Iterable[Row]:
     yield Row("Dzhanibekov effect: growth rate", f"{rate:.4f} 1/s", abs(growth / rate - 1), "", (0, 1e-8))
 
 
-STEPS = {"euler": (400, 800, 1600), "symplectic_euler": (400, 800, 1600), "rk4": (100, 200, 400)}
+ORDER_TEST_FREQS = {"euler": (400, 800, 1600), "symplectic_euler": (400, 800, 1600), "rk4": (100, 200, 400)}
 """Steps per second of the flights from which the order of an integrator is estimated, Hz."""
 
 
@@ -232,7 +235,7 @@ def order_errors() -> dict[str, NDArray]:
     """
 
     def flight(freq: int, scheme: str) -> tuple[NDArray, NDArray]:
-        sim = free_body(scheme, freq, SPIN)
+        sim = free_body(scheme, freq, TUMBLE_ANG_VEL)
         drag = np.diag([-0.02, -0.05, -0.2])
         sim.data = sim.data.replace(params=sim.data.params.replace(drag_matrix=drag))
         sim.step(freq // 2)
@@ -241,9 +244,11 @@ def order_errors() -> dict[str, NDArray]:
 
     with jax.enable_x64(True):
         reference = flight(6400, "rk4")
-        flights = {name: [flight(f, name) for f in freqs] for name, freqs in STEPS.items()}
+        flights = {name: [flight(f, name) for f in freqs] for name, freqs in ORDER_TEST_FREQS.items()}
     return {
-        name: np.array([[np.linalg.norm(x - e) for x, e in zip(final, reference, strict=True)] for final in by_freq])
+        name: np.array(
+            [[np.linalg.norm(x - e) for x, e in zip(state_pair, reference, strict=True)] for state_pair in by_freq]
+        )
         for name, by_freq in flights.items()
     }
 
@@ -253,7 +258,7 @@ def orders() -> Iterable[Row]:
     for name, errors in order_errors().items():
         order = 4 if name == "rk4" else 1
         for quantity, column in zip(("position", "attitude"), errors.T, strict=True):
-            slope = float(np.polyfit(np.log(1 / np.array(STEPS[name])), np.log(column), 1)[0])
+            slope = float(np.polyfit(np.log(1 / np.array(ORDER_TEST_FREQS[name])), np.log(column), 1)[0])
             bound = (order - 0.35, order + 0.35)  # tolerance for terms of higher order
             yield Row(f"order of {name}: {quantity}", f"theory: {order}", slope, "", bound)
 

@@ -41,7 +41,7 @@ class Flight:
     """Measured position, likewise, m. (n, 3)"""
 
     @property
-    def compared(self) -> slice:
+    def compared_samples(self) -> slice:
         """Samples that are compared."""
         height = self.setpoint[:, 2]
         up = np.flatnonzero(height > AIRBORNE_SHARE * np.median(height[height > 0.5 * height.max()]))
@@ -49,12 +49,12 @@ class Flight:
 
     def rmse(self, pos: NDArray) -> float:
         """Return the root mean square distance of positions, (n, 3), from the setpoint, m."""
-        error = (pos - self.setpoint[:, :3])[self.compared]
+        error = (pos - self.setpoint[:, :3])[self.compared_samples]
         return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
 
     def lag(self, pos: NDArray) -> float:
         """Return the lag behind the setpoint at which positions, (n, 3), are closest to it horizontally, s."""
-        first, last = self.compared.start, self.compared.stop
+        first, last = self.compared_samples.start, self.compared_samples.stop
 
         def distance(k: int) -> float:
             return float(np.mean((pos[first + k : last, :2] - self.setpoint[first : last - k, :2]) ** 2))
@@ -139,7 +139,9 @@ def laboratory_estimator(quat_deviation: float = 0.06) -> Estimator:
     return Kalman(sensors, deviations={"quat": quat_deviation})
 
 
-def fly(flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimator: Estimator | None = None) -> NDArray:
+def simulate_flights(
+    flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimator: Estimator | None = None
+) -> NDArray:
     """Return the positions of simulated drones that follow the setpoints of flights, m. (n, n_flights, 3)
 
     The controller is the firmware's ``"pid"``, and each drone starts where the real one did. Flights are continued with
@@ -163,15 +165,15 @@ def fly(flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimato
     return pos
 
 
-def compare(
+def compare_tracking(
     flights: Sequence[Flight], drone: AirframeSource = "cf2x_L250", estimator: Estimator | None = None
 ) -> list[Comparison]:
-    """Return the tracking errors of flights and of their simulations; see ``fly`` for the arguments."""
-    rows, flown = [], fly(flights, drone, estimator)
+    """Return the tracking errors of flights and of their simulations; see ``simulate_flights`` for the arguments."""
+    comparisons, simulated_pos = [], simulate_flights(flights, drone, estimator)
     for k, flight in enumerate(flights):
-        pos = flown[: len(flight.pos), k]
-        away = np.linalg.norm(flight.pos - flight.setpoint[:, :3], axis=-1)[flight.compared]
+        pos = simulated_pos[: len(flight.pos), k]
+        distance = np.linalg.norm(flight.pos - flight.setpoint[:, :3], axis=-1)[flight.compared_samples]
         errors = flight.rmse(flight.pos), flight.rmse(pos)
         lags = flight.lag(flight.pos), flight.lag(pos)
-        rows.append(Comparison(flight.name, *errors, *lags, bool(np.max(away) > MAX_DISTANCE)))
-    return rows
+        comparisons.append(Comparison(flight.name, *errors, *lags, bool(np.max(distance) > MAX_DISTANCE)))
+    return comparisons

@@ -19,11 +19,11 @@ from crazysim.plugins.vehicles.car_params import SLIP_SPEED, CarParams
 from crazysim.pytree import as_parameter
 
 REFERENCE = "CommonRoad, BMW 320i"
-STEP, DURATION, SPEED = 0.005, 6.0, 15.0
+INTEGRATION_STEP, DURATION, INITIAL_SPEED = 0.005, 6.0, 15.0
 """Step of Runge-Kutta and duration of the drives, s, and their speed at the start, m/s."""
 
 
-def parameters(car: Any) -> CommonRoadParams:
+def commonroad_params(car: Any) -> CommonRoadParams:
     """Return our parameters of a vehicle of CommonRoad."""
     numbers = {
         "friction": car.tire.p_dy1,
@@ -44,8 +44,8 @@ def parameters(car: Any) -> CommonRoadParams:
 def commonroad_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
     """Return the rates of states and commands in CommonRoad's order. (..., 7)"""
     x = jnp.asarray(state)
-    split = CommonRoadState(x[..., :2], *(x[..., k : k + 1] for k in range(2, 7)))
-    return jnp.concatenate(commonroad_single_track(split, jnp.asarray(command), params), axis=-1)
+    car_state = CommonRoadState(x[..., :2], *(x[..., k : k + 1] for k in range(2, 7)))
+    return jnp.concatenate(commonroad_single_track(car_state, jnp.asarray(command), params), axis=-1)
 
 
 def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParams) -> Array:
@@ -66,9 +66,9 @@ def crazysim_rates(state: ArrayLike, command: ArrayLike, params: CommonRoadParam
     )  # fmt: skip
     vel = speed * jnp.concatenate([jnp.cos(slip), jnp.sin(slip)])
     rates = single_track(CarState(jnp.zeros(3), x[4:5], vel, x[5:6], x[2:3], zero), limited[3:4], car)
-    acc, turn = rates.body_vel, (vel[:1] * rates.body_vel[1:] - vel[1:] * rates.body_vel[:1]) / speed**2
+    acc, slip_rate = rates.body_vel, (vel[:1] * rates.body_vel[1:] - vel[1:] * rates.body_vel[:1]) / speed**2
     along = (vel @ acc)[None] / speed
-    return jnp.concatenate([rates.pos[:2], limited[2:3], along, rates.yaw, rates.yaw_rate, turn])
+    return jnp.concatenate([rates.pos[:2], limited[2:3], along, rates.yaw, rates.yaw_rate, slip_rate])
 
 
 def lane_change(t: float, rate: float) -> list[float]:
@@ -77,21 +77,21 @@ def lane_change(t: float, rate: float) -> list[float]:
     return [next(r for start, r in reversed(steps) if t >= start), 1.0 if t < 4 else -1.0]
 
 
-def drive(f: Callable[[NDArray, list[float]], ArrayLike], start: NDArray, rate: float) -> NDArray:
+def drive(rates: Callable[[NDArray, list[float]], ArrayLike], initial_state: NDArray, rate: float) -> NDArray:
     """Return the state after a lane change, by Runge-Kutta of order 4.
 
     Args:
-        f: Rates of a state under a command.
-        start: State at the start.
+        rates: Rates of a state under a command.
+        initial_state: State at the start.
         rate: Rate of the steering angle, rad/s.
     """
-    x = start
-    for k in range(round(DURATION / STEP)):
-        command = lane_change(k * STEP, rate)
-        k1 = np.asarray(f(x, command))
-        k2 = np.asarray(f(x + STEP / 2 * k1, command))
-        k3 = np.asarray(f(x + STEP / 2 * k2, command))
-        x = x + STEP / 6 * (k1 + 2 * k2 + 2 * k3 + np.asarray(f(x + STEP * k3, command)))
+    x = initial_state
+    for k in range(round(DURATION / INTEGRATION_STEP)):
+        command = lane_change(k * INTEGRATION_STEP, rate)
+        k1 = np.asarray(rates(x, command))
+        k2 = np.asarray(rates(x + INTEGRATION_STEP / 2 * k1, command))
+        k3 = np.asarray(rates(x + INTEGRATION_STEP / 2 * k2, command))
+        x = x + INTEGRATION_STEP / 6 * (k1 + 2 * k2 + 2 * k3 + np.asarray(rates(x + INTEGRATION_STEP * k3, command)))
     return x
 
 
@@ -100,25 +100,30 @@ def compare_with_commonroad() -> Iterable[Row]:
     model = importlib.import_module("vehiclemodels.vehicle_dynamics_st").vehicle_dynamics_st
     car = importlib.import_module("vehiclemodels.parameters_vehicle2").parameters_vehicle2()
     rng, n = np.random.default_rng(0), 500
-    top, stop = car.longitudinal.v_max, car.steering.max
-    x = rng.uniform([-9, -9, -stop, 0.5, -3, -1, -0.3], [9, 9, stop, top, 3, 1, 0.3], (n, 7))
-    x[:25, 2], x[25:50, 3] = stop, top  # at the stops of the steering angle and of the speed
+    max_speed, max_steer = car.longitudinal.v_max, car.steering.max
+    x = rng.uniform([-9, -9, -max_steer, 0.5, -3, -1, -0.3], [9, 9, max_steer, max_speed, 3, 1, 0.3], (n, 7))
+    x[:25, 2], x[25:50, 3] = max_steer, max_speed  # at the stops of the steering angle and of the speed
     u = rng.uniform([-2, -2], [2, 2], (n, 2)) * [car.steering.v_max, car.longitudinal.a_max]
     theirs = np.array([model(list(row), list(command), car) for row, command in zip(x, u, strict=True)])
     with jax.enable_x64(True):
-        params = parameters(car)
+        params = commonroad_params(car)
         ours = np.asarray(commonroad_rates(x, u, params))
         # rounding of float64 in differences of terms up to 1,000 times as large
         difference = float(np.max(np.abs(ours - theirs) / (1 + np.abs(theirs))))
         yield Row("rates of 500 states, commands beyond the limits", REFERENCE, difference, "", (0, 1e-11))
-        laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (commonroad_rates, crazysim_rates)]
-        start = np.array([0.0, 0, 0, SPEED, 0, 0, 0])
+        rate_laws = [jax.jit(lambda x, u, law=law: law(x, u, params)) for law in (commonroad_rates, crazysim_rates)]
+        initial_state = np.array([0.0, 0, 0, INITIAL_SPEED, 0, 0, 0])
         for rate in (0.03, 0.12):
-            reference = drive(lambda x, u: model(list(x), list(u), car), start, rate)
-            ported, shipped = (drive(law, start, rate) for law in laws)
-            what = f"lane change, steering at {rate:g} rad/s, {DURATION:g} s"
-            difference = float(np.linalg.norm((ported - reference)[:2]))
-            yield Row(f"{what}: `commonroad_single_track`, position", REFERENCE, difference, "m", (0, 1e-9))
-            for k, way in enumerate(("along", "across")):
-                yield Row(f"{what}: `single_track`, position {way}", REFERENCE, float(abs(shipped - reference)[k]), "m",
-                          other=f"of {reference[k]:.3g} m")  # fmt: skip
+            reference = drive(lambda x, u: model(list(x), list(u), car), initial_state, rate)
+            ported_state, shipped_state = (drive(law, initial_state, rate) for law in rate_laws)
+            manoeuvre = f"lane change, steering at {rate:g} rad/s, {DURATION:g} s"
+            difference = float(np.linalg.norm((ported_state - reference)[:2]))
+            yield Row(f"{manoeuvre}: `commonroad_single_track`, position", REFERENCE, difference, "m", (0, 1e-9))
+            for k, direction in enumerate(("along", "across")):
+                yield Row(
+                    f"{manoeuvre}: `single_track`, position {direction}",
+                    REFERENCE,
+                    float(abs(shipped_state - reference)[k]),
+                    "m",
+                    remark=f"of {reference[k]:.3g} m",
+                )

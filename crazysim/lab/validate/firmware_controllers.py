@@ -24,8 +24,8 @@ from crazysim.drones import load_airframe
 from crazysim.dynamics.rotor import quadratic_curve
 from crazysim.lab.validate.rows import Row
 
-RATE, POSITION_PERIOD = 500, 5
-VECTORS = Path(crazysim.__file__).parents[1] / "tests"
+FREQ, POSITION_PERIOD = 500, 5
+RECORDINGS = Path(crazysim.__file__).parents[1] / "tests"
 """Folder with the recorded outputs; it exists in a checkout of the sources only."""
 FILTERED_AIRFRAME = {"base": "cf2x_L250", "pid": {"position": {"kd": [0.3] * 3}, "velocity": {"kd": [2.0] * 3}}}
 CASES: dict[str, tuple[Any, str, AirframeSource]] = {
@@ -42,13 +42,13 @@ CASES: dict[str, tuple[Any, str, AirframeSource]] = {
 MAX_TRUNCATION = 5.0
 """Largest loss of a motor by the firmware's integer arithmetic, PWM: roll, pitch, yaw and motor lose less than one
 each, and where all motors are lowered by the excess of the highest, the difference of two motors counts."""
-FLOAT32 = 3.0
+MAX_ROUNDING = 3.0
 """Rounding, PWM: yaw has a derivative gain of 0.35 * 500 * 120 PWM per degree."""
 
 
 def recorded_pwm(name: str) -> NDArray:
     """Return the PWM of the motors by the compiled firmware. (n_ticks, n, 4)"""
-    with np.load(VECTORS / "control" / "firmware_motors.npz") as file:
+    with np.load(RECORDINGS / "control" / "firmware_motors.npz") as file:
         return file[name].astype(float)
 
 
@@ -60,7 +60,7 @@ def pwm_differences(name: str, whole_numbers: bool = False) -> NDArray:
         whole_numbers: True to compute in integers where the firmware does.
     """
     controller, mode, drone = CASES[name]
-    states, commands = (x.astype(np.float32) for x in flights(mode, 8, 240, seed=11))
+    states, commands = (x.astype(np.float32) for x in sample_flights(mode, 8, 240, seed=11))
     controller = dataclasses.replace(controller, whole_numbers=whole_numbers)
     return np.abs(compiled_pwm(controller, mode, states, commands, drone) - recorded_pwm(name))
 
@@ -69,48 +69,50 @@ def compare_controllers() -> Iterable[Row]:
     """Yield the largest differences of the motors from the compiled firmware's."""
     for name, (controller, mode, drone) in CASES.items():
         flown = f"`{drone}`" if isinstance(drone, str) else "`cf2x_L250` with derivative gains"
-        for whole, bound in ((False, MAX_TRUNCATION + FLOAT32), (True, 1.0 + FLOAT32)):
-            numbers = "integers as the firmware" if whole else "real numbers"
-            what = f"{type(controller).__name__} on {mode} commands, {flown}, {numbers}: motors"
-            yield Row(what, "compiled C, 240 ticks", float(pwm_differences(name, whole).max()), "PWM", (0, bound))
+        for whole_numbers, bound in ((False, MAX_TRUNCATION + MAX_ROUNDING), (True, 1.0 + MAX_ROUNDING)):
+            arithmetic = "integers as the firmware" if whole_numbers else "real numbers"
+            quantity = f"{type(controller).__name__} on {mode} commands, {flown}, {arithmetic}: motors"
+            yield Row(
+                quantity, "compiled C, 240 ticks", float(pwm_differences(name, whole_numbers).max()), "PWM", (0, bound)
+            )
 
 
-def flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArray]:
+def sample_flights(mode: str, n: int, n_ticks: int, seed: int) -> tuple[NDArray, NDArray]:
     """Return states (n_ticks, n, 13) and commands (n_ticks, n, k): from gentle to wild, across yaw +-180 degrees.
 
     A state is pos, vel, quat, ang_vel. Thrust is in PWM, and zero for a while in some flights. State commands change
     at the ticks of the position loop.
     """
     rng = np.random.default_rng(seed)
-    size = np.geomspace(0.02, 1.0, n)[:, None]  # the last flights turn upside down
+    amplitude = np.geomspace(0.02, 1.0, n)[:, None]  # the last flights turn upside down
 
     def smooth(k: int, scale: Any, period: float) -> NDArray:
         phase, slow = rng.uniform(0, 2 * np.pi, (3, n, k)), rng.uniform(0.3, 1.7, (3, n, k))
-        t = np.arange(n_ticks)[:, None, None, None] / RATE
+        t = np.arange(n_ticks)[:, None, None, None] / FREQ
         return scale * np.sum(np.sin(2 * np.pi * t * slow / period + phase), axis=1) / 1.7
 
-    pos, vel = smooth(3, 2 * size, 1.0), smooth(3, 3 * size, 0.7)
+    pos, vel = smooth(3, 2 * amplitude, 1.0), smooth(3, 3 * amplitude, 0.7)
     # Rolls go upside down; pitch keeps away from 90 degrees, where rounding of the Euler angles is amplified.
-    tilt, yaw = smooth(2, 1.2 * size, 0.5) * [1.0, 0.5], 3.0 + smooth(1, 2.0, 0.9)
+    tilt, yaw = smooth(2, 1.2 * amplitude, 0.5) * [1.0, 0.5], 3.0 + smooth(1, 2.0, 0.9)
     quat = np.array(
         [[quat_of_rpy(tilt[i, j, 0], tilt[i, j, 1], yaw[i, j, 0]) for j in range(n)] for i in range(n_ticks)]
     )
-    ang_vel = smooth(3, 10 * size, 0.3)
+    ang_vel = smooth(3, 10 * amplitude, 0.3)
     states = np.concatenate([pos, vel, quat, ang_vel], axis=-1)
     if mode == "state":
         tick_of_command = POSITION_PERIOD * (np.arange(n_ticks) // POSITION_PERIOD)
-        desired_yaw = (yaw + smooth(1, size, 0.4))[tick_of_command, :, 0]
+        desired_yaw = (yaw + smooth(1, amplitude, 0.4))[tick_of_command, :, 0]
         quat_des = np.stack([0 * desired_yaw, 0 * desired_yaw, np.sin(desired_yaw / 2), np.cos(desired_yaw / 2)], -1)
-        parts = [pos + smooth(3, 1.5 * size, 0.6), vel + smooth(3, size, 0.4), smooth(3, 4 * size, 0.5)]
-        rates = smooth(3, 3 * size, 0.3)
+        parts = [pos + smooth(3, 1.5 * amplitude, 0.6), vel + smooth(3, amplitude, 0.4), smooth(3, 4 * amplitude, 0.5)]
+        rates = smooth(3, 3 * amplitude, 0.3)
         commands = np.concatenate(
             [*(part[tick_of_command] for part in parts), quat_des, rates[tick_of_command]], axis=-1
         )
     else:
-        thrust = np.clip(38000 + 40000 * size * smooth(1, 1.0, 0.5), 1000, 65535)
+        thrust = np.clip(38000 + 40000 * amplitude * smooth(1, 1.0, 0.5), 1000, 65535)
         thrust[n_ticks // 3 : n_ticks // 3 + 20, ::3] = 0
-        angles = np.concatenate([tilt, yaw], axis=-1) + smooth(3, size, 0.4)
-        commands = np.concatenate([angles if mode == "attitude" else smooth(3, 8 * size, 0.3), thrust], axis=-1)
+        angles = np.concatenate([tilt, yaw], axis=-1) + smooth(3, amplitude, 0.4)
+        commands = np.concatenate([angles if mode == "attitude" else smooth(3, 8 * amplitude, 0.3), thrust], axis=-1)
     return states, commands
 
 
@@ -129,7 +131,7 @@ def compiled_pwm(
     controller: Any, mode: str, states: NDArray, commands: NDArray, drone: AirframeSource = "cf2x_L250"
 ) -> NDArray:
     """Return the PWM of the motors by a controller of crazysim, in the precision of JAX. (n_ticks, n, 4)"""
-    return np.asarray(_compiled_flight(controller, mode)(controller_numbers(controller, drone), states, commands))
+    return np.asarray(_compiled_flight(controller, mode)(controller_constants(controller, drone), states, commands))
 
 
 @functools.cache
@@ -137,25 +139,30 @@ def _compiled_flight(controller: Any, mode: str) -> Any:
     return jax.jit(functools.partial(_flight_pwm, controller, mode))
 
 
-def controller_numbers(controller: Any, drone: AirframeSource) -> tuple:
+def controller_constants(controller: Any, drone: AirframeSource) -> tuple:
     """Return parameters and memory of a controller, collective thrust per unit of PWM, N, and the thrust curve."""
     airframe = load_airframe(drone)
-    newton = 4 * float(airframe.value("rotors.thrust_max")) / 65535
-    return controller.params(airframe), controller.memory(airframe), newton, airframe.value("rotors.thrust_curve")[None]
+    newton_per_pwm = 4 * float(airframe.value("rotors.thrust_max")) / 65535
+    return (
+        controller.params(airframe),
+        controller.memory(airframe),
+        newton_per_pwm,
+        airframe.value("rotors.thrust_curve")[None],
+    )
 
 
-def pwm_of_controller(
+def traceable_pwm(
     controller: Any, mode: str, states: Array, commands: Array, drone: AirframeSource = "cf2x_L250"
 ) -> Array:
     """Return the result of ``compiled_pwm``, by a function that JAX can trace."""
-    return _flight_pwm(controller, mode, controller_numbers(controller, drone), states, commands)
+    return _flight_pwm(controller, mode, controller_constants(controller, drone), states, commands)
 
 
-def _flight_pwm(controller: Any, mode: str, numbers: tuple, states: Any, commands: Any) -> Array:
-    params, rest, newton, thrust_curve = numbers
-    rest = jax.tree.map(jnp.asarray, rest)
+def _flight_pwm(controller: Any, mode: str, constants: tuple, states: Any, commands: Any) -> Array:
+    params, initial_memory, newton_per_pwm, thrust_curve = constants
+    initial_memory = jax.tree.map(jnp.asarray, initial_memory)
     if mode != "state":
-        commands = commands * jnp.asarray([1, 1, 1, newton], commands.dtype)
+        commands = commands * jnp.asarray([1, 1, 1, newton_per_pwm], commands.dtype)
 
     def tick(memory: Any, row: tuple) -> tuple[Any, Array]:
         k, s, c = row
@@ -164,14 +171,14 @@ def _flight_pwm(controller: Any, mode: str, numbers: tuple, states: Any, command
         data = SimpleNamespace(states=states, controls=controls)
         command = Setpoint.of_command(c) if mode == "state" else c
         if mode == "state" and controller.has_outer:
-            after = controller.outer(data, command, memory, params)
-            memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_PERIOD == 0, new, old), after, memory)
+            outer_memory = controller.outer(data, command, memory, params)
+            memory = jax.tree.map(lambda new, old: jnp.where(k % POSITION_PERIOD == 0, new, old), outer_memory, memory)
         rotor_vel, memory = controller.update(data, command, memory, params)
         thrust = jnp.where(rotor_vel > 0, quadratic_curve(rotor_vel, thrust_curve), 0.0)
-        return memory, 4 * thrust / newton
+        return memory, 4 * thrust / newton_per_pwm
 
-    def fly(states: Array, commands: Array) -> Array:
+    def fly_drone(states: Array, commands: Array) -> Array:
         ticks = jnp.arange(len(states))
-        return jax.lax.scan(tick, rest, (ticks, states, commands))[1]
+        return jax.lax.scan(tick, initial_memory, (ticks, states, commands))[1]
 
-    return jax.vmap(fly, 1, 1)(states, commands)
+    return jax.vmap(fly_drone, 1, 1)(states, commands)

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.lab.validate.firmware_controllers import VECTORS
+from crazysim.lab.validate.firmware_controllers import RECORDINGS
 from crazysim.lab.validate.rows import Row
 from crazysim.plugins.estimators import complementary as law
 from crazysim.plugins.estimators import error_state, updates
 
-FOLDER = VECTORS / "plugins" / "estimators"
-KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range", "sweep")
+FILTER_RECORDINGS = RECORDINGS / "plugins" / "estimators"
+MEASUREMENT_KINDS = ("difference", "distance", "flow", "ground", "pose", "position", "range", "sweep")
 """Measurements of the recordings of the Kalman filter."""
 ANCHORS = ((-3.0, -3.0, 0.2), (3.0, -3.0, 2.4), (3.0, 3.0, 0.2), (-3.0, 3.0, 2.4))
 """Positions of the anchors, m."""
@@ -33,39 +33,39 @@ def update_with_measurements(kind: str, k: Any, m: Any, gyro: Array, estimate: A
     if kind in ("position", "ground"):
         return error_state.select_estimate(k % 10 == 5, updates.update_pos(estimate, m[:3], 0.01), estimate)
     if kind == "pose":
-        after = updates.update_quat(updates.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
-        return error_state.select_estimate(k % 10 == 0, after, estimate)
+        updated = updates.update_quat(updates.update_pos(estimate, m[:3], 0.01), m[3:7], 0.05)
+        return error_state.select_estimate(k % 10 == 0, updated, estimate)
     if kind in ("flow", "range"):
-        after = updates.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
-        estimate = error_state.select_estimate(k % 10 == 0, after, estimate)
-        sees = (k % 25 == 10) & (kind == "range")
-        return error_state.select_estimate(sees, updates.update_range(estimate, rot, m[2], 0.02), estimate)
+        updated = updates.update_flow(estimate, rot, 0.1 * m[:2], gyro, jnp.asarray(0.01 * 35 / 0.71674), 0.2)
+        estimate = error_state.select_estimate(k % 10 == 0, updated, estimate)
+        has_range = (k % 25 == 10) & (kind == "range")
+        return error_state.select_estimate(has_range, updates.update_range(estimate, rot, m[2], 0.02), estimate)
     if kind == "sweep":
         estimate = error_state.select_estimate(k == 2, updates.update_pos(estimate, m[:3], 0.01), estimate)
         station = stations[0][k // 8 % 2], stations[1][k // 8 % 2]
         for first, tilt in ((0, math.pi / 6), (4, -math.pi / 6)):
-            after = updates.update_sweep(estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, m[0], 0.001)
-            estimate = error_state.select_estimate(k % 8 == first, after, estimate)
+            updated = updates.update_sweep(estimate, rot, jnp.asarray(DIODE_OFFSET), station, tilt, m[0], 0.001)
+            estimate = error_state.select_estimate(k % 8 == first, updated, estimate)
         return estimate
     anchors, a = jnp.asarray(ANCHORS), k // 5 % 4
     if kind == "distance":
-        after = updates.update_distance(estimate, anchors[a], m[0], 0.25)
+        updated = updates.update_distance(estimate, anchors[a], m[0], 0.25)
     else:
-        after = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
-    return error_state.select_estimate(k % 5 == 0, after, estimate)
+        updated = updates.update_difference(estimate, anchors[a], anchors[(a + 1) % 4], m[0], 0.15)
+    return error_state.select_estimate(k % 5 == 0, updated, estimate)
 
 
 def kalman_states(kind: str) -> tuple[NDArray, NDArray]:
     """Return states and covariances of the Kalman filter in flights of 4 s, every 0.1 s, ours and the firmware's.
 
     Args:
-        kind: One of ``KINDS``; ``"ground"`` is a drone at rest, the others fly fast.
+        kind: One of ``MEASUREMENT_KINDS``; ``"ground"`` is a drone at rest, the others fly fast.
 
     Returns:
         Position, m, velocity, m/s, error of attitude, rad, quaternion wxyz, and covariance. (40, n)
     """
     level = jnp.array([0.0, 0.0, 0.0, 1.0])
-    with np.load(FOLDER / "firmware_filter.npz") as file:
+    with np.load(FILTER_RECORDINGS / "firmware_filter.npz") as file:
         inertial = jnp.asarray(file[f"inertial/{'ground' if kind == 'ground' else 'air'}"])[1:]
         inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
         stations = jnp.asarray(file["sweep/places"]), jnp.asarray(file["sweep/frames"])
@@ -98,7 +98,7 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
     Returns:
         Quaternion xyzw, height, m, and climb rate, m/s. (100, 6)
     """
-    with np.load(FOLDER / "firmware_complementary.npz") as file:
+    with np.load(FILTER_RECORDINGS / "firmware_complementary.npz") as file:
         inputs, recorded = jnp.asarray(file[f"{kind}/inputs"]), file[f"{kind}/outputs"]
 
     def tick(carry: Any, x: Any) -> tuple[Any, Array]:
@@ -124,7 +124,7 @@ def complementary_states(kind: str) -> tuple[NDArray, NDArray]:
 
 def compare_filters() -> Iterable[Row]:
     """Yield the largest differences of states from the compiled firmware's."""
-    for kind in KINDS:
+    for kind in MEASUREMENT_KINDS:
         estimates, recorded = kalman_states(kind)
         difference = np.abs(estimates - recorded)
         # rounding of float32, which 4,000 loops add up

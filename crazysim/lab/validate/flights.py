@@ -11,7 +11,7 @@ from crazysim.drones import load_airframe
 from crazysim.errors import ConfigError
 from crazysim.lab.identify import Model, aligned, fast_rotation, prediction_errors, read_log
 from crazysim.lab.identify.prediction import HORIZONS
-from crazysim.lab.validate.closed_loop import compare, laboratory_estimator, read_flight
+from crazysim.lab.validate.closed_loop import compare_tracking, laboratory_estimator, read_flight
 from crazysim.lab.validate.rows import Row
 
 PUBLISHED_ERRORS = {
@@ -21,7 +21,7 @@ PUBLISHED_ERRORS = {
 """Mean errors over the melon flights after 0.1 and 0.5 s, m and degrees, of IDSIA's rigid body and of its learned model
 with the least error of position: rows Physics and Hybrid of the last table in ``results/model_comparison.ipynb``,
 repository idsia-robotics/nanodrone-sysid-benchmark at commit 2d921b5; angles there in rad."""
-MASS = 0.045
+IDSIA_MASS = 0.045
 """Mass of IDSIA's drone, kg."""
 
 
@@ -46,7 +46,7 @@ def open_loop(folder: Path) -> Iterable[Row]:
     series_errors: dict[str, dict[str, NDArray]] = {"position": {}, "attitude": {}}
     errors: dict[str, NDArray] = {}
     for name in ("cf21B_500", "cf21B_500_idsia"):
-        model = Model.create(load_airframe(name), MASS)
+        model = Model.create(load_airframe(name), IDSIA_MASS)
         flight = aligned(log, fast_rotation([log], model.params).delays[0])
         errors = prediction_errors([flight], model)
         errors = {key.removesuffix(" (mean)"): x for key, x in errors.items() if key.endswith("(mean)")}
@@ -56,22 +56,22 @@ def open_loop(folder: Path) -> Iterable[Row]:
     series_errors["position"]["constant velocity"] = errors["position at constant velocity"]
     series_errors["attitude"]["constant body rates"] = errors["attitude at constant body rates"]
     series_errors["attitude"]["unchanged"] = errors["attitude unchanged"]
-    for what, unit in (("position", "m"), ("attitude", "degrees")):
-        published = {f"published {name}": figures for name, figures in PUBLISHED_ERRORS[what].items()}
-        for series, figures in (series_errors[what] | published).items():
+    for quantity, unit in (("position", "m"), ("attitude", "degrees")):
+        published = {f"published {name}": figures for name, figures in PUBLISHED_ERRORS[quantity].items()}
+        for series, figures in (series_errors[quantity] | published).items():
             horizons, flights = ((0.1, 0.5), "three melon flights") if series in published else (HORIZONS, path.stem)
             for h, figure in zip(horizons, figures, strict=True):
-                label = f"{what}, {series}, after {h:g} s"
-                yield Row(label, flights, float(figure), unit, series=series.replace("`", ""), at=h)
+                label = f"{quantity}, {series}, after {h:g} s"
+                yield Row(label, flights, float(figure), unit, series=series.replace("`", ""), x=h)
 
 
 def closed_loop(folder: Path) -> Iterable[Row]:
     """Yield the ratio of simulated to logged tracking error of each flight."""
     paths = [path for name in ("circle", "figure8", "trefoil") for path in find_logs(folder, f"*{name}*")]
-    for row in compare([read_flight(path) for path in paths], estimator=laboratory_estimator()):
+    for row in compare_tracking([read_flight(path) for path in paths], estimator=laboratory_estimator()):
         remark = f"real {row.logged:.3f} m, simulated {row.simulated:.3f} m"
         if row.failed:
-            yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, other=remark)
+            yield Row(f"{row.name} (the real drone crashed)", "its log", row.ratio, remark=remark)
             continue
         kind = " ".join(part for part in row.name.split("_")[1:] if not part.startswith("rep"))
-        yield Row(row.name, "its log", row.ratio, "", (0.7, 1.4), remark, series="one flight", at=kind)
+        yield Row(row.name, "its log", row.ratio, "", (0.7, 1.4), remark, series="one flight", x=kind)

@@ -21,9 +21,10 @@ from crazysim.lab.validate.rows import Row
 from crazysim.plugins.estimators import error_state, updates
 from crazysim.plugins.estimators.kalman import MEASUREMENT_STD
 
-PERIOD, LOOPS = 0.01, 10
-"""Time between samples of a log, s, and the firmware's loops in it, each of which adds process noise."""
-PROCESS_NOISE = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
+SAMPLE_PERIOD, LOOPS_PER_SAMPLE = 0.01, 10
+"""Time between samples of a log, s, and the number of the filter's loops in that time, each
+of which adds process noise."""
+PROCESS_NOISE_STD = np.array([5e-7, 5e-7, 1e-6, 5e-4, 5e-4, 1e-3, 1e-4, 1e-4, 1e-4])
 """Deviations of the noise of a loop of 1 ms, m, m/s, rad: (0.5, 0.5, 1) m/s^2 and 0.1 rad/s of the firmware."""
 SETTLING_TIME = 2.0
 """Time from the first setpoint, s, after which estimates are compared and drones fly."""
@@ -66,15 +67,17 @@ def thrust_attitudes(pos: NDArray, quat: NDArray) -> NDArray:
         pos: Position of the tracked body, world frame, m. (n, 3)
         quat: Its attitude, body to world, xyzw. (n, 4)
     """
-    accel = np.gradient(np.gradient(pos, PERIOD, axis=0), PERIOD, axis=0) + [0, 0, GRAVITY_MAGNITUDE]
-    force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[round(SETTLING_TIME / PERIOD) :]
+    accel = np.gradient(np.gradient(pos, SAMPLE_PERIOD, axis=0), SAMPLE_PERIOD, axis=0) + [0, 0, GRAVITY_MAGNITUDE]
+    force = np.asarray(rotation.rotate_inverse(jnp.asarray(quat), jnp.asarray(accel)))[
+        round(SETTLING_TIME / SAMPLE_PERIOD) :
+    ]
     x, y, z = np.mean(force, axis=0) / np.linalg.norm(np.mean(force, axis=0))
     tilt = np.array([-y, x, 0, 1 + z]) / np.sqrt(2 + 2 * z)  # the shortest rotation of the z axis to (x, y, z)
     return np.asarray(rotation.multiply(jnp.asarray(quat), jnp.asarray(tilt, quat.dtype)))
 
 
 @jax.jit
-def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, Array]:
+def replay_filter(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, Array]:
     """Return positions, m, (n, 3), and attitudes, xyzw, (n, 4), of the filter on measurements at 100 Hz.
 
     Args:
@@ -83,12 +86,12 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
         pos: Measured position, world frame, m. (n, 3)
         quat: Measured attitude, body to world, xyzw. (n, 4)
     """
-    noise = jnp.asarray(LOOPS * PROCESS_NOISE**2, accel.dtype)
+    noise = jnp.asarray(LOOPS_PER_SAMPLE * PROCESS_NOISE_STD**2, accel.dtype)
 
     def tick(estimate: error_state.Estimate, x: Any) -> tuple[Any, Any]:
-        force, rate, where, attitude = x
-        estimate = error_state.add_noise(error_state.predict(estimate, force, rate, PERIOD), noise)
-        estimate = updates.update_pos(estimate, where, MEASUREMENT_STD["pos"])
+        force, rate, measured_pos, attitude = x
+        estimate = error_state.add_noise(error_state.predict(estimate, force, rate, SAMPLE_PERIOD), noise)
+        estimate = updates.update_pos(estimate, measured_pos, MEASUREMENT_STD["pos"])
         estimate = error_state.finalize(updates.update_quat(estimate, attitude, MEASUREMENT_STD["quat"]))
         return estimate, (estimate.pos, estimate.quat)
 
@@ -96,12 +99,14 @@ def replay(accel: Array, gyro: Array, pos: Array, quat: Array) -> tuple[Array, A
     return jax.lax.scan(tick, start, (accel, gyro, pos, quat))[1]
 
 
-def errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float, float]:
+def estimate_errors(log: dict[str, NDArray], pos: NDArray, quat: NDArray) -> tuple[float, float]:
     """Return the RMS differences of estimates from motion capture, of position, m, and of attitude, degrees."""
-    after = round(SETTLING_TIME / PERIOD)
-    turn = np.asarray(rotation.multiply(rotation.conjugate(jnp.asarray(log["quat"])), jnp.asarray(quat)))[after:]
+    settled_index = round(SETTLING_TIME / SAMPLE_PERIOD)
+    turn = np.asarray(rotation.multiply(rotation.conjugate(jnp.asarray(log["quat"])), jnp.asarray(quat)))[
+        settled_index:
+    ]
     angle = 2 * np.arctan2(np.linalg.norm(turn[:, :3], axis=-1), np.abs(turn[:, 3]))
-    distance = np.linalg.norm(pos - log["pos"], axis=-1)[after:]
+    distance = np.linalg.norm(pos - log["pos"], axis=-1)[settled_index:]
     return float(np.sqrt(np.mean(distance**2))), float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
@@ -117,13 +122,13 @@ def compare_filter(folder: Path) -> Iterable[Row]:
     for name, log in flights.items():
         if np.max(np.linalg.norm(log["pos"] - log["goal"], axis=-1)) > MAX_DISTANCE:
             continue
-        size = len(log["pos"])  # all are continued to one length, so that the filter compiles once
-        longest = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
-        ours = errors(log, *(np.asarray(x)[:size] for x in replay(*longest)))
-        board = errors(log, log["est_pos"], log["est_quat"])
-        for what, unit, our_error, board_error in zip(
+        size = len(log["pos"])  # all logs are padded to one length, so that the filter compiles once
+        padded = (log[k][np.minimum(np.arange(n), size - 1)] for k in ("accel", "gyro", "pos", "quat"))
+        ours = estimate_errors(log, *(np.asarray(x)[:size] for x in replay_filter(*padded)))
+        board = estimate_errors(log, log["est_pos"], log["est_quat"])
+        for quantity, unit, our_error, board_error in zip(
             ("position", "attitude"), ("m", "degrees"), ours, board, strict=True
         ):
-            yield Row(f"{name}: {what}", "filter on board", our_error / board_error, "", (0, 1.1),
-                      f"on board {board_error:.3g} {unit}, here {our_error:.3g} {unit}", series=what,
-                      at=name.partition("_")[2])  # fmt: skip
+            yield Row(f"{name}: {quantity}", "filter on board", our_error / board_error, "", (0, 1.1),
+                      f"on board {board_error:.3g} {unit}, here {our_error:.3g} {unit}", series=quantity,
+                      x=name.partition("_")[2])  # fmt: skip

@@ -41,38 +41,38 @@ A figure passes if it is within the range in its row; rows without a range only 
 """
 """Introduction at the top of the page, in which ``packages`` is filled in."""
 COLUMNS: Mapping[str, Callable[[Row], str]] = {
-    "Quantity": lambda row: row.what,
-    "Reference": lambda row: row.against,
+    "Quantity": lambda row: row.quantity,
+    "Reference": lambda row: row.reference,
     "Figure": lambda row: f"**{row.text}**" if row.failed else row.text,
     "Passes": lambda row: bound_text(row.bound),
-    "For comparison": lambda row: row.other,
+    "For comparison": lambda row: row.remark,
 }
 """Functions from a row to the text of a cell, by the heading of the column."""
 
 
-def page(sections: Sequence[Section], rows: Sequence[Row], made: str, pictures: Mapping[str, str]) -> str:
+def format_page(sections: Sequence[Section], rows: Sequence[Row], provenance: str, pictures: Mapping[str, str]) -> str:
     """Return the page in Markdown.
 
     Args:
         sections: Sections, in their order on the page.
         rows: Rows of these sections.
-        made: Sentence with the date, commit, machine and versions with which the rows were measured.
+        provenance: Sentence with the date, commit, machine and versions with which the rows were measured.
         pictures: Paths of pictures, relative to the page, by the name of their section.
     """
     bounded = [row for row in rows if row.bound is not None or row.problem]
     failed = [row for row in bounded if row.failed]
     summary = f" {len(bounded) - len(failed)} of {len(bounded)} figures with a range are within it." if bounded else ""
     if failed:
-        summary += " Outside: " + "; ".join(row.what for row in failed) + "."
+        summary += " Outside: " + "; ".join(row.quantity for row in failed) + "."
     packages = dict.fromkeys(name for section in sections for name in section.packages.values())
-    parts = [INTRODUCTION.format(packages=" ".join(['".[demo]"', *packages])).strip(), made + summary]
+    parts = [INTRODUCTION.format(packages=" ".join(['".[demo]"', *packages])).strip(), provenance + summary]
     for section in sections:
-        command = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.logs}`"
+        command = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.needs_logs}`"
         if section.packages:
             command = f"`pip install {' '.join(section.packages.values())}` and {command}"
         parts += [f"## {section.title}", section.text, f"Repeat: {command}."]
-        if section.missing:
-            parts.append(f"Not measured: {section.missing}.")
+        if section.problem:
+            parts.append(f"Not measured: {section.problem}.")
             continue
         if section.name in pictures:
             parts.append(f"![{section.axes[1]}]({pictures[section.name]})")

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from crazysim.drones.airframe import GRAVITY_MAGNITUDE
-from crazysim.lab.validate.closed_forms import SPIN, free_body, state_of, with_states
+from crazysim.lab.validate.closed_forms import TUMBLE_ANG_VEL, free_body, state_of, with_states
 from crazysim.lab.validate.rows import Row
 
 
@@ -28,12 +28,12 @@ def mujoco_differences() -> dict[str, float]:
         <worldbody><body pos="0 0 100"><freejoint/>
         <inertial pos="0 0 0" mass="0.0434" diaginertia="2e-5 3e-5 5e-5"/></body></worldbody></mujoco>""")
     data, force, torque = mujoco.MjData(model), np.array([0.02, -0.05, 0.3]), np.array([3e-5, -2e-5, 1e-5])
-    data.qvel[:] = [1, -2, 3, *SPIN]
+    data.qvel[:] = [1, -2, 3, *TUMBLE_ANG_VEL]
     data.xfrc_applied[1] = [*force, *torque]
     for _ in range(500):
         mujoco.mj_step(model, data)
     with jax.enable_x64(True):
-        sim = free_body("rk4", 1000, SPIN)
+        sim = free_body("rk4", 1000, TUMBLE_ANG_VEL)
         sim.data = with_states(sim.data, force=force, torque=torque)
         sim.step(500)
         s = state_of(sim)

@@ -11,10 +11,10 @@ from crazysim.lab.validate.rows import Row, Section
 from crazysim.storage import replacing
 
 
-def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
+def draw_section(section: Section, rows: Sequence[Row], path: Path) -> None:
     """Write a picture of the rows with a series, one panel for each unit.
 
-    If ``Row.at`` is a number, each series is a line, and the vertical axis is logarithmic. If it is a name, each series
+    If ``Row.x`` is a number, each series is a line, and the vertical axis is logarithmic. If it is a name, each series
     is a set of points, and the range of figures that pass is shaded.
 
     Args:
@@ -34,25 +34,25 @@ def draw(section: Section, rows: Sequence[Row], path: Path) -> None:
     rows = [row for row in rows if row.series and not row.problem]
     units = list(dict.fromkeys(row.unit for row in rows))
     colours = {series: f"C{k}" for k, series in enumerate(dict.fromkeys(row.series for row in rows))}
-    has_names = isinstance(rows[0].at, str)
+    has_names = isinstance(rows[0].x, str)
     figure = Figure(figsize=(9, 4 if has_names else 4.8), layout="constrained")
     for axis, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
         unit_rows = [row for row in rows if row.unit == unit]
-        places = list(dict.fromkeys(row.at for row in unit_rows))
+        x_values = list(dict.fromkeys(row.x for row in unit_rows))
         for series in dict.fromkeys(row.series for row in unit_rows):
             points = [
-                (places.index(row.at) if has_names else row.at, row.figure) for row in unit_rows if row.series == series
+                (x_values.index(row.x) if has_names else row.x, row.figure) for row in unit_rows if row.series == series
             ]
             line = "" if has_names else "--" if series.startswith("published") else "-"
             style = {"marker": "o", "linestyle": line, "markersize": 4, "linewidth": 1.2}
             axis.plot(*zip(*points, strict=True), label=series, color=colours[series], **style)
         if has_names:
-            axis.set_xticks(range(len(places)), places, rotation=90 if len(places) > 12 else 20, fontsize=7)
+            axis.set_xticks(range(len(x_values)), x_values, rotation=90 if len(x_values) > 12 else 20, fontsize=7)
             low, high = next(row.bound for row in unit_rows if row.bound is not None)
             axis.axhspan(max(low, 0), high, color="0.93", zorder=0, label="passes")
             axis.legend(fontsize=7)
         else:
-            axis.set(yscale="log", xticks=places, xticklabels=[f"{place:g}" for place in places])
+            axis.set(yscale="log", xticks=x_values, xticklabels=[f"{x:g}" for x in x_values])
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
             axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15))

@@ -24,22 +24,22 @@ from crazysim.sim.sim import Sim
 
 AIRFRAMES = ("cf21B_500", "cf2x_L250", "crazyflie", "bumblebee")
 """Airframes that RAPTOR flies."""
-STEP = 2
+STEP_MS = 2
 """Step of both simulators, ms."""
-PERIODS = (10, STEP)
+PERIODS = (10, STEP_MS)
 """Times between two calls of the policy, ms: the first as in its training, the second about as on flight controllers.
 
 The authors' firmware calls it every 2.5 ms on PX4, 1 ms on the Crazyflie and 0.5 ms on Betaflight.
 """
-SECONDS = 10
+FLIGHT_SECONDS = 10
 """Duration of a flight, s."""
-STARTS = 20
+N_STARTS = 20
 """Number of starts of each airframe at each latency."""
 DELAYS = (0, 2, 4, 6, 8, 10, 12)
 """Latencies of the commands, ms."""
 
 
-class Pilot:
+class RaptorPolicy:
     """RAPTOR for a batch of drones, called as the authors' firmware calls it.
 
     Its recurrent state advances every 10 ms, as in training, and calls in between leave it unchanged; the previous
@@ -55,7 +55,7 @@ class Pilot:
         self._policy = importlib.import_module("foundation_policy").Raptor()
         self._policy.reset()
         self._memory = next(layer for layer in self._policy.layers if hasattr(layer, "state"))
-        self._calls, self._made = 10 // period, 0
+        self._calls_per_advance, self._n_calls = 10 // period, 0
         self._mean = self._action = action
 
     def action(self, state: np.ndarray) -> np.ndarray:
@@ -65,53 +65,53 @@ class Pilot:
             state: Position from the goal, m, rotation matrix, row by row, velocity, m/s, and angular velocity, body
                 frame, rad/s. (n, 18)
         """
-        weight = (self._made - 1) % self._calls
+        weight = (self._n_calls - 1) % self._calls_per_advance
         self._mean = (weight * self._mean + self._action) / (weight + 1)
         memory = self._memory.state
         self._action = self._policy.evaluate_step(np.concatenate([state, self._mean], axis=-1))
-        if self._made % self._calls:
+        if self._n_calls % self._calls_per_advance:
             self._memory.state = memory
-        self._made += 1
+        self._n_calls += 1
         return self._action
 
 
 def hold_goal(
-    pilot: Pilot, period: int, observe: Callable[[], np.ndarray], fly: Callable[[np.ndarray], None]
+    policy: RaptorPolicy, period: int, observe: Callable[[], np.ndarray], apply_action: Callable[[np.ndarray], None]
 ) -> np.ndarray:
     """Return which drones stay within 0.3 m of their goal in the last second of a flight. (n,)
 
     Args:
-        pilot: Policy.
+        policy: Policy.
         period: Time between two calls, ms.
-        observe: Function that returns the state in the layout of ``Pilot.action``.
-        fly: Function that flies for the period with an action.
+        observe: Function that returns the state in the layout of ``RaptorPolicy.action``.
+        apply_action: Function that applies an action for the period.
     """
-    away: Any = 0.0
-    for time in range(0, 1000 * SECONDS, period):
+    max_distance: Any = 0.0
+    for time in range(0, 1000 * FLIGHT_SECONDS, period):
         state = observe()
-        if time >= 1000 * (SECONDS - 1):
-            away = np.maximum(away, np.linalg.norm(state[:, :3], axis=-1))
-        fly(pilot.action(state))
-    return away < 0.3  # a NaN is not held
+        if time >= 1000 * (FLIGHT_SECONDS - 1):
+            max_distance = np.maximum(max_distance, np.linalg.norm(state[:, :3], axis=-1))
+        apply_action(policy.action(state))
+    return max_distance < 0.3  # a NaN is not held
 
 
 def hold_in_simulation(
-    sim: Sim, top: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int
+    sim: Sim, max_rotor_vel: np.ndarray, action: np.ndarray, delay: np.ndarray | int, period: int
 ) -> np.ndarray:
     """Return which drones of a simulation, one per world, RAPTOR holds at their goal. (n_worlds,)
 
     Args:
         sim: Simulation with rotor commands, whose drones start within 0.5 m of the goal along each axis.
-        top: Largest rotor speed, rpm. (n_worlds, 1) or ()
+        max_rotor_vel: Largest rotor speed, rpm. (n_worlds, 1) or ()
         action: Action before the first call; the rotors start at its speeds. (n_worlds, 4)
         delay: Delay of the commands, steps. (n_worlds, 1) or ()
         period: Time between two calls of the policy, ms.
     """
     n, goal = sim.n_worlds, np.array([0, 0, 3.0])
-    start = np.random.default_rng(0).uniform(-0.5, 0.5, (STARTS, 1, 3))
+    start = np.random.default_rng(0).uniform(-0.5, 0.5, (N_STARTS, 1, 3))
 
     def speeds(action: np.ndarray) -> np.ndarray:
-        return np.asarray(top * (action + 1) / 2, np.float32)[:, None]
+        return np.asarray(max_rotor_vel * (action + 1) / 2, np.float32)[:, None]
 
     def observe() -> np.ndarray:
         s = sim.data.states
@@ -119,30 +119,30 @@ def hold_in_simulation(
         pos, *others = (np.asarray(x, np.float64).reshape(n, -1) for x in parts)
         return np.concatenate([pos - goal, *others], axis=-1)
 
-    def fly(action: np.ndarray) -> None:
+    def apply_action(action: np.ndarray) -> None:
         sim.rotor_vel_control(speeds(action))
-        sim.step(period // STEP)
+        sim.step(period // STEP_MS)
 
     sim.data = with_states(sim.data, pos=np.resize(start, (n, 1, 3)) + goal, rotor_vel=speeds(action))
     sim.rotor_vel_control(speeds(action))
     sim.add(Latency(delay))
-    return hold_goal(Pilot(period, action), period, observe, fly)
+    return hold_goal(RaptorPolicy(period, action), period, observe, apply_action)
 
 
 def compare_airframes() -> Iterable[Row]:
     """Yield the longest latency at which RAPTOR holds all drones of an airframe."""
     for drone in AIRFRAMES:
-        top = load_airframe(drone).rotor_vel_limits[1].max()
+        max_rotor_vel = load_airframe(drone).rotor_vel_limits[1].max()
         for period in PERIODS:
-            sim = Sim(STARTS * len(DELAYS), drone=drone, control="rotor_vel", integrator="rk4")
-            delay = np.repeat(np.array(DELAYS) // STEP, STARTS)[:, None]
-            shares = hold_in_simulation(sim, top, np.zeros((sim.n_worlds, 4)), delay, period)
-            shares = 100 * np.mean(shares.reshape(-1, STARTS), axis=-1)
-            whole = int(np.argmin(np.append(shares == 100, False)))
-            listed = ", ".join(f"{share:.0f}" for share in shares)
+            sim = Sim(N_STARTS * len(DELAYS), drone=drone, control="rotor_vel", integrator="rk4")
+            delay = np.repeat(np.array(DELAYS) // STEP_MS, N_STARTS)[:, None]
+            held = hold_in_simulation(sim, max_rotor_vel, np.zeros((sim.n_worlds, 4)), delay, period)
+            shares = 100 * np.mean(held.reshape(-1, N_STARTS), axis=-1)
+            n_delays_held = int(np.argmin(np.append(shares == 100, False)))
+            share_list = ", ".join(f"{share:.0f}" for share in shares)
             yield Row(f"`{drone}`, called every {period} ms: longest latency with all drones held",
-                      f"{STARTS} starts within 0.5 m", DELAYS[max(whole - 1, 0)], "ms",
-                      None, f"held with 0 to 12 ms, in steps of 2: {listed} %")  # fmt: skip
+                      f"{N_STARTS} starts within 0.5 m", DELAYS[max(n_delays_held - 1, 0)], "ms",
+                      None, f"held with 0 to 12 ms, in steps of 2: {share_list} %")  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,11 +192,11 @@ def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndar
         delay: Delay of the commands, steps.
         period: Time between two calls of the policy, ms.
     """
-    q, n, top = quadrotors, len(quadrotors.mass), 20_000.0
+    q, n, max_rotor_vel = quadrotors, len(quadrotors.mass), 20_000.0
     sim = Sim(n, drone="cf21B_500", control="rotor_vel", integrator="rk4")
     params, world = sim.data.params, (n, 1)
     square = np.zeros((n, 1, 1, 3))
-    square[..., 2] = (q.thrust / top**2)[:, None, None]
+    square[..., 2] = (q.thrust / max_rotor_vel**2)[:, None, None]
     inertia = np.eye(3) * q.inertia[:, None, None]
     lag = np.zeros((n, 1, 1, 4))
     lag[..., ::2] = 1 / q.lag[:, None, None]
@@ -204,10 +204,10 @@ def hold_in_crazysim(quadrotors: Quadrotors, delay: int, period: int) -> np.ndar
         "mass": q.mass.reshape(*world, 1), "L": q.arm.reshape(*world, 1), "J": inertia, "J_inv": np.linalg.inv(inertia),
         "rpm2thrust": square, "rpm2torque": square * q.torque[:, None, None, None], "rotor_dyn_coef": lag,
         "drag_matrix": np.zeros((3, 3)), "prop_inertia": np.zeros(1), "rotor_vel_min": np.zeros(1),
-        "rotor_vel_max": np.full(1, top),
+        "rotor_vel_max": np.full(1, max_rotor_vel),
     }  # fmt: skip
     sim.data = sim.data.replace(params=params.replace(**{k: np.asarray(x, np.float32) for k, x in changes.items()}))
-    return hold_in_simulation(sim, np.asarray(top), q.hover, delay, period)
+    return hold_in_simulation(sim, np.asarray(max_rotor_vel), q.hover, delay, period)
 
 
 def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
@@ -222,15 +222,15 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
     l2f: Any = importlib.import_module("l2f")
     batch = l2f.vector_selector[n]
     device, rng, world = l2f.Device(), batch.VectorRng(), batch.VectorEnvironment()
-    parameters, state, later = batch.VectorParameters(), batch.VectorState(), batch.VectorState()
+    parameters, state, next_state = batch.VectorParameters(), batch.VectorState(), batch.VectorState()
     batch.initialize_rng(device, rng, 0)
     batch.initialize_environment(device, world)
     batch.initial_parameters(device, world, parameters)
     batch.initial_state(device, world, parameters, state)
-    start = np.resize(np.random.default_rng(0).uniform(-0.5, 0.5, (STARTS, 3)), (n, 3))
+    start = np.resize(np.random.default_rng(0).uniform(-0.5, 0.5, (N_STARTS, 3)), (n, 3))
     for i in range(n):
         parameter_file = json.loads(l2f.parameters_to_json(device, world.environments[i], parameters.parameters[i]))
-        parameter_file["integration"]["dt"] = STEP / 1000
+        parameter_file["integration"]["dt"] = STEP_MS / 1000
         signs = np.sign(parameter_file["dynamics"]["rotor_positions"])
         parameters_of_drone = {
             "mass": q.mass[i], "rotor_positions": q.arm[i] * signs, "J": np.diag(q.inertia[i]),
@@ -250,13 +250,13 @@ def hold_in_l2f(quadrotors: Quadrotors, delay: int, period: int) -> np.ndarray:
         batch.observe(device, world, parameters, state, observed, rng)
         return observed[:, :18].astype(np.float64)
 
-    def fly(action: np.ndarray) -> None:
-        for _ in range(period // STEP):
+    def apply_action(action: np.ndarray) -> None:
+        for _ in range(period // STEP_MS):
             sent.append(action)
-            batch.step(device, world, parameters, state, sent.pop(0).astype(np.float32), later, rng)
-            state.assign(later)
+            batch.step(device, world, parameters, state, sent.pop(0).astype(np.float32), next_state, rng)
+            state.assign(next_state)
 
-    return hold_goal(Pilot(period, q.hover), period, observe, fly)
+    return hold_goal(RaptorPolicy(period, q.hover), period, observe, apply_action)
 
 
 def compare_training_airframes() -> Iterable[Row]:
@@ -265,7 +265,7 @@ def compare_training_airframes() -> Iterable[Row]:
     for period in PERIODS:
         for delay in (0, 2, 6, 10):
             ours, theirs = (
-                100 * np.mean(fly(quadrotors, delay // STEP, period)) for fly in (hold_in_crazysim, hold_in_l2f)
+                100 * np.mean(hold(quadrotors, delay // STEP_MS, period)) for hold in (hold_in_crazysim, hold_in_l2f)
             )
             # rounding decides about quadrotors at the edge of stability: 5 of 256 are 2 percentage points
             yield Row(f"called every {period} ms, commands {delay} ms late: quadrotors held, crazysim and l2f",

@@ -24,7 +24,11 @@ FREQ, PERIOD = 1000, 0.1
 """Rate of our steps, Hz, and time between two commands, s."""
 WIND = np.array([3.0, -1.0, 0.5])
 """Wind of the flights in moving air, world frame, m/s."""
-START = {"pos": np.array([0.0, 0.0, 50.0]), "vel": np.array([0.5, -0.3, 0.2]), "ang_vel": np.array([0.2, -0.1, 0.3])}
+INITIAL_STATES = {
+    "pos": np.array([0.0, 0.0, 50.0]),
+    "vel": np.array([0.5, -0.3, 0.2]),
+    "ang_vel": np.array([0.2, -0.1, 0.3]),
+}
 """States at the start, m, m/s, rad/s."""
 
 States = list[dict[str, NDArray]]
@@ -44,10 +48,10 @@ def simulation(params: dict[str, Any], n_worlds: int = 1, drag: bool = True) -> 
         n_worlds: Number of worlds.
         drag: True for a linear drag as large as the drag of the rotors in hover, False for none.
     """
-    hubs, rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
-    linear = -len(hubs) * hover_speed(params) * np.array([params["k_d"], params["k_d"], params["k_z"]])
+    hub_positions, rate = np.stack(list(params["rotor_pos"].values())), 1 / params["tau_m"]
+    linear = -len(hub_positions) * hover_speed(params) * np.array([params["k_d"], params["k_d"], params["k_z"]])
     rotors = {
-        "position": hubs,
+        "position": hub_positions,
         "yaw_torque_sign": params["rotor_directions"],
         "thrust_curve": [0.0, 0.0, params["k_eta"] * RPM_TO_RAD_S**2],
         "torque_curve": [0.0, 0.0, params["k_m"] * RPM_TO_RAD_S**2],
@@ -69,7 +73,9 @@ def rotor_aerodynamics(params: dict[str, Any]) -> RotorAerodynamics:
     return RotorAerodynamics(drag=params["k_d"], inflow=params["k_z"], hub_height=0.0)
 
 
-def flight(params: dict[str, Any], commands: NDArray, effects: Sequence[Plugin] = (), drag: bool = False) -> States:
+def crazysim_flight(
+    params: dict[str, Any], commands: NDArray, effects: Sequence[Plugin] = (), drag: bool = False
+) -> States:
     """Return our states after each command.
 
     Args:
@@ -81,7 +87,7 @@ def flight(params: dict[str, Any], commands: NDArray, effects: Sequence[Plugin] 
     sim = simulation(params, drag=drag)
     for effect in effects:
         sim.add(effect)
-    sim.data = with_states(sim.data, **START, rotor_vel=np.full(4, hover_speed(params) / RPM_TO_RAD_S))
+    sim.data = with_states(sim.data, **INITIAL_STATES, rotor_vel=np.full(4, hover_speed(params) / RPM_TO_RAD_S))
     states = []
     for command in commands:
         sim.rotor_vel_control(command[None, None] / RPM_TO_RAD_S)
@@ -94,7 +100,12 @@ def rotorpy_flight(params: dict[str, Any], commands: NDArray, aero: bool = False
     """Return RotorPy's states after each command, in our names and units; with ``aero`` in ``WIND``."""
     multirotor = importlib.import_module("rotorpy.vehicles.multirotor").Multirotor
     drone = multirotor(params, aero=aero, integrator_kwargs={"rtol": 1e-10, "atol": 1e-12})
-    state = {"x": START["pos"], "v": START["vel"], "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": START["ang_vel"]}
+    state = {
+        "x": INITIAL_STATES["pos"],
+        "v": INITIAL_STATES["vel"],
+        "q": np.array([0.0, 0.0, 0.0, 1.0]),
+        "w": INITIAL_STATES["ang_vel"],
+    }
     state |= {"wind": WIND * aero, "rotor_speeds": np.full(4, hover_speed(params))}
     states = []
     for command in commands:
@@ -145,39 +156,39 @@ def compare_with_rotorpy() -> Iterable[Row]:
     params = importlib.import_module("rotorpy.vehicles.crazyflie_params").quad_params
     commands = hover_speed(params) * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (20, 4)))
     with jax.enable_x64(True):
-        ours, theirs = flight(params, commands[:10]), rotorpy_flight(params, commands[:10])
+        ours, theirs = crazysim_flight(params, commands[:10]), rotorpy_flight(params, commands[:10])
         differences = state_differences(ours[-1], theirs[-1])
-        drag_only = flight(params, commands, [Wind(WIND)], drag=True)
-        ours = flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
+        drag_only = crazysim_flight(params, commands, [Wind(WIND)], drag=True)
+        ours = crazysim_flight(params, commands, [Wind(WIND), rotor_aerodynamics(params)], drag=True)
         theirs = rotorpy_flight(params, commands, aero=True)
         slow, fast = (wrenches(params, speed) for speed in (0.1, 3.0))
     # RotorPy's integrator has a relative tolerance of 1e-10 in each of about 100 steps
-    for name, what, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
+    for name, quantity, unit, bound in (("pos", "position", "m", 1e-8), ("quat", "attitude", "degrees", 1e-6),
                                     ("ang_vel", "angular velocity", "rad/s", 1e-8),
                                     ("rotor_vel", "rotor speeds", "rpm", 1e-4)):  # fmt: skip
-        yield Row(f"flight without air, 1 s: {what}", "RotorPy", differences[name], unit, (0, bound))
+        yield Row(f"flight without air, 1 s: {quantity}", "RotorPy", differences[name], unit, (0, bound))
     our_wrench, their_wrench = fast
-    for what, axes, unit in (("force across the rotors", [0, 1], "N"), ("yaw torque", [5], "N m")):
-        size = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
+    for quantity, axes, unit in (("force across the rotors", [0, 1], "N"), ("yaw torque", [5], "N m")):
+        remark = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
         yield Row(
-            f"air at up to 3 m/s: {what}",
+            f"air at up to 3 m/s: {quantity}",
             "RotorPy",
             float(np.abs(our_wrench - their_wrench)[:, axes].max()),
             unit,
             (0, 1e-15),
-            size,
+            remark,
         )
     for speed, (our_wrench, their_wrench) in ((0.1, slow), (3.0, fast)):
-        for what, axes, unit in (("force along the rotors", [2], "N"), ("roll and pitch torque", [3, 4], "N m")):
-            size = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
-            apart_at = float(np.abs(our_wrench - their_wrench)[:, axes].max())
-            yield Row(f"air at up to {speed:g} m/s: {what}", "RotorPy", apart_at, unit, None, size)
+        for quantity, axes, unit in (("force along the rotors", [2], "N"), ("roll and pitch torque", [3, 4], "N m")):
+            remark = f"RotorPy: up to {np.abs(their_wrench[:, axes]).max():.2g} {unit}"
+            difference = float(np.abs(our_wrench - their_wrench)[:, axes].max())
+            yield Row(f"air at up to {speed:g} m/s: {quantity}", "RotorPy", difference, unit, None, remark)
     for seconds in (1, 2):
         k = round(seconds / PERIOD) - 1
         differences, drag_only_differences = (
             state_differences(ours[k], theirs[k]),
             state_differences(drag_only[k], theirs[k]),
         )
-        for name, what, unit in (("pos", "position", "m"), ("quat", "attitude", "degrees")):
+        for name, quantity, unit in (("pos", "position", "m"), ("quat", "attitude", "degrees")):
             remark = f"linear drag alone: {drag_only_differences[name]:.3g} {unit}"
-            yield Row(f"flight in wind, {seconds} s: {what}", "RotorPy", differences[name], unit, None, remark)
+            yield Row(f"flight in wind, {seconds} s: {quantity}", "RotorPy", differences[name], unit, None, remark)

@@ -16,9 +16,9 @@ from crazysim.progress import progress_bar
 class Row:
     """One comparison."""
 
-    what: str
+    quantity: str
     """Quantity that is compared."""
-    against: str
+    reference: str
     """Reference and data."""
     figure: float = math.nan
     """Measured figure."""
@@ -26,14 +26,14 @@ class Row:
     """Unit of the figure."""
     bound: tuple[float, float] | None = None
     """Least and largest figure that passes; None for a figure without a bound."""
-    other: str = ""
+    remark: str = ""
     """Other figures to compare with, such as published ones."""
     problem: str = ""
     """Reason why the comparison failed to run."""
     series: str = ""
     """Name of the points or the line that the figure belongs to in the section's picture; empty for none."""
-    at: float | str = ""
-    """Place along the horizontal axis of that picture: a number or the name of a group."""
+    x: float | str = ""
+    """Coordinate along the horizontal axis of that picture: a number or the name of a group."""
     section: str = ""
     """Name of the section."""
 
@@ -62,24 +62,24 @@ class Section:
     """Functions that measure rows."""
     packages: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Modules that must be importable, with the requirement for pip of each."""
-    absent: str = ""
-    """Reason why the section is not measured."""
-    logs: bool = False
-    """True if logs of real flights are needed."""
+    data_problem: str = ""
+    """Reason why the section's data are missing; empty if it has them."""
+    needs_logs: bool = False
+    """True if the section needs logs of real flights."""
     axes: tuple[str, str] = ("", "")
     """Labels of the axes of the section's picture; empty for none."""
 
     @property
-    def missing(self) -> str:
-        """Reason why the section cannot be measured, or an empty text."""
+    def problem(self) -> str:
+        """Reason why the section cannot be measured, or an empty string if it can."""
         missing = [name for package, name in self.packages.items() if importlib.util.find_spec(package) is None]
-        return f"run `pip install {' '.join(missing)}`" if missing else self.absent
+        return f"run `pip install {' '.join(missing)}`" if missing else self.data_problem
 
 
-def measure(sections: Sequence[Section]) -> list[Row]:
+def measure_sections(sections: Sequence[Section]) -> list[Row]:
     """Return the rows of all sections; a check that raises an error is a row that failed."""
     rows: list[Row] = []
-    tasks = [(section, check) for section in sections if not section.missing for check in section.checks]
+    tasks = [(section, check) for section in sections if not section.problem for check in section.checks]
     for section, check in progress_bar(tasks, "validating", "check"):
         measured: list[Row] = []
         try:

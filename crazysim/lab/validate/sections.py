@@ -36,7 +36,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
     """
     idsia, nanobench = ((data or Path()) / name for name in ("idsia", "nanobench"))
 
-    def absent(folder: Path) -> str:
+    def data_problem(folder: Path) -> str:
         if data is None:
             return "give `--data FOLDER`"
         return "" if folder.is_dir() else f"FOLDER has no folder {folder.name}"
@@ -57,7 +57,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "ground; `flow` has no other sensor, `range` has flow and time of flight. Differences of covariances are "
             "relative to their size plus 1e-5.",
             (firmware_controllers.compare_controllers, firmware_filters.compare_filters),
-            absent="" if firmware_controllers.VECTORS.is_dir() else "run it in a checkout of the sources",
+            data_problem="" if firmware_controllers.RECORDINGS.is_dir() else "run it in a checkout of the sources",
         ),
         Section(
             "crazyflow", "Crazyflow", "In float32, Crazyflow's controllers in both programs.",
@@ -94,7 +94,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "does not have, so that its prediction turns over. "
             "[Identification](guides/identification.md#cf21b_500_idsia) has the details, and says why "
             "`cf21B_500_idsia` is off, too.",
-            (partial(flights.open_loop, idsia),), absent=absent(idsia), logs=True,
+            (partial(flights.open_loop, idsia),), data_problem=data_problem(idsia), needs_logs=True,
             axes=("prediction over, s", "mean error"),
         ),
         Section(
@@ -102,7 +102,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "A Crazyflie 2.1: NanoBench. The simulated drone `cf2x_L250` follows the logged setpoints with the "
             "firmware's controller and filter. The figure is its RMS distance from the setpoint over that of the real "
             "drone.",
-            (partial(flights.closed_loop, nanobench),), absent=absent(nanobench), logs=True,
+            (partial(flights.closed_loop, nanobench),), data_problem=data_problem(nanobench), needs_logs=True,
             axes=("", "error of the simulation over that of the flight"),
         ),
         Section(
@@ -116,7 +116,7 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "and before both filters are compared with them, which lowers the attitude error of the filter on board in "
             "each flight, from 2.1 to 1.6 degrees in the median. The angle is that of the mean thrust over the whole "
             "flight, which no filter in flight has: with that of the first 3 s in the air the largest ratio is 1.17.",
-            (partial(logged_filter.compare_filter, nanobench),), absent=absent(nanobench), logs=True,
+            (partial(logged_filter.compare_filter, nanobench),), data_problem=data_problem(nanobench), needs_logs=True,
             axes=("", "error over that of the filter on board"),
         ),
         Section(

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.lab.validate.closed_loop import Flight, compare, fly, laboratory_estimator, read_flight
+from crazysim.lab.validate.closed_loop import (
+    Flight,
+    compare_tracking,
+    laboratory_estimator,
+    read_flight,
+    simulate_flights,
+)
 
 
 @pytest.fixture(scope="module")
@@ -14,7 +20,7 @@ def circling():
     angle = np.clip(t - 3, 0, None)
     setpoint = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), np.clip(t / 2, 0.01, 1), 0.3 + 0 * t], axis=-1)
     still = Flight("still", setpoint, np.tile([0.5, 0.0, 0.0], (len(t), 1)))
-    return setpoint, fly([still])[:, 0]
+    return setpoint, simulate_flights([still])[:, 0]
 
 
 def log(path, setpoint, pos, rest=0.06, before=100):
@@ -35,19 +41,19 @@ def test_a_flight_of_the_simulation_is_matched(circling, tmp_path):
     path = log(tmp_path / "own.npz", *circling)
     flight = read_flight(path)
     np.testing.assert_allclose(flight.pos, circling[1][: len(flight.pos)], rtol=0, atol=2e-3)  # 1.7e9 s has 0.2 us
-    (row,) = compare([flight])
+    (row,) = compare_tracking([flight])
     assert row.logged > 0.1
     assert abs(row.ratio - 1) < 0.01
     assert row.logged_lag == row.simulated_lag == pytest.approx(0.5, abs=0.1)  # 1 / kp of the position loop
     assert not row.failed
-    (row,) = compare([flight], estimator=laboratory_estimator())
+    (row,) = compare_tracking([flight], estimator=laboratory_estimator())
     assert 1.0 < row.ratio < 1.3
 
 
 def test_a_flight_that_fails_is_marked(circling, tmp_path):
     setpoint, pos = circling
     away = pos + np.where(np.arange(len(pos)) > 700, 3.0, 0.0)[:, None]
-    rows = compare([read_flight(log(tmp_path / f"{k}.npz", setpoint, p)) for k, p in enumerate((pos, away))])
+    rows = compare_tracking([read_flight(log(tmp_path / f"{k}.npz", setpoint, p)) for k, p in enumerate((pos, away))])
     assert [row.failed for row in rows] == [False, True]
     assert rows[1].ratio < 0.5
 

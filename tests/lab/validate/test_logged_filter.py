@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crazysim import ConfigError
-from crazysim.lab.validate.logged_filter import compare_filter, errors, read_filter_log
+from crazysim.lab.validate.logged_filter import compare_filter, estimate_errors, read_filter_log
 
 RNG = np.random.default_rng(0)
 
@@ -37,10 +37,10 @@ def test_a_hover_is_estimated_better_than_by_a_filter_that_is_off(tmp_path):
     write(tmp_path / "crashed.npz", away=3.0)
     log = read_filter_log(tmp_path / "hover.npz")
     # The scatter moves the mean thrust by 1 mm / (2 * 0.01 s) / 4 s, 0.1 degrees.
-    np.testing.assert_allclose(errors(log, log["est_pos"], log["est_quat"]), [0.03, 10.0], rtol=1e-3)
+    np.testing.assert_allclose(estimate_errors(log, log["est_pos"], log["est_quat"]), [0.03, 10.0], rtol=1e-3)
     np.testing.assert_allclose(np.degrees(2 * log["quat"][:, :3]), 0, atol=0.2)
     position, attitude = compare_filter(tmp_path)
-    assert "hover" in position.what
+    assert "hover" in position.quantity
     assert position.figure < 0.1  # scatter of sqrt(3) mm at most, of 30
     assert attitude.figure < 0.1
 

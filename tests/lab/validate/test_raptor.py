@@ -25,13 +25,13 @@ class StandIn:
 
 
 def test_raptor_advances_its_state_at_the_rate_of_its_training_and_observes_mean_actions(monkeypatch):
-    policy = StandIn()
-    monkeypatch.setitem(sys.modules, "foundation_policy", types.SimpleNamespace(Raptor=lambda: policy))
-    pilot = raptor.Pilot(2, np.full((1, 4), 7.0))
+    network = StandIn()
+    monkeypatch.setitem(sys.modules, "foundation_policy", types.SimpleNamespace(Raptor=lambda: network))
+    raptor_policy = raptor.RaptorPolicy(2, np.full((1, 4), 7.0))
     states = []
     for _ in range(11):
-        pilot.action(np.zeros((1, 18)))
-        states.append(policy.state)
+        raptor_policy.action(np.zeros((1, 18)))
+        states.append(network.state)
     assert states == [1] * 5 + [2] * 5 + [3]  # by calls 0, 5 and 10
     # the action before the first call; then means of the actions since the last advance
-    np.testing.assert_allclose(policy.seen, [7, 1, 1.5, 2, 2.5, 3, 6, 6.5, 7, 7.5, 8])
+    np.testing.assert_allclose(network.seen, [7, 1, 1.5, 2, 2.5, 3, 6, 6.5, 7, 7.5, 8])

@@ -7,9 +7,9 @@ import pytest
 from crazysim.__main__ import main
 from crazysim.errors import ConfigError
 from crazysim.lab.validate import Row, closed_forms, validate
-from crazysim.lab.validate.page import page
-from crazysim.lab.validate.pictures import draw
-from crazysim.lab.validate.rows import measure
+from crazysim.lab.validate.page import format_page
+from crazysim.lab.validate.pictures import draw_section
+from crazysim.lab.validate.rows import measure_sections
 from crazysim.lab.validate.sections import sections
 
 
@@ -33,18 +33,18 @@ def test_the_function_returns_the_rows_of_the_command():
 def test_rows_with_a_series_are_drawn_and_shown(tmp_path):
     images = pytest.importorskip("PIL.Image")
     section = next(section for section in sections(tmp_path) if section.name == "filter")
-    section = dataclasses.replace(section, absent="")
-    named = [Row(f"{k}", "", 0.5 * k, "", (0, 1.1), series="position", at=f"flight {k}") for k in range(1, 4)]
+    section = dataclasses.replace(section, data_problem="")
+    named = [Row(f"{k}", "", 0.5 * k, "", (0, 1.1), series="position", x=f"flight {k}") for k in range(1, 4)]
     errors = [
-        Row("x", "", 0.1 * h, unit, series=s, at=h) for h in (0.1, 0.5) for unit in "mN" for s in ("a", "published")
+        Row("x", "", 0.1 * h, unit, series=s, x=h) for h in (0.1, 0.5) for unit in "mN" for s in ("a", "published")
     ]
     for rows in (named, errors):
-        draw(section, rows, tmp_path / "pictures" / "one.png")
+        draw_section(section, rows, tmp_path / "pictures" / "one.png")
         image = images.open(tmp_path / "pictures" / "one.png")
         assert image.width > 500
         assert len(image.getcolors()) > 8
     rows = [dataclasses.replace(row, section="filter") for row in named]
-    text = page([section], rows, "Made.", {"filter": "pictures/one.png"})
+    text = format_page([section], rows, "Made.", {"filter": "pictures/one.png"})
     assert "(pictures/one.png)" in text
     assert "| 3 | **1.5** | at most 1.1 |" in text
     assert "2 of 3 figures with a range are within it. Outside: 3." in text
@@ -94,11 +94,13 @@ def test_what_cannot_run_is_a_failed_row_or_a_message(tmp_path, capsys):
         raise RuntimeError("no such thing")
 
     closed = sections(None)[0]
-    (row,) = measure([dataclasses.replace(closed, checks=(broken,))])
+    (row,) = measure_sections([dataclasses.replace(closed, checks=(broken,))])
     assert row.failed
     assert Row("x", "y", float("nan"), bound=(0, 1)).failed
     missing = dataclasses.replace(closed, packages={"numpy": "numpy", "no_such_package": "such==1"})
-    assert missing.missing == "run `pip install such==1`"
-    assert "Repeat: `pip install numpy such==1` and `crazysim validate --only closed`." in page([missing], [], "", {})
+    assert missing.problem == "run `pip install such==1`"
+    assert "Repeat: `pip install numpy such==1` and `crazysim validate --only closed`." in format_page(
+        [missing], [], "", {}
+    )
     assert main(["validate", "--data", str(tmp_path / "none")]) == 2
     assert "expected a folder with logs" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from crazysim.plugins.sensors import IMU, Barometer, MotionCapture, Triad
 ANCHORS = [[-3, -3, 0.2], [3, -3, 2.4], [3, 3, 0.2], [-3, 3, 2.4]]
 
 
-@pytest.mark.parametrize("kind", firmware_filters.KINDS)
+@pytest.mark.parametrize("kind", firmware_filters.MEASUREMENT_KINDS)
 def test_the_filter_is_that_of_the_compiled_firmware(kind):
     """In fast flights of 4 s: but for rounding of float32 that 4,000 loops of 1 ms add up."""
     found, recorded = firmware_filters.kalman_states(kind)
