@@ -1,7 +1,8 @@
 """Hooks of MkDocs: pages that are generated, and links from the repository's layout to the site's.
 
 The site holds the pages of ``docs/`` and, generated here, README, CONTRIBUTING, SECURITY and CHANGELOG of the
-repository, one page for each example, and one page of API reference for each public module.
+repository, one page for each example, and one page of API reference for each public module. ``llms.py`` makes its texts
+for coding assistants.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import sys
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -18,6 +20,9 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "docs"))  # hooks are loaded as single files
+import llms  # noqa: E402
+
 ROOT_PAGES = {
     "README.md": "index.md",
     "docs/README.md": "contents.md",
@@ -58,6 +63,13 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     parts = FENCE.split(markdown)
     parts[::2] = [LINK.sub(lambda match: _site_link(match, page.file.src_uri), part) for part in parts[::2]]
     return "".join(parts)
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Write the texts for coding assistants."""
+    description = config.site_description or ""
+    Path(config.site_dir, "llms.txt").write_text(llms.page_list(config.site_name, description, ROOT_PAGES))
+    Path(config.site_dir, "llms-full.txt").write_text(llms.full_text())
 
 
 def _site_link(match: re.Match[str], page: str) -> str:

@@ -100,6 +100,17 @@ def test_extras_are_never_imported_at_module_level():
             assert not extras & {name.split(".")[0] for name in names}, source
 
 
+def test_extras_that_messages_and_pages_name_exist():
+    texts = [
+        *SOURCES,
+        *(ROOT / name for name in ("README.md", "CHANGELOG.md", "Makefile")),
+        *(ROOT / "docs").rglob("*.md"),
+    ]
+    named = re.findall(r"""(?:crazysim|["']\.)\[([a-z0-9,]+)\]""", "\n".join(path.read_text() for path in texts))
+    assert named
+    assert {extra for extras in named for extra in extras.split(",")} <= PROJECT["optional-dependencies"].keys()
+
+
 def undocumented(sources):
     """Return the public methods of public classes that neither the class nor a base of the package documents."""
     classes = [node for source in sources for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]

@@ -1,11 +1,15 @@
 """The site's navigation holds every page, and links lead to files and headings that exist."""
 
+import importlib.util
 import re
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
+spec = importlib.util.spec_from_file_location("llms", ROOT / "docs" / "llms.py")
+llms = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(llms)
 PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *(ROOT / "docs").rglob("*.md")]
 GENERATED = {
     "index.md": "README.md",
@@ -59,3 +63,13 @@ def test_there_are_links_and_anchors_to_check():
     links = [link for page in PAGES for link in LINK.findall(prose(page))]
     assert len(links) > 50
     assert sum(bool(anchor) for _, anchor in links) > 5
+
+
+def test_coding_assistants_find_every_page_and_example():
+    """``llms.txt`` links to pages of the site, and ``llms-full.txt`` holds their text."""
+    listed = llms.page_list("crazysim", "A drone simulator.", {source: page for page, source in GENERATED.items()})
+    pages = [page for page in nav() if not page.startswith("examples/") or page == "examples/README.md"]
+    assert [target for target, _ in LINK.findall(listed)] == ["llms-full.txt", *[f"{page[:-3]}.html" for page in pages]]
+    text = llms.full_text()
+    for source in (*(ROOT / "docs/guides").glob("*.md"), *(ROOT / "docs/examples").glob("*.py")):
+        assert source.read_text() in text
