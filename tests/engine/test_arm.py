@@ -58,7 +58,7 @@ def run_on_arm(folder, source, n_lanes, n_steps, inputs, outputs):
 @needs_compiler
 @pytest.mark.skipif(None in NEEDED.values(), reason=f"needs {' and '.join(NEEDED)}")
 def test_a_kernel_for_arm_computes_the_numbers_of_this_machine(tmp_path):
-    """Compilers contract products and sums differently, so numbers differ by rounding; 37 lanes leave part of a vector."""
+    """Compilers contract products and sums differently, so numbers differ by rounding; 37 lanes fill no vector."""
     sim, scales = Sim(n_worlds=37), np.linspace(0.5, 1, 37, dtype=np.float32)
     sim.attitude_control(scales[:, None, None] * np.tile(np.float32([0.05, -0.1, 0.2, 0.4]), (37, 1, 1)))
     flat = Step(sim.step_pipeline, "lanes").flatten(sim.data)
