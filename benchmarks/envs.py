@@ -118,8 +118,8 @@ def rollouts(
         compile_s, lasts = {}, {}
         for drones, env in places.items():
             if name == "training":
-                carry = ppo.init(env, recipe, key)
-                lowered = ppo.iterate.lower(carry, env, recipe)
+                carry = ppo.init(env, (recipe,), key[None])
+                lowered = ppo.iterate.lower(carry, env, (recipe,))
             else:
                 carry = (starts[drones], jax.device_put(jax.random.key(2), place))
                 lowered = jitted(env, acts[name]).lower(carry)

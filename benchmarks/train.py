@@ -1,17 +1,18 @@
 """Training results: several seeds per task, evaluated on 1,000 held-out initial states, and the table of the page.
 
-    python benchmarks/train.py [--tasks hover track] [--seeds 0 1 2 3 4] [--device gpu] [--parallel 12] [--plot FILE]
-    python benchmarks/train.py --all --seeds $(seq 41 50) --device gpu --parallel 9 --write
-    python benchmarks/train.py --check --device gpu --parallel 12
+    python benchmarks/train.py [--tasks hover track] [--seeds 0:5] [--device gpu] [--parallel 3] [--plot FILE]
+    python benchmarks/train.py --all --seeds 0:20 --device gpu --parallel 3 --write
+    python benchmarks/train.py --check --device gpu --parallel 3
     python benchmarks/train.py --tasks hover -- --worlds 2048 --config learning_rate=1e-3
 
-Each training runs in its own process, ``crazysim train TASK``, so its time includes imports, building, compilation and
-evaluation. A JSON line for each run, as it ends, and one for each task, with medians over its seeds. All tasks are
-trained with the first seed, then all with the next one: the first runs compile, the others load their programs.
+All seeds of a task are trained by one process, ``crazysim train TASK --seeds ...``, so its time includes imports,
+building, compilation and evaluation of all of them; ``--together`` limits the seeds of a process. A JSON line for each
+seed, as its process ends, and one for each task, with medians over its seeds.
 
-Finished runs are kept in one file, ``results.jsonl`` of the folder ``--out``, and are not trained again while the
+Finished seeds are kept in one file, ``results.jsonl`` of the folder ``--out``, and are not trained again while the
 sources of the package are the same: an interrupted command continues where it was, also on another machine that is
-given this file. A failed training is reported at the end, and the others go on.
+given this file. A process that was interrupted continues from its last checkpoint if its folder is still there. A
+failed training is reported at the end, and the others go on.
 
 ``--write`` puts the rows of the tasks of which all seeds are finished into the committed table,
 docs/concepts/training-results.json, and into the page beside it. ``--check`` trains one seed of each task, and fails
@@ -39,9 +40,11 @@ import numpy as np
 from measure import digits, machine, run_in_process
 
 import crazysim
+from crazysim.commands.training import seeds_of
 from crazysim.envs.registry import TASKS, entry_of
+from crazysim.train.config import recipe_of
 from crazysim.train.show import read_curve
-from crazysim.train.training import kept_point, least_kept_success, stored_config
+from crazysim.train.training import CHECKPOINT, kept_point, least_kept_success, stored_configs
 
 PACKAGE = Path(crazysim.__file__).parent
 TABLE = Path(__file__).parents[1] / "docs" / "concepts" / "training-results.json"
@@ -60,9 +63,10 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--tasks", nargs="+", help="tasks; by default hover, recover, track and race, or all to check")
     parser.add_argument("--all", action="store_true", help="train all built-in tasks")
-    parser.add_argument("--seeds", type=int, nargs="+", help="by default 0 to 4, or 0 to check")
+    parser.add_argument("--seeds", type=seeds_of, help="such as 0:20 or 3,5; by default 0:5, or 0 to check")
     parser.add_argument("--out", type=Path, default=Path("out/train"), help="folder of the runs")
-    parser.add_argument("--parallel", type=int, default=1, help="trainings that run at a time")
+    parser.add_argument("--parallel", type=int, default=1, help="processes that run at a time")
+    parser.add_argument("--together", type=int, default=20, help="largest number of seeds of a process")
     parser.add_argument("--plot", type=Path, help="image of the learning curves")
     parser.add_argument("--only-plot", action="store_true", help="plot, summarise and write finished runs; train none")
     parser.add_argument("--keep", action="store_true", help="use finished runs of other sources of the package too")
@@ -84,12 +88,13 @@ def main() -> None:
     if not args.only_plot:
         missing = [key for key in wanted if key not in results]
         print(json.dumps({"finished": len(results), "to_train": len(missing)}), flush=True)
-        about = {"sources": source, "commit": args.commit, "parallel": args.parallel}
+        groups = groups_of(missing, args.together)
+        about = {"sources": source, "commit": args.commit, "parallel": min(args.parallel, max(len(groups), 1))}
         if missing:
             about |= run_in_process(machine, args.device)  # in this process it would hold memory of the device
             cores = f"{about['cores']} cores of {about['processor']}"
             about["machine"] = cores if about["device"] == "cpu" else about["device"]
-        failures = train_all(missing, args.out, store, about, results)
+        failures = train_all(groups, args.out, store, about, results)
 
     finished = {task: [results[key] for key in wanted if key[0] == task and key in results] for task in tasks}
     rows = [row_of(runs) for runs in finished.values() if runs]
@@ -129,57 +134,82 @@ def read(store: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
     return {(x["task"], x["seed"], x["on"], *x["arguments"]): x for x in results}
 
 
+def groups_of(missing: list[tuple[Any, ...]], largest: int) -> list[list[tuple[Any, ...]]]:
+    """Return the runs to train in groups that differ in their seeds alone, of limited size, the longest first."""
+    groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
+    for key in missing:
+        groups.setdefault((key[0], *key[2:]), []).append(key)
+    parts = [group[i : i + largest] for group in groups.values() for i in range(0, len(group), largest)]
+
+    def n_samples(part: list[tuple[Any, ...]]) -> int:
+        recipe = recipe_of(part[0][0])
+        return len(part) * recipe.n_worlds * recipe.config.get("iterations", 1) * recipe.config.get("n_steps", 1)
+
+    return sorted(parts, key=n_samples, reverse=True)
+
+
 def train_all(
-    missing: list[tuple[Any, ...]], out: Path, store: Path, about: dict[str, Any], results: dict[Any, dict[str, Any]]
+    groups: list[list[tuple[Any, ...]]],
+    out: Path,
+    store: Path,
+    about: dict[str, Any],
+    results: dict[Any, dict[str, Any]],
 ) -> list[str]:
-    """Train, add what ends well to the results and their file, and return what went wrong."""
+    """Train each group, add what ends well to the results and their file, and return what went wrong."""
     failures = []
     out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(about["parallel"]) as pool:
-        runs = {pool.submit(train, *key, out=out, shared=about["parallel"] > 1): key for key in missing}
+        runs = {pool.submit(train, group, out, about): group for group in groups}
         try:
             for run in as_completed(runs):
-                task, seed, device, *arguments = key = runs[run]
+                task, _, device, *arguments = runs[run][0]
+                seeds = [key[1] for key in runs[run]]
                 try:
-                    result = {"task": task, "seed": seed, "on": device, "arguments": arguments} | run.result() | about
+                    found = run.result()
                 except RuntimeError as error:
-                    failures.append(f"{task}: training with seed {seed} failed")
-                    print(json.dumps({"task": task, "seed": seed, "failed": str(error)}), flush=True)
+                    failures.append(f"{task}: training with seeds {', '.join(map(str, seeds))} failed")
+                    print(json.dumps({"task": task, "seeds": seeds, "failed": str(error)}), flush=True)
                     continue
-                with store.open("a") as file:
-                    file.write(json.dumps(result) + "\n")
-                results[key] = result
-                print(json.dumps({name: result[name] for name in SHOWN}), flush=True)
+                for key, result in zip(runs[run], found, strict=True):
+                    results[key] = {"task": task, "seed": key[1], "on": device, "arguments": arguments} | result | about
+                    with store.open("a") as file:
+                        file.write(json.dumps(results[key]) + "\n")
+                    print(json.dumps({name: results[key][name] for name in SHOWN}), flush=True)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return failures
 
 
-def folder_of(out: Path, task: str, seed: int, device: str, *arguments: str) -> Path:
+def folder_of(out: Path, task: str, seeds: str, device: str, *arguments: str) -> Path:
     """Return the folder of a run, which is in ``out`` whatever the place of the task, such as ``../task.py:NAME``."""
-    return out / re.sub(r"[^A-Za-z0-9_.-]+", "_", "-".join([task, device, str(seed), *arguments]))
+    return out / re.sub(r"[^A-Za-z0-9_.-]+", "_", "-".join([task, device, seeds, *arguments]))
 
 
-def train(task: str, seed: int, device: str, *arguments: str, out: Path, shared: bool) -> dict[str, Any]:
-    """Train in a new process and return the results.
+def train(group: list[tuple[Any, ...]], out: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
+    """Train some seeds of a task in a new process and return the results of each.
 
     Args:
-        task: Name of the task.
-        seed: Random seed.
-        device: Device of the training.
-        arguments: Further arguments of ``crazysim train``.
+        group: Task, seed, device and further arguments of ``crazysim train``, which differ in the seed alone.
         out: Folder of the runs.
-        shared: True if other trainings run on the device at the same time.
+        about: Hash of the sources, and the number of processes that run at the same time.
 
     Raises:
         RuntimeError: If the training fails, with the end of its output.
     """
-    folder = folder_of(out, task, seed, device, *arguments)
-    shutil.rmtree(folder, ignore_errors=True)  # of a training that was interrupted
-    command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seed", str(seed), "--out", str(folder)]
+    task, _, device, *arguments = group[0]
+    seeds = ",".join(str(key[1]) for key in group)
+    folder = folder_of(out, task, seeds, device, *arguments)
+    stamp = folder / "sources.txt"
+    is_same = stamp.exists() and stamp.read_text() == about["sources"]
+    if not is_same:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        stamp.write_text(about["sources"])
+    command = [sys.executable, "-P", "-m", "crazysim", "train", task, "--seeds", seeds, "--out", str(folder)]
+    command += ["--resume"] if (folder / CHECKPOINT).exists() else []  # of a training that was interrupted
     # By default each process would take three quarters of the memory of a GPU.
-    environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if shared else {}) | os.environ
+    environment = ({"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} if about["parallel"] > 1 else {}) | os.environ
     # The same package as here, whatever the folder in which this runs.
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     log, begin = folder.with_name(f"{folder.name}.log"), time.perf_counter()
@@ -194,11 +224,18 @@ def train(task: str, seed: int, device: str, *arguments: str, out: Path, shared:
     if done.returncode:
         last = (log.read_text().strip().splitlines() or ["no output"])[-1]
         raise RuntimeError(f"status {done.returncode}, {last} (see {log})")
+    algorithm = next(iter(stored_configs(folder).values())).algorithm
+    results = [result_of(folder / f"seed-{key[1]}") for key in group]
+    shared = {"algorithm": algorithm, "wall_s": digits(wall_s), "together": len(group)}
+    return [result | shared for result in results]
+
+
+def result_of(folder: Path) -> dict[str, Any]:
+    """Return the results of one seed from its learning curve; seconds are those of all seeds of its process."""
     curve = read_curve(folder)
     point, last = kept_point(curve), curve[-1]
     solved = next((p["seconds"] for p in curve if p["success"] >= 0.95), None)
     return {
-        "algorithm": stored_config(folder).algorithm,
         "success": round(point["success"], 4),
         "crashed": round(point["crashed"], 4),
         "error": digits(point["error"]) if point["error"] == point["error"] else None,
@@ -207,7 +244,6 @@ def train(task: str, seed: int, device: str, *arguments: str, out: Path, shared:
         "seconds": digits(last["seconds"]),
         "compile_seconds": digits(last["compile_seconds"]),
         "seconds_to_95_percent": None if solved is None else digits(solved),
-        "wall_s": digits(wall_s),
         "curve": [[digits(p["seconds"]), round(p["success"], 4)] for p in curve],
     }
 
@@ -226,7 +262,7 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "unit": entry_of(runs[0]["task"]).task.unit,
         "seconds": digits(statistics.median(run["seconds"] for run in runs)),
     }
-    row["parallel"] = max(run["parallel"] for run in runs)
+    row |= {name: max(run.get(name, 1) for run in runs) for name in ("parallel", "together")}
     return row | {name: ", ".join(sorted({run[name] for run in runs})) for name in ("commit", "date", "machine", "jax")}
 
 
@@ -257,12 +293,19 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             f"{row['least']:.1%}",
             f"{row['median']:.1%}",
             "" if row["error"] is None else f"{digits(row['error'], 2):g} {row['unit']}",
-            f"{digits(row['seconds'], 2):g} s" + (f", {row['parallel']} at a time" if row["parallel"] != 1 else ""),
+            time_of(row),
             f"{row['commit']}, {row['date']}",
             f"{row['machine']}, jax {row['jax']}",
         )
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def time_of(row: dict[str, Any]) -> str:
+    """Return the time of the training of a row, and what else ran in it."""
+    text = f"{digits(row['seconds'], 2):g} s"
+    text += f" for {row['together']} seeds" if row.get("together", 1) != 1 else ""
+    return text + (f", {row['parallel']} at a time" if row["parallel"] != 1 else "")
 
 
 def check(runs: list[dict[str, Any]]) -> list[str]:

@@ -263,14 +263,17 @@ def test_the_table_gets_the_rows_of_which_all_seeds_are_finished(run, train, tmp
              "median": 1.0, "error": None, "unit": "m", "seconds": 5.0, "parallel": 12, "commit": "0000000",
              "date": "2026-11-25", "machine": "another", "jax": "0.11.2"}  # fmt: skip
     train.TABLE.write_text(json.dumps([other]))
-    finished(train, tmp_path, (0.99, 1.0, 0.995))
+    finished(train, tmp_path, (0.99, 1.0, 0.995), together=3)
     before = train.PAGE.read_text()
-    run("train.py", "--only-plot", "--tasks", "hover", "--seeds", 0, 1, 2, 3, "--out", tmp_path, "--write")
+    run("train.py", "--only-plot", "--tasks", "hover", "--seeds", "0:4", "--out", tmp_path, "--write")
     assert json.loads(train.TABLE.read_text()) == [other]
-    (row,) = run("train.py", "--tasks", "hover", "--seeds", 0, 1, 2, "--out", tmp_path, "--write")[1:]
+    (row,) = run("train.py", "--tasks", "hover", "--seeds", "0,1,2", "--out", tmp_path, "--write")[1:]
     assert json.loads(train.TABLE.read_text()) == [row, other]
     page, end = train.PAGE.read_text(), train.END
-    assert "| `hover` | PPO, 2.6 M | 0 to 2 | 99.0% | 99.5% | 0.02 m | 21 s | abc1234, 2026-11-26 | a machine" in page
+    assert (
+        "| `hover` | PPO, 2.6 M | 0 to 2 | 99.0% | 99.5% | 0.02 m | 21 s for 3 seeds | abc1234, 2026-11-26 | a machine"
+        in page
+    )
     assert "| `track` | analytic gradients, 0.26 M | 3, 7 | 100.0% | 100.0% |  | 5 s, 12 at a time | 0000000" in page
     assert page[page.index(end) :] == before[before.index(end) :]
     assert page[: page.index(train.BEGIN)] == before[: before.index(train.BEGIN)]
@@ -304,16 +307,16 @@ def test_the_page_shows_the_committed_table(benchmarks):
 
 @pytest.mark.long("trains in a process of its own")
 def test_a_training_that_fails_leaves_the_others_which_are_not_trained_again(run, train, tmp_path, capsys):
-    options = ("--seeds", "0", "--parallel", "2", "--out", tmp_path, "--")
+    options = ("--seeds", "0:2", "--parallel", "2", "--out", tmp_path, "--")
     small = ("--iterations", "1", "--worlds", "2", "--set", "seconds=0.1", "--config", "n_steps=4", "minibatches=2")
-    with pytest.raises(SystemExit, match=r"^nothing: training with seed 0 failed$"):
+    with pytest.raises(SystemExit, match=r"^nothing: training with seeds 0, 1 failed$"):
         run("train.py", "--tasks", "nothing", "hover", *options, *small)
     count, *lines = lines_of(capsys.readouterr().out)
-    assert count == {"finished": 0, "to_train": 2}
+    assert count == {"finished": 0, "to_train": 4}
     assert any("task 'nothing' does not exist" in line.get("failed", "") for line in lines)
-    assert lines[-1]["env_steps"] == 8
+    assert (lines[-1]["env_steps"], lines[-1]["seeds"], lines[-1]["together"]) == (8, [0, 1], 2)
     again = run("train.py", "--tasks", "hover", *options, *small)
-    assert again == [{"finished": 1, "to_train": 0}, lines[-1]]
+    assert again == [{"finished": 2, "to_train": 0}, lines[-1]]
 
 
 def test_mppi_prints_the_rate_of_commands(run):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from crazysim.commands.options import DefaultsFormatter, given_options
+from crazysim.errors import ConfigError
 from crazysim.storage import PICTURE_SUFFIXES, check_writable
 
 
@@ -23,7 +24,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("task", help=task)
     add("--algorithm", help="ppo or apg; by default the recipe's")
     add("--seed", type=int, help="random seed; by default 0")
-    add("--worlds", type=int, help="number of parallel worlds; by default the recipe's")
+    seeds = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in that of the run"
+    add("--seeds", type=seeds_of, metavar="FIRST:END", help=seeds)
+    sweep = "values of hyperparameters, each trained with each seed in one program"
+    add("--sweep", nargs="+", default=[], metavar="NAME=VALUE,VALUE", help=sweep)
+    add("--worlds", type=int, help="number of parallel worlds of a training; by default the recipe's")
     iterations = "number of rollouts, each with its updates; by default the recipe's"
     add("--iterations", type=int, help=iterations)
     add("--out", type=Path, help="folder of the run; by default out/TASK")
@@ -36,24 +41,24 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--config", nargs="+", default=[], metavar="NAME=VALUE", help="hyperparameters of the algorithm")
     add("--no-film", action="store_true", help="write no film")
 
-    add = _of_run(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
+    add = _add_policy_command(commands, "evaluate", "evaluate a trained policy on held-out initial states", evaluate)
     add("--worlds", type=int, default=1000, help="number of initial states")
     add("--seed", type=int, help="seed of other initial states than the held-out ones")
     add("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
-    _add_place(add)
+    _add_task_and_device(add)
 
-    add = _of_run(commands, "export", "write a trained policy as ONNX or as a C header", export)
+    add = _add_policy_command(commands, "export", "write a trained policy as ONNX or as a C header", export)
     add("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
     add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
 
-    add = _of_run(commands, "render", "film a trained policy", render)
+    add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
     add("--worlds", type=int, default=4, help="number of worlds side by side")
     add("--seed", type=int, default=1, help="seed of the initial states")
-    _add_place(add)
+    _add_task_and_device(add)
 
 
-def _of_run(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
+def _add_policy_command(commands: argparse._SubParsersAction, name: str, text: str, run: Any) -> Any:
     """Add a command that reads the folder of a run, and return the function that adds its arguments."""
     parser = commands.add_parser(name, help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
@@ -61,11 +66,41 @@ def _of_run(commands: argparse._SubParsersAction, name: str, text: str, run: Any
     return parser.add_argument
 
 
-def _add_place(add: Any) -> None:
+def _add_task_and_device(add: Any) -> None:
     """Add the options of a command that rebuilds the environment of a run."""
     place = "FILE.py:CLASS of your task, if it has moved since training"
     add("--task", metavar="FILE.py:CLASS", help=place)
     add("--device", help="device: cpu, gpu; by default the training's")
+
+
+def seeds_of(text: str) -> list[int]:
+    """Return the seeds of ``FIRST:END``, from FIRST to END - 1, or of a list with commas."""
+    first, colon, end = text.partition(":")
+    try:
+        seeds = list(range(int(first), int(end))) if colon else [int(x) for x in text.split(",")]
+    except ValueError:
+        seeds = []
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise argparse.ArgumentTypeError(
+            f"expected FIRST:END with FIRST below END, or seeds with commas, each once, got {text!r}. Use for example "
+            f"0:8, for the seeds 0 to 7."
+        )
+    return seeds
+
+
+def _sweep_of(texts: Sequence[str]) -> dict[str, list[float]]:
+    """Return the values in NAME=VALUE,VALUE by name."""
+    sweep: dict[str, list[float]] = {}
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            sweep[name] = [*sweep.get(name, ()), *map(float, values.split(","))]
+        except ValueError:
+            raise ConfigError(
+                f"expected NAME=VALUE,VALUE with numbers to sweep, got {text!r}. Use for example "
+                f"learning_rate=1e-4,3e-4."
+            ) from None
+    return sweep
 
 
 def _pairs(texts: Sequence[str]) -> dict[str, Any]:
@@ -90,22 +125,25 @@ def train(options: argparse.Namespace) -> None:
         for name, entry in TASKS.items():
             print(f"{name:12} {(entry.task.__doc__ or '').splitlines()[0]}")
         return
-    from crazysim.train.runs import run
+    from crazysim.train.runs import run, run_many
 
+    settings: dict[str, Any] = {
+        "resume": options.resume,
+        "checkpoint_every": options.checkpoint_every,
+        "algorithm": options.algorithm,
+        "n_worlds": options.worlds,
+        "options": _pairs(options.set) | given_options(options, "device"),
+        "config": _pairs(options.config) | given_options(options, "iterations"),
+    }
     before = signal.signal(signal.SIGTERM, _exit)
     try:
-        run(
-            options.task,
-            options.out,
-            resume=options.resume,
-            film=not options.no_film,
-            checkpoint_every=options.checkpoint_every,
-            algorithm=options.algorithm,
-            seed=options.seed,
-            n_worlds=options.worlds,
-            options=_pairs(options.set) | given_options(options, "device"),
-            config=_pairs(options.config) | given_options(options, "iterations"),
-        )
+        if options.seeds is None and not options.sweep:
+            run(options.task, options.out, film=not options.no_film, seed=options.seed, **settings)
+            return
+        if options.seeds is not None and options.seed is not None:
+            raise ConfigError("expected --seed or --seeds, got both. Use --seeds alone.")
+        seeds = options.seeds or [options.seed or 0]
+        run_many(options.task, options.out, seeds=seeds, sweep=_sweep_of(options.sweep), **settings)
     finally:
         signal.signal(signal.SIGTERM, before)
 

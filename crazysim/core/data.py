@@ -115,8 +115,9 @@ class SimCore(PyTree):
     """Index of the drone in its world; enters its random numbers. (n_worlds, n_drones)"""
     drone_mocap_ids: Array = leaf("shared", 1)
     """MuJoCo mocap ids of the bodies of the drones. (n_drones,)"""
-    rng_key: Array = leaf("shared", 0)
-    """Random key of the seed; a reset does not change it. ()"""
+    rng_key: Array = leaf("parameter", 0)
+    """Random key of the seed; a reset does not change it. (), or (n_worlds, n_drones) where blocks of worlds have keys
+    of their own"""
     mjx_synced: Array = leaf("shared", 0)
     """True where the scene matches this data. ()"""
 

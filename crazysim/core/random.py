@@ -32,6 +32,12 @@ def seed_sim(data: SimData, seed: int | Array, device: jax.Device | None = None)
     return data.replace(core=data.core.replace(rng_key=key if device is None else jax.device_put(key, device)))
 
 
+def seed_key(data: SimData) -> Array:
+    """Return the random key of the seed of one drone or one world, which all its drones share. ()"""
+    key = data.core.rng_key
+    return key[0] if key.ndim else key
+
+
 def world_key(data: SimData, name: str) -> Array:
     """Return the random key of one world, for stages declared for one drone or one world.
 
@@ -133,7 +139,7 @@ def _key(data: SimData, name: str, *members: Array) -> Array:
 
     The step is hashed late, and the name last, so that all names share the hashes before.
     """
-    core, key = data.core, data.core.rng_key
+    core, key = data.core, seed_key(data)
     for number in (core.world_id, core.episode, *members, core.steps, zlib.crc32(name.encode())):
         key = jax.random.fold_in(key, number)
     return key
@@ -142,8 +148,10 @@ def _key(data: SimData, name: str, *members: Array) -> Array:
 def _over_worlds(data: SimData, fn: Callable[[SimData], Array]) -> Array:
     core = data.core
 
-    def of_world(world_id: Array, drone_id: Array, episode: Array, steps: Array) -> Array:
-        world_core = core.replace(world_id=world_id, drone_id=drone_id, episode=episode, steps=steps)
+    def of_world(key: Array, world_id: Array, drone_id: Array, episode: Array, steps: Array) -> Array:
+        world_core = core.replace(rng_key=key, world_id=world_id, drone_id=drone_id, episode=episode, steps=steps)
         return fn(data.replace(core=world_core))
 
-    return jax.vmap(of_world)(core.world_id[:, 0], core.drone_id, core.episode[:, 0], core.steps[:, 0])
+    axes = (0 if core.rng_key.ndim else None, 0, 0, 0, 0)
+    numbers = core.world_id[:, 0], core.drone_id, core.episode[:, 0], core.steps[:, 0]
+    return jax.vmap(of_world, in_axes=axes)(core.rng_key, *numbers)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from crazysim.core.data import SimData
+from crazysim.core.data import SimCore, SimData
 from crazysim.core.plugin import Plugin
 from crazysim.core.settings import as_mask, positive_integer
 from crazysim.core.sharding import default_device_of, put_on_device, shard
@@ -111,10 +111,12 @@ class Env(ABC):
         """Return all worlds at the start of an episode; the same key gives the same episodes.
 
         Args:
-            key: Random key, as ``jax.random.key`` makes. ()
+            key: Random key, as ``jax.random.key`` makes, (), or keys of blocks of worlds of equal size, (n_blocks,).
+                The episodes of a block are those of an environment of its size with its key.
 
         Raises:
-            ConfigError: If the task begins in a state that is not finite. A compiled reset, such as
+            ConfigError: If the number of keys does not divide the number of worlds, or if the task begins in a state
+                that is not finite. A compiled reset, such as
                 ``jax.jit(env.reset)``, cannot raise: the episode of such a world ends at its first step, with
                 ``info["nonfinite"]``.
         """
@@ -364,10 +366,25 @@ class DroneEnv(Env):
                 "follow its simulation. Set sim.default_data before DroneEnv(sim, ...), or change the data of a state."
             )
         data, mesh = self.episode_reset.broadcast_default(self.sim.n_worlds, self.sim.n_drones), self.sim.mesh
-        data = data.replace(core=data.core.replace(rng_key=key))
+        data = data.replace(core=_with_keys(data.core, key))
         if mesh is not None:
             return shard(data, mesh)
         return data if is_traced([key]) else put_on_device(data, self.sim.device)
+
+
+def _with_keys(core: SimCore, key: Array) -> SimCore:
+    """Return the core with the key of all worlds, or with the keys of blocks of worlds."""
+    if key.size == 1:
+        return core.replace(rng_key=key.reshape(()))
+    n_worlds, rest = divmod(core.n_worlds, key.size)
+    if key.ndim != 1 or rest:
+        raise ConfigError(
+            f"expected one key, or keys of blocks that divide the {core.n_worlds} worlds, got keys of shape "
+            f"{key.shape}. Use for example jax.random.key(0)."
+        )
+    drones = (core.n_worlds, core.n_drones)
+    rng_key = jnp.broadcast_to(jnp.repeat(key, n_worlds)[:, None], drones)
+    return core.replace(rng_key=rng_key, world_id=core.world_id % n_worlds)
 
 
 def _default_arrays(sim: Sim) -> list[Any]:

@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from crazysim.core.data import SimData
+from crazysim.core.random import seed_key
 from crazysim.errors import ConfigError, short_repr
 
 STRIDE = np.uint32(0x9E3779B9)
@@ -46,7 +47,7 @@ def episode_key(data: SimData, name: str) -> Array:
         Typed key, for ``draw``, ``uniform`` or ``jax.random``. ()
     """
     core = data.core
-    seed = jax.random.key_data(core.rng_key).astype(jnp.uint32)
+    seed = jax.random.key_data(seed_key(data)).astype(jnp.uint32)
     world, episode = core.world_id.astype(jnp.uint32), core.episode.astype(jnp.uint32)
     first = _mix(seed[0] ^ np.uint32(zlib.crc32(name.encode())))
     second = _mix(seed[1] + first)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,12 +12,13 @@ from jax import Array
 from crazysim.core.settings import positive_integer
 from crazysim.envs.env import Env
 from crazysim.envs.state import EnvState, Obs, validate_action
+from crazysim.jaxcompat import is_key
 from crazysim.pytree import PyTree, select_worlds
 
 Policy = Callable[[Obs, Any, Array], tuple[Array, Any, Any]]
 """``policy(obs, memory, key) -> (action, memory, extras)``, for all worlds at once. ``memory`` is the state that the
-policy keeps between steps, (n_worlds, ...) each, or ``()``; ``key`` is a random key; ``action`` has the actions of all
-drones, (n_worlds, n_drones, k); ``extras`` is any tree of arrays, for ``Transition.extras``."""
+policy keeps between steps, (n_worlds, ...) each, or ``()``; ``key`` is a random key, or several; ``action`` has the
+actions of all drones, (n_worlds, n_drones, k); ``extras`` is any tree of arrays, for ``Transition.extras``."""
 
 
 class Transition(PyTree):
@@ -77,7 +79,7 @@ def rollout(
         env: The environment, usually inside ``AutoReset``.
         state: The state at the start.
         policy: The policy, for all worlds at once.
-        key: Random key; each step receives one of its own.
+        key: Random key, or several; each step receives as many of its own. () or (n_keys,)
         n_steps: Number of steps, a positive integer.
         keep: ``keep(transition)``: the part of each transition to return; reward and ``done`` by default.
         initial_memory: Memory of the policy at the start of an episode; ``()`` for none. (n_worlds, ...) each
@@ -104,5 +106,7 @@ def rollout(
         return ([after.leaves[i] for i in carried], memory), kept
 
     carry = [start.leaves[i] for i in carried], memory
-    (leaves, memory), kept = jax.lax.scan(step, carry, jax.random.split(key, n_steps))
+    split = partial(jax.random.split, num=n_steps)
+    keys = jax.vmap(split, out_axes=1)(key) if is_key(key) and key.ndim else split(key)
+    (leaves, memory), kept = jax.lax.scan(step, carry, keys)
     return EnvState(start.replace(carried, leaves).data()), memory, kept

@@ -7,11 +7,11 @@ from crazysim.startup import lazy
 if TYPE_CHECKING:
     from crazysim.train.config import TrainConfig
     from crazysim.train.evaluation import evaluate
-    from crazysim.train.runs import run
+    from crazysim.train.runs import run, run_many
     from crazysim.train.show import film, plot_episode
     from crazysim.train.training import load_policy
 
-__all__ = ["TrainConfig", "evaluate", "film", "load_policy", "plot_episode", "run"]
+__all__ = ["TrainConfig", "evaluate", "film", "load_policy", "plot_episode", "run", "run_many"]
 
 __getattr__ = lazy(
     __name__,
@@ -22,5 +22,6 @@ __getattr__ = lazy(
         "load_policy": "crazysim.train.training",
         "plot_episode": "crazysim.train.show",
         "run": "crazysim.train.runs",
+        "run_many": "crazysim.train.runs",
     },
 )

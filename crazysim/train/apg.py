@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +18,8 @@ from crazysim.envs.state import EnvState, Obs, flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
-from crazysim.train.networks import Layers, Policy, all_finite, init_mlp
+from crazysim.train.networks import Layers, Policies, Policy, all_finite, init_mlp
+from crazysim.train.seeds import Rates, for_each_seed, split_blocks, stack_rates
 
 STATS_ITERATIONS = 20
 """Iterations during which the observation statistics are updated."""
@@ -45,8 +47,8 @@ class Config:
         check_hyperparameters(self)
 
 
-class Learner(PyTree):
-    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
+class Agent(PyTree):
+    """Network, optimiser and statistics of one seed; in a ``Learner`` stacked, with a leading axis over seeds."""
 
     policy: Layers
     """Network from normalised observations to the action before tanh."""
@@ -55,66 +57,95 @@ class Learner(PyTree):
     stats: RunningStats
     """Mean and variance with which observations are normalised."""
     key: Array
-    """Random key."""
+    """Random key. ()"""
+
+
+class Learner(PyTree):
+    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
+
+    agents: Agent
+    """The agents of all seeds. (n_seeds, ...) each"""
     env: EnvState
-    """State of the environments at the end of the last iteration."""
+    """State of the environments at the end of the last iteration: a block of worlds for each seed, of equal size."""
     iteration: Array
     """Number of completed iterations. ()"""
 
     def as_policy(self) -> Policy:
-        """Return the policy with its observation statistics."""
-        return Policy(self.stats, self.policy)
+        """Return the policies of all seeds. (n_seeds, ...) each"""
+        return Policy(self.agents.stats, self.agents.policy)
 
 
-def init(env: Env, config: Config, key: Array) -> Learner:
-    """Return an untrained learner; ``env`` has no automatic resets."""
-    k_policy, k_env, key = jax.random.split(key, 3)
+def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
+    """Return an untrained learner; ``env`` has no automatic resets.
+
+    Args:
+        env: Environment, with a block of worlds for each seed.
+        configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
+        keys: Random keys of the seeds. (n_seeds,)
+    """
+    config = configs[0]
+    k_policy, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), keys), 1, 0)
     state = env.reset(k_env)
-    n_obs = flatten(state.obs).shape[-1]
-    policy = init_mlp(k_policy, (n_obs, *config.hidden, env.actions.size), 0.01)
-    stats = RunningStats.create(n_obs).update(flatten(state.obs))
-    return Learner(policy, _optimizer(config).init(policy), stats, key, state, jnp.int32(0))
+
+    def init_agent(k_policy: Array, key: Array, obs: Array) -> Agent:
+        policy = init_mlp(k_policy, (obs.shape[-1], *config.hidden, env.actions.size), 0.01)
+        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(policy)
+        return Agent(policy, optimizer, RunningStats.create(obs.shape[-1]).update(obs), key)
+
+    obs = split_blocks(flatten(state.obs), len(configs))
+    return Learner(for_each_seed(init_agent, k_policy, k_agent, obs), state, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"))
-def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
-    """Return the learner after one rollout and one update, and the metrics of the iteration.
+@partial(jax.jit, static_argnames=("env", "configs"))
+def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Learner, dict[str, Array]]:
+    """Return the learner after one rollout and one update, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``finite`` is True if weights and loss are finite. The rollout starts where the previous one ended;
     worlds whose episode is over start a new one. A non-finite gradient is skipped. The scan stores its intermediates
     instead of recomputing them under ``jax.checkpoint``: tens of steps fit in memory.
     """
     start = env.restart(learner.env, learner.env.done)
+    agents, rates, config = learner.agents, stack_rates(configs), configs[0]
+    split = partial(split_blocks, n_seeds=len(configs))
 
-    def loss(policy: Layers) -> tuple[Array, Any]:
-        actor = Policy(learner.stats, policy)
+    def loss(policies: Layers) -> tuple[Array, Any]:
+        """Return the sum of the losses of all seeds, whose gradient is that of each, stacked."""
+        actors = Policies(Policy(agents.stats, policies))
 
         def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
             del key
-            return actor(obs), memory, ()
+            return actors(obs), memory, ()
 
         def keep(transition: Transition) -> Any:
-            return transition.reward.mean(), flatten(transition.obs), transition.terminated.mean()
+            reward, raw, terminated = split((transition.reward, flatten(transition.obs), transition.terminated))
+            return reward.mean(axis=(1, 2)), raw, terminated.mean(axis=1)
 
-        state, _, (rewards, raw, crashed) = rollout(env, start, act, learner.key, config.n_steps, keep)
-        discounts = config.discount ** jnp.arange(config.n_steps, dtype=rewards.dtype)
-        metrics = {"reward": rewards.mean(), "crashed": crashed.mean(), "error": jnp.nanmean(state.info["error"])}
-        return -(discounts * rewards).mean(), (state, raw, metrics)
+        state, _, (rewards, raw, crashed) = rollout(env, start, act, agents.key, config.n_steps, keep)
+        discounts = rates["discount"] ** jnp.arange(config.n_steps, dtype=rewards.dtype)[:, None]
+        error = jnp.nanmean(split(state.info["error"]), axis=(1, 2))
+        metrics = {"reward": rewards.mean(axis=0), "crashed": crashed.mean(axis=0), "error": error}
+        losses = -(discounts * rewards).mean(axis=0)
+        return losses.sum(), (losses, state, raw, metrics)
 
-    (cost, (state, raw, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(learner.policy)
-    norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
-    updates, optimizer = _optimizer(config).update(grads, learner.optimizer, learner.policy)
-    new = (optax.apply_updates(learner.policy, updates), optimizer)
-    policy, optimizer = jax.tree.map(
-        lambda x, old: jnp.where(jnp.isfinite(norm), x, old), new, (learner.policy, learner.optimizer)
-    )
-    # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
-    updated = learner.stats.update(raw)
-    stats = jax.tree.map(lambda x, old: jnp.where(learner.iteration < STATS_ITERATIONS, x, old), updated, learner.stats)
-    learner = Learner(policy, optimizer, stats, learner.key, state, learner.iteration + 1)
-    return learner, metrics | {"gradient": norm, "finite": all_finite((policy, optimizer, stats, cost))}
+    def update(agent: Agent, loss: Array, grads: Layers, raw: Array, rates: Rates) -> tuple[Agent, dict[str, Array]]:
+        norm = jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(grads)))
+        transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
+        updates, optimizer = transform.update(grads, agent.optimizer, agent.policy)
+        new = (optax.apply_updates(agent.policy, updates), optimizer)
+        policy, optimizer = jax.tree.map(
+            lambda x, old: jnp.where(jnp.isfinite(norm), x, old), new, (agent.policy, agent.optimizer)
+        )
+        # Normalisation that keeps shifting would degrade a policy that is already good, so it is frozen early.
+        updated, early = agent.stats.update(raw), learner.iteration < STATS_ITERATIONS
+        stats = jax.tree.map(lambda x, old: jnp.where(early, x, old), updated, agent.stats)
+        finite = all_finite((policy, optimizer, stats, loss))
+        return Agent(policy, optimizer, stats, agent.key), {"gradient": norm, "finite": finite}
+
+    (_, (losses, state, raw, metrics)), grads = jax.value_and_grad(loss, has_aux=True)(agents.policy)
+    agents, others = for_each_seed(update, agents, losses, grads, raw, rates, axes=(0, 0, 0, 1, 0))
+    return Learner(agents, state, learner.iteration + 1), metrics | others
 
 
-def _optimizer(config: Config) -> optax.GradientTransformation:
-    schedule = optax.linear_schedule(config.learning_rate, 0.0, config.iterations)
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:
+    schedule = optax.linear_schedule(learning_rate, 0.0, config.iterations)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))

@@ -20,6 +20,7 @@ from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.train import apg, ppo
+from crazysim.train.hyperparameters import SWEEPABLE
 
 ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg}
 """Algorithms by name: modules with ``Config``, ``init`` and ``iterate``."""
@@ -96,10 +97,8 @@ def recipe_of(task: str, algorithm: str | None = None) -> Recipe:
     return recipe if algorithm in (None, recipe.algorithm) else DEFAULT_RECIPES.get(algorithm, Recipe(algorithm))
 
 
-ALTERABLE_HYPERPARAMETERS = (
-    "iterations", "learning_rate", "discount", "gae_lambda", "clip", "entropy", "value_weight", "max_grad_norm",
-)  # fmt: skip
-"""Hyperparameters that may change when a run is resumed: neither shapes nor counters of its state depend on them."""
+ALTERABLE_HYPERPARAMETERS = ("iterations", *SWEEPABLE)
+"""Hyperparameters that may change when a run is resumed."""
 
 
 @dataclass(frozen=True)

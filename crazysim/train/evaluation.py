@@ -40,18 +40,26 @@ def as_tree(policy: Callable[[Obs], Array]) -> Any:
     return policy if isinstance(policy, PyTree) else _FunctionPolicy(policy)
 
 
-@partial(jax.jit, static_argnames=("env",))
-def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
+@partial(jax.jit, static_argnames=("env", "n_blocks"))
+def fly_episodes(env: Env, policy: Any, key: Array, n_blocks: int = 1) -> dict[str, Array]:
     """Fly one episode in every world and return its record.
+
+    Args:
+        env: Environment without automatic resets.
+        policy: Policy of all worlds.
+        key: Random key of the initial states.
+        n_blocks: Number of blocks of worlds of equal size, which begin from the same initial states.
 
     Returns:
         ``error``: task error after every step, constant after the end of the episode (n_steps, n_worlds, n_drones);
         ``over``: True once the episode has terminated (n_steps, n_worlds); ``nonfinite``: True where it did so because
         the world became non-finite (n_worlds,); ``reward``: sum over the episode (n_worlds, n_drones); ``terms``: terms
-        of the reward by name, means over worlds and drones, zero from the end of an episode on (n_steps,) each;
+        of the reward by name, means over the worlds and drones of a block, zero from the end of an episode on
+        (n_steps, n_blocks) each;
         ``succeeded``: True where a task with ``task.succeeded`` was completed during the episode (n_worlds, n_drones).
     """
     env = RewardTerms(env)
+    state = env.reset(jnp.broadcast_to(key, (n_blocks,)))
 
     def act(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
         del key
@@ -66,18 +74,23 @@ def fly(env: Env, policy: Any, key: Array) -> dict[str, Array]:
         }
         return kept | {"reward": state.reward, "terminated": state.terminated, "succeeded": env.succeeded(state)}
 
-    _, _, kept = rollout(env, env.reset(key), act, key, env.max_steps, keep)
+    _, _, kept = rollout(env, state, act, key, env.max_steps, keep)
     over = jnp.cumsum(kept["terminated"], axis=0) > 0
     before = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
     flies = ~before[..., None]
     last = jnp.minimum(jnp.arange(env.max_steps)[:, None], before.shape[0] - before.sum(axis=0) - 1)[..., None]
+
+    def blocks_of(x: Array) -> Array:
+        """(n_steps, n_worlds, n_drones) -> (n_steps, n_blocks, n_worlds / n_blocks, n_drones)"""
+        return x.reshape(x.shape[0], n_blocks, -1, x.shape[-1])
+
     flight = {
         "error": jnp.take_along_axis(kept["error"], last, axis=0),
         "over": over,
         "nonfinite": jnp.any(kept["nonfinite"] & ~before, axis=0),
         "reward": jnp.where(flies, kept["reward"], 0.0).sum(axis=0),
         "terms": {
-            name[len(TERM_PREFIX) :]: jnp.where(flies, x, 0.0).mean(axis=(1, 2))
+            name[len(TERM_PREFIX) :]: blocks_of(jnp.where(flies, x, 0.0)).mean(axis=(2, 3))
             for name, x in kept.items()
             if name.startswith(TERM_PREFIX)
         },
@@ -104,24 +117,44 @@ def evaluate(env: Env, policy: Callable[[Obs], Array], key: Array | None = None)
         seconds, in ``task.unit`` (at the end of the episode for tasks with ``task.succeeded``), NaN if all crashed;
         ``reward``: mean return of an episode; ``reward NAME``: contribution of each term to it.
     """
-    flight = fly(env, as_tree(policy), jax.random.key(EVALUATION_SEED) if key is None else key)
+    return evaluate_blocks(env, as_tree(policy), key)[0]
+
+
+def evaluate_blocks(env: Env, policy: Any, key: Array | None = None, n_blocks: int = 1) -> list[dict[str, float]]:
+    """Return the metrics of ``evaluate`` for blocks of worlds of equal size, which begin from the same initial states.
+
+    Args:
+        env: Environment without automatic resets; each world flies from one initial state.
+        policy: Policy of all worlds, such as ``Policies``.
+        key: Random key of the initial states; None for the held-out ones.
+        n_blocks: Number of blocks.
+    """
+    key = jax.random.key(EVALUATION_SEED) if key is None else key
+    # The rest takes less time on the host than compiling it.
+    flight = jax.device_get(fly_episodes(env, policy, key, n_blocks))
+    n_worlds = env.sim.n_worlds // n_blocks
+    return [_metrics(env, flight, i, slice(i * n_worlds, (i + 1) * n_worlds)) for i in range(n_blocks)]
+
+
+def _metrics(env: Env, flight: dict[str, Any], block: int, worlds: slice) -> dict[str, float]:
+    """Return the metrics of ``evaluate`` for the worlds of a block."""
     by_task = "succeeded" in flight
     last = 1 if by_task else max(round(env.task.hold * env.max_steps / env.task.seconds), 1)
-    flight = jax.device_get(flight)  # the rest takes less time on the host than compiling it
-    steps = 1 + (~flight["over"][:-1]).sum(axis=0)
-    error, over = flight["error"][-last:], flight["over"][-1]
-    settled = flight["succeeded"] if by_task else np.all(error < env.task.tolerance, axis=0) & ~over[:, None]
+    all_over = flight["over"][:, worlds]
+    steps = 1 + (~all_over[:-1]).sum(axis=0)
+    error, over = flight["error"][-last:, worlds], all_over[-1]
+    settled = flight["succeeded"][worlds] if by_task else np.all(error < env.task.tolerance, axis=0) & ~over[:, None]
     crashed = over & ~np.all(settled, axis=-1)
     error = error[:, ~crashed]
     error = error[~np.isnan(error)]
     return {
         "success": float(settled.mean()),
         "crashed": float(crashed.mean()),
-        "nonfinite": float(flight["nonfinite"].mean()),
+        "nonfinite": float(flight["nonfinite"][worlds].mean()),
         "length": float(steps.mean()) * env.task.seconds / env.max_steps,
         "error": float(error.mean()) if error.size else float("nan"),
-        "reward": float(flight["reward"].mean()),
-        **{f"{TERM_PREFIX}{name}": float(x.sum()) for name, x in flight["terms"].items()},
+        "reward": float(flight["reward"][worlds].mean()),
+        **{f"{TERM_PREFIX}{name}": float(x[:, block].sum()) for name, x in flight["terms"].items()},
     }
 
 

@@ -14,6 +14,7 @@ from jax import Array
 from crazysim.envs.state import flatten
 from crazysim.envs.statistics import RunningStats
 from crazysim.pytree import PyTree
+from crazysim.train.seeds import for_each_seed, join_blocks, split_blocks
 
 Layers = list[tuple[Array, Array]]
 """Weights (n_in, n_out) and biases (n_out,), first layer first."""
@@ -75,3 +76,15 @@ class Policy(PyTree):
     def __call__(self, obs: dict[str, Array]) -> Array:
         """Return the action, between -1 and 1, for observations. (..., n_obs) -> (..., n_actions)"""
         return jnp.tanh(mlp(self.layers, self.stats.normalize(flatten(obs))))
+
+
+class Policies(PyTree):
+    """Policies of several seeds, each of which controls a block of worlds of equal size."""
+
+    policies: Policy
+    """The policies, stacked. (n_seeds, ...) each"""
+
+    def __call__(self, obs: dict[str, Array]) -> Array:
+        """Return the action, between -1 and 1, for observations. (n_worlds, n_drones, n_obs) -> (..., n_actions)"""
+        blocks = split_blocks(obs, self.policies.stats.mean.shape[0])
+        return join_blocks(for_each_seed(lambda policy, obs: policy(obs), self.policies, blocks))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -20,6 +21,7 @@ from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree
 from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
+from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ class Config:
         check_hyperparameters(self)
 
 
-class Learner(PyTree):
-    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
+class Agent(PyTree):
+    """Networks, optimiser and statistics of one seed; in a ``Learner`` stacked, with a leading axis over seeds."""
 
     policy: Layers
     """Network from normalised observations to the mean action before tanh."""
@@ -74,15 +76,22 @@ class Learner(PyTree):
     returns: RunningStats
     """Mean and variance of returns, with which the outputs of the value network are scaled. (1,) each"""
     key: Array
-    """Random key."""
+    """Random key. ()"""
+
+
+class Learner(PyTree):
+    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
+
+    agents: Agent
+    """The agents of all seeds. (n_seeds, ...) each"""
     env: EnvState
-    """State of the environments."""
+    """State of the environments: a block of worlds for each seed, of equal size."""
     iteration: Array
     """Number of completed iterations. ()"""
 
     def as_policy(self) -> Policy:
-        """Return the deterministic policy."""
-        return Policy(self.stats, self.policy)
+        """Return the deterministic policies of all seeds. (n_seeds, ...) each"""
+        return Policy(self.agents.stats, self.agents.policy)
 
 
 class Sample(PyTree):
@@ -102,84 +111,143 @@ class Sample(PyTree):
     """True where the episode ended with the step."""
 
 
-def init(env: Env, config: Config, key: Array) -> Learner:
-    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode."""
-    if env.sim.n_worlds % config.minibatches:
+def init(env: Env, configs: Sequence[Config], keys: Array) -> Learner:
+    """Return an untrained learner; ``env`` resets automatically within the step that ends an episode.
+
+    Args:
+        env: Environment, with a block of worlds for each seed.
+        configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
+        keys: Random keys of the seeds. (n_seeds,)
+    """
+    config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
+    if n_worlds % config.minibatches:
         raise ConfigError(
-            f"expected minibatches that divide the {env.sim.n_worlds} worlds, got {config.minibatches}. Use for "
-            f"example {math.gcd(env.sim.n_worlds, 8)}."
+            f"expected minibatches that divide the {n_worlds} worlds, got {config.minibatches}. Use for "
+            f"example {math.gcd(n_worlds, 8)}."
         )
-    k_policy, k_value, k_env, key = jax.random.split(key, 4)
+    k_policy, k_value, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 4), keys), 1, 0)
     state = env.reset(k_env)
-    n_obs, n_actions = flatten(state.obs).shape[-1], env.actions.size
-    policy = init_mlp(k_policy, (n_obs, *config.hidden, n_actions), 0.01)
-    value = init_mlp(k_value, (n_obs, *config.hidden, 1), 1.0)
-    log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
-    optimizer = _optimizer(config).init((policy, log_std, value))
-    stats = RunningStats.create(n_obs).update(flatten(state.obs))
-    return Learner(policy, log_std, value, optimizer, stats, RunningStats.create(1), key, state, jnp.int32(0))
+
+    def init_agent(k_policy: Array, k_value: Array, key: Array, obs: Array) -> Agent:
+        n_obs, n_actions = obs.shape[-1], env.actions.size
+        policy = init_mlp(k_policy, (n_obs, *config.hidden, n_actions), 0.01)
+        value = init_mlp(k_value, (n_obs, *config.hidden, 1), 1.0)
+        log_std = jnp.full(n_actions, jnp.log(config.init_std), policy[0][0].dtype)
+        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init((policy, log_std, value))
+        stats = RunningStats.create(n_obs).update(obs)
+        return Agent(policy, log_std, value, optimizer, stats, RunningStats.create(1), key)
+
+    obs = split_blocks(flatten(state.obs), len(configs))
+    return Learner(for_each_seed(init_agent, k_policy, k_value, k_agent, obs), state, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("env", "config"))
-def iterate(learner: Learner, env: Env, config: Config) -> tuple[Learner, dict[str, Array]]:
-    """Return the learner after one rollout and its updates, and the metrics of the iteration.
+@partial(jax.jit, static_argnames=("env", "configs"))
+def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Learner, dict[str, Array]]:
+    """Return the learner after one rollout and its updates, and the metrics of the iteration. (n_seeds,) each
 
     The metric ``finite`` is True if weights, optimiser state, statistics and losses are finite.
     """
-    key, k_fly, k_learn = jax.random.split(learner.key, 3)
-    state, samples, raw, metrics = _collect(learner, env, config, k_fly)
-    advantages, targets = _advantages(samples, _value(learner, learner.stats.normalize(flatten(state.obs))), config)
-    returns = learner.returns.update(targets[..., None])
-    targets = (targets - returns.mean) / _scale(returns)
-    parameters = (learner.policy, learner.log_std, _rescale_value(learner.value, learner.returns, returns))
-    parameters, optimizer, losses = _learn(parameters, learner.optimizer, samples, advantages, targets, config, k_learn)
-    policy, log_std, value = parameters
-    stats = learner.stats.update(raw)
-    finite = all_finite((parameters, optimizer, stats, returns, losses))
-    learner = Learner(policy, log_std, value, optimizer, stats, returns, key, state, learner.iteration + 1)
-    return learner, metrics | losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
+    key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
+    agents, rates = learner.agents.replace(key=key), stack_rates(configs)
+    state, samples, raw, metrics = _collect(agents, learner.env, env, configs[0], rates, k_fly)
+    last_obs = split_blocks(flatten(state.obs), len(configs))
+    learn = partial(_learn, config=configs[0])
+    agents, losses = for_each_seed(learn, agents, samples, raw, last_obs, rates, k_learn, axes=(0, 1, 1, 0, 0, 0))
+    return Learner(agents, state, learner.iteration + 1), metrics | losses
 
 
 def _collect(
-    learner: Learner, env: Env, config: Config, key: Array
+    agents: Agent, state: EnvState, env: Env, config: Config, rates: Rates, keys: Array
 ) -> tuple[EnvState, Sample, Array, dict[str, Array]]:
-    """Return the state after a rollout, its samples, its observations before normalisation, and metrics."""
+    """Return the state after a rollout of all seeds, its samples, its observations before normalisation, and metrics.
 
-    def policy(obs: Obs, memory: Any, key: Array) -> tuple[Array, Any, Any]:
-        raw = flatten(obs)
-        seen = learner.stats.normalize(raw)
-        mean, value = jnp.tanh(mlp(learner.policy, seen)), _value(learner, seen)
-        action = mean + jnp.exp(learner.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
-        return action, memory, (raw, seen, value, _log_prob(mean, learner.log_std, action))
+    Samples and observations have leading axes (n_steps, n_seeds, n_worlds, n_drones), metrics (n_seeds,).
+    """
+    split = partial(split_blocks, n_seeds=keys.shape[0])
+
+    def act(agent: Agent, raw: Array, key: Array) -> tuple[Array, Any]:
+        seen = agent.stats.normalize(raw)
+        mean, value = _mean_action(agent.policy, seen), _value(agent, seen)
+        action = mean + jnp.exp(agent.log_std) * jax.random.normal(key, mean.shape, mean.dtype)
+        return action, (raw, seen, value, _log_prob(mean, agent.log_std, action))
+
+    def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
+        action, extras = for_each_seed(act, agents, split(flatten(obs)), keys)
+        return join_blocks(action), memory, (action, *extras)
 
     def keep(transition: Transition) -> tuple[Sample, Array, Any]:
-        raw, seen, value, log_prob = transition.extras
-        truncated = (transition.truncated & ~transition.terminated)[:, None]
-        final_value = _value(learner, learner.stats.normalize(flatten(transition.final_obs)))
-        reward = transition.reward + config.discount * jnp.where(truncated, final_value, 0.0)
-        over = jnp.broadcast_to(transition.done[:, None], reward.shape)
-        sample = Sample(seen, transition.action, log_prob, value, reward, over)
-        error = transition.state.info["error"].mean()
-        return sample, raw, (transition.reward.mean(), transition.terminated, error)
+        action, raw, seen, value, log_prob = transition.extras
+        reward, over, truncated, terminated, error = split(
+            (
+                transition.reward,
+                transition.done[:, None],
+                (transition.truncated & ~transition.terminated)[:, None],
+                transition.terminated,
+                transition.state.info["error"],
+            )
+        )
 
-    state, _, (samples, raw, (reward, crashed, error)) = rollout(env, learner.env, policy, key, config.n_steps, keep)
+        def final_value(agent: Agent, raw: Array) -> Array:
+            return _value(agent, agent.stats.normalize(raw))
+
+        final = for_each_seed(final_value, agents, split(flatten(transition.final_obs)))
+        discount = rates["discount"][:, None, None]
+        sample = Sample(
+            seen,
+            action,
+            log_prob,
+            value,
+            reward + discount * jnp.where(truncated, final, 0.0),
+            jnp.broadcast_to(over, reward.shape),
+        )
+        return sample, raw, (reward.mean(axis=(1, 2)), terminated, error.mean(axis=(1, 2)))
+
+    state, _, (samples, raw, (reward, crashed, error)) = rollout(env, state, policy, keys, config.n_steps, keep)
     over = samples.done.any(axis=-1)
     metrics = {
-        "reward": reward.mean(),
-        "crashed": crashed.sum() / jnp.maximum(over.sum(), 1),
-        "error": error.mean(),
+        "reward": reward.mean(axis=0),
+        "crashed": crashed.sum(axis=(0, 2)) / jnp.maximum(over.sum(axis=(0, 2)), 1),
+        "error": error.mean(axis=0),
     }
     return state, samples, raw, metrics
 
 
-def _advantages(samples: Sample, last: Array, config: Config) -> tuple[Array, Array]:
+def _learn(
+    agent: Agent, samples: Sample, raw: Array, last_obs: Array, rates: Rates, key: Array, config: Config
+) -> tuple[Agent, dict[str, Array]]:
+    """Return the agent of one seed after the updates on its rollout, and metrics.
+
+    Args:
+        agent: The agent before.
+        samples: Its samples. (n_steps, n_worlds, n_drones, ...) each
+        raw: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
+        last_obs: Observations after the rollout. (n_worlds, n_drones, n_obs)
+        rates: Hyperparameters of the seed. () each
+        key: Random key.
+        config: Hyperparameters of all seeds; those in ``rates`` count.
+    """
+    last = _value(agent, agent.stats.normalize(last_obs))
+    advantages, targets = _advantages(samples, last, rates)
+    returns = agent.returns.update(targets[..., None])
+    targets = (targets - returns.mean) / _scale(returns)
+    parameters = (agent.policy, agent.log_std, _rescale_value(agent.value, agent.returns, returns))
+    data = (samples.obs, samples.action, samples.log_prob, advantages, targets)
+    parameters, optimizer, losses = _update(parameters, agent.optimizer, data, rates, key, config)
+    policy, log_std, value = parameters
+    stats = agent.stats.update(raw)
+    finite = all_finite((parameters, optimizer, stats, returns, losses))
+    agent = Agent(policy, log_std, value, optimizer, stats, returns, agent.key)
+    return agent, losses | {"std": jnp.exp(log_std).mean(), "finite": finite}
+
+
+def _advantages(samples: Sample, last: Array, rates: Rates) -> tuple[Array, Array]:
     """Return generalised advantage estimates and value targets. (n_steps, n_worlds, n_drones)"""
 
     def back(carry: tuple[Array, Array], sample: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], Array]:
         advantage, value_after = carry
         reward, value, over = sample
-        discount = config.discount * ~over
-        advantage = reward + discount * value_after - value + discount * config.gae_lambda * advantage
+        discount = rates["discount"] * ~over
+        advantage = reward + discount * value_after - value + discount * rates["gae_lambda"] * advantage
         return (advantage, value), advantage
 
     sequence = (samples.reward, samples.value, samples.done)
@@ -187,50 +255,57 @@ def _advantages(samples: Sample, last: Array, config: Config) -> tuple[Array, Ar
     return advantages, advantages + samples.value
 
 
-def _learn(
-    parameters: Any, optimizer: Any, samples: Sample, advantages: Array, targets: Array, config: Config, key: Array
+def _update(
+    parameters: Any, optimizer: Any, data: Any, rates: Rates, key: Array, config: Config
 ) -> tuple[Any, Any, dict[str, Array]]:
-    """Return parameters, optimiser state and mean losses after the updates on a rollout."""
-    data = (samples.obs, samples.action, samples.log_prob, advantages, targets)
+    """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
+    n_worlds = data[0].shape[1]
+    transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
 
-    def of_worlds(numbers: Array) -> Any:
-        """Return the samples of some worlds. (n_samples, ...)"""
-        return jax.tree.map(lambda x: x[:, numbers].reshape(-1, *x.shape[3:]), data)
+    def samples_of(worlds: Array) -> Any:
+        """Return the samples of some worlds, by their indices. (n_samples, ...) each"""
+        return jax.tree.map(lambda x: x[:, worlds].reshape(-1, *x.shape[3:]), data)
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
         obs, action, log_prob, advantage, target = batch
-        mean = jnp.tanh(mlp(policy, obs))
+        mean = _mean_action(policy, obs)
         ratio = jnp.exp(_log_prob(mean, log_std, action) - log_prob)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-        gain = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - config.clip, 1 + config.clip) * advantage).mean()
+        clipped = jnp.clip(ratio, 1 - rates["clip"], 1 + rates["clip"])
+        gain = jnp.minimum(ratio * advantage, clipped * advantage).mean()
         error = 0.5 * jnp.square(mlp(value, obs)[..., 0] - target).mean()
-        total = -gain + config.value_weight * error - config.entropy * log_std.sum()
+        total = -gain + rates["value_weight"] * error - rates["entropy"] * log_std.sum()
         return total, {"value_error": error, "ratio_off": jnp.abs(ratio - 1).mean()}
 
     def update(carry: Any, batch: Any) -> tuple[Any, dict[str, Array]]:
         parameters, optimizer = carry
         grads, losses = jax.grad(loss, has_aux=True)(parameters, batch)
-        updates, optimizer = _optimizer(config).update(grads, optimizer, parameters)
+        updates, optimizer = transform.update(grads, optimizer, parameters)
         return (optax.apply_updates(parameters, updates), optimizer), losses
 
     def epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        order = jax.random.permutation(key, targets.shape[1]).reshape(config.minibatches, -1)
-        return jax.lax.scan(lambda c, numbers: update(c, of_worlds(numbers)), carry, order)
+        minibatches = jax.random.permutation(key, n_worlds).reshape(config.minibatches, -1)
+        return jax.lax.scan(lambda carry, worlds: update(carry, samples_of(worlds)), carry, minibatches)
 
     carry, losses = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)
 
 
-def _optimizer(config: Config) -> optax.GradientTransformation:
+def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:
     n_updates = config.iterations * config.epochs * config.minibatches
-    schedule = optax.linear_schedule(config.learning_rate, 0.0, n_updates)
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+    schedule = optax.linear_schedule(learning_rate, 0.0, n_updates)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))
 
 
-def _value(learner: Learner, obs: Array) -> Array:
+def _mean_action(policy: Layers, obs: Array) -> Array:
+    """Return the mean action for normalised observations. (..., n_obs) -> (..., n_actions)"""
+    return jnp.tanh(mlp(policy, obs))
+
+
+def _value(agent: Agent, obs: Array) -> Array:
     """Return the expected return for normalised observations. (..., n_obs) -> (...)"""
-    return mlp(learner.value, obs)[..., 0] * _scale(learner.returns) + learner.returns.mean
+    return mlp(agent.value, obs)[..., 0] * _scale(agent.returns) + agent.returns.mean
 
 
 def _scale(returns: RunningStats) -> Array:

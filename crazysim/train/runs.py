@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, RenderError
 from crazysim.train.config import TrainConfig
+from crazysim.train.hyperparameters import SWEEPABLE
 from crazysim.train.show import film as film_policy
-from crazysim.train.show import plot_curve, plot_episode, read_curve
-from crazysim.train.training import CHECKPOINT, POLICY, TrainResult, stored_config, train
+from crazysim.train.show import plot_curve, plot_episode, plot_spread, read_curve
+from crazysim.train.training import CHECKPOINT, CURVE, POLICY, TABLE, TrainResult, stored_configs, train, train_many
 
 SETTINGS = ("algorithm", "seed", "n_worlds", "options", "config")
 """Settings of ``TrainConfig.create`` that ``run`` takes."""
@@ -57,15 +59,11 @@ def run(
         DivergedError: If weights or losses become non-finite; the last checkpoint stays.
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
-    if unknown := settings.keys() - SETTINGS:
-        raise ConfigError(
-            f"expected settings among {', '.join(SETTINGS)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "
-            f"in config={{...}}, such as config={{'iterations': 100}}."
-        )
+    _check_settings(settings, SETTINGS)
     config = TrainConfig.create(task, **settings)
     folder = Path("out") / config.title if folder is None else Path(folder)
     if resume:
-        config = TrainConfig.create(task, **settings, resumed=stored_config(folder))
+        config = TrainConfig.create(task, **settings, resumed=_stored_config(folder))
     result = train(config, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
     log(f"wrote {folder / CHECKPOINT}, {folder / POLICY}")
     try:
@@ -78,3 +76,123 @@ def run(
     except (ImportError, RenderError) as error:
         log(f"no curve or film: {error}")
     return result
+
+
+def run_many(
+    task: str | Task,
+    folder: str | Path | None = None,
+    *,
+    seeds: Iterable[int] = (0,),
+    sweep: Mapping[str, Sequence[float]] | None = None,
+    resume: bool = False,
+    evaluation_worlds: int = 1000,
+    log: Callable[[str], None] = print,
+    progress: bool = True,
+    checkpoint_every: float | None = None,
+    on_iteration: Callable[[int, dict[str, Any]], None] | None = None,
+    **settings: Any,
+) -> dict[str, TrainResult]:
+    """Train with several seeds, and several values of hyperparameters, in one program: ``crazysim train --seeds``.
+
+    A seed gives the same training, to rounding, whatever other ones are trained beside it. The folder then has one
+    ``checkpoint.npz`` of all, ``seeds.csv`` and ``seeds.json`` with a row for each training, ``curve.png`` with their
+    medians and spreads, and for each training a folder with ``policy.npz`` and ``curve.json``, such as ``seed-3`` or
+    ``learning_rate-0.0003-seed-3``.
+
+    Args:
+        task: As in ``run``.
+        folder: Folder of the run; None for ``out/NAME``.
+        seeds: Seeds.
+        sweep: Values of hyperparameters by name, each of which is trained with each seed; names of ``SWEEPABLE``.
+        resume: True to continue from the checkpoint in the folder, with the same seeds and values.
+        evaluation_worlds: Number of held-out initial states of each evaluation.
+        log: Function that is called with each line of output.
+        progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
+        checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
+        on_iteration: As in ``run``, but each metric is an array with a number for each training.
+        settings: ``algorithm``, ``n_worlds`` of each training, ``options`` and ``config`` of ``TrainConfig.create``.
+
+    Returns:
+        The results by the names of their folders.
+
+    Raises:
+        ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``run``; a training that diverges ends alone, and
+            ``DivergedError`` is raised if all did.
+    """
+    _check_settings(settings, tuple(x for x in SETTINGS if x != "seed"))
+    variants = variants_of(seeds, sweep or {}, settings.get("config") or {})
+    config = TrainConfig.create(task, **settings)
+    folder = Path("out") / config.title if folder is None else Path(folder)
+    stored = stored_configs(folder) if resume else {}
+    configs = {}
+    for name, (seed, changes) in variants.items():
+        given = settings | {"seed": seed, "config": {**(settings.get("config") or {}), **changes}}
+        configs[name] = TrainConfig.create(task, **given, resumed=stored.get(name))
+    results = train_many(configs, folder, resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
+    log(f"wrote {folder / CHECKPOINT}, {folder / TABLE}, and {POLICY} and {CURVE} in {', '.join(configs)}")
+    curves: dict[str, list[Any]] = {}
+    for name in configs:
+        curves.setdefault(name.rpartition("seed-")[0].strip("-") or config.title, []).append(read_curve(folder / name))
+    try:
+        plot_spread(curves, folder / "curve.png")
+        log(f"wrote {folder / 'curve.png'}")
+    except ImportError as error:
+        log(f"no curve: {error}")
+    return results
+
+
+def variants_of(
+    seeds: Iterable[int], sweep: Mapping[str, Sequence[float]], config: Mapping[str, Any]
+) -> dict[str, tuple[int, dict[str, float]]]:
+    """Return the seed and the changed hyperparameters of each training, by the name of its folder.
+
+    Args:
+        seeds: Seeds.
+        sweep: Values of hyperparameters by name.
+        config: Hyperparameters of all trainings, which a sweep must not change.
+
+    Raises:
+        ConfigError: If there are no seeds or no values, or some twice, or if a hyperparameter cannot differ between
+            trainings of one program.
+    """
+    chosen: dict[str, list[Any]] = {"seeds": list(seeds)} | {name: list(values) for name, values in sweep.items()}
+    for name, values in chosen.items():
+        if not values or len(set(map(str, values))) < len(values):
+            raise ConfigError(
+                f"expected at least one value of {name}, and each once, got {values or 'none'}. Leave out the others."
+            )
+        if name != "seeds" and name not in SWEEPABLE:
+            raise ConfigError(
+                f"expected hyperparameters to sweep among {', '.join(SWEEPABLE)}, got {name}, on which shapes or "
+                f"counters depend. Train its values one after another, with --config {name}=VALUE and --out."
+            )
+        if name in config:
+            raise ConfigError(f"expected {name} to be swept or given, got both. Leave it out of the config.")
+    names = list(sweep)
+    return {
+        "-".join([*(f"{name}-{value}" for name, value in zip(names, values, strict=True)), f"seed-{seed}"]): (
+            seed,
+            dict(zip(names, values, strict=True)),
+        )
+        for *values, seed in itertools.product(*(chosen[name] for name in names), chosen["seeds"])
+    }
+
+
+def _check_settings(settings: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Check the names of the settings of ``TrainConfig.create``."""
+    if unknown := settings.keys() - set(known):
+        raise ConfigError(
+            f"expected settings among {', '.join(known)}, got {', '.join(sorted(unknown))}. Hyperparameters belong "
+            f"in config={{...}}, such as config={{'iterations': 100}}."
+        )
+
+
+def _stored_config(folder: Path) -> TrainConfig:
+    """Return the configuration of a folder that holds a run of one training."""
+    configs = stored_configs(folder)
+    if list(configs) != [""]:
+        raise ConfigError(
+            f"expected a run of one training in {folder}, got one of {', '.join(configs)}. Resume it with the same "
+            f"--seeds and --sweep."
+        )
+    return configs[""]

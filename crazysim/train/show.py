@@ -19,7 +19,7 @@ from crazysim.scene.software import film_size
 from crazysim.sim.sim import Sim
 from crazysim.sim.visualize import draw_points
 from crazysim.storage import reading, write_figure
-from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, as_tree, fly
+from crazysim.train.evaluation import EVALUATION_SEED, TERM_PREFIX, as_tree, fly_episodes
 from crazysim.train.networks import Policy
 from crazysim.train.training import CURVE
 
@@ -60,6 +60,39 @@ def plot_curve(curves: dict[str, list[dict[str, float]]], path: Path) -> None:
     _save(figure, path)
 
 
+def plot_spread(groups: dict[str, list[list[dict[str, float]]]], path: Path) -> None:
+    """Plot median, quartiles and extremes of success, error and reward of several trainings over environment steps.
+
+    Args:
+        groups: Contents of ``curve.json`` of the trainings of each group, such as all seeds of one learning rate. A
+            training that diverged ends earlier, and counts until then.
+        path: Image to write, such as a ``.png``.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    figure, axes = _figure(3)
+    for name, curves in groups.items():
+        longest = max(curves, key=len)
+        steps = np.array([point["env_steps"] for point in longest]) / 1e6
+        for axis, metric in zip(axes, ("success", "error", "reward"), strict=True):
+            values = np.full((len(curves), len(steps)), np.nan)
+            for row, curve in zip(values, curves, strict=True):
+                row[: len(curve)] = [point[metric] for point in curve]
+            known = ~np.isnan(values).all(axis=0)
+            values, shown = values[:, known] * (100 if metric == "success" else 1), steps[known]
+            low, first, median, third, high = np.nanquantile(values, (0, 0.25, 0.5, 0.75, 1), axis=0)
+            (line,) = axis.plot(shown, median, label=f"{name}, {len(curves)} seeds" if metric == "success" else None)
+            axis.fill_between(shown, first, third, color=line.get_color(), alpha=0.3, linewidth=0)
+            axis.fill_between(shown, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
+    axes[1].set_yscale("log")
+    for axis, label in zip(axes, ("success, %", "mean error", "reward in an episode"), strict=True):
+        axis.set(xlabel="environment steps, millions", ylabel=label)
+    axes[0].legend(fontsize="small")
+    axes[0].set_title("median, quartiles and extremes", fontsize=9)
+    _save(figure, path)
+
+
 def plot_episode(
     env: Env, policy: Callable[[Obs], Array], path: str | Path, key: Array | None = None
 ) -> dict[str, np.ndarray]:
@@ -77,8 +110,9 @@ def plot_episode(
     Raises:
         ImportError: If matplotlib is not installed.
     """
-    flight = jax.device_get(fly(env, as_tree(policy), jax.random.key(EVALUATION_SEED) if key is None else key))
-    terms, over = flight["terms"], flight["over"]
+    key = jax.random.key(EVALUATION_SEED) if key is None else key
+    flight = jax.device_get(fly_episodes(env, as_tree(policy), key))
+    terms, over = {name: x[:, 0] for name, x in flight["terms"].items()}, flight["over"]
     t = env.task.seconds * (1 + np.arange(len(over))) / len(over)
     figure, axes = _figure(3)
     for name, x in terms.items():

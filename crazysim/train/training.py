@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +36,13 @@ from crazysim.storage import replacing
 from crazysim.tables import POSITIVE, read_number
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, recipe_of
-from crazysim.train.evaluation import evaluate, outcome
+from crazysim.train.evaluation import evaluate_blocks, outcome
 from crazysim.train.export import describe
-from crazysim.train.networks import Policy
+from crazysim.train.hyperparameters import SWEEPABLE
+from crazysim.train.networks import Policies, Policy
+from crazysim.train.seeds import seed_of
 
-CHECKPOINT, POLICY, CURVE = "checkpoint.npz", "policy.npz", "curve.json"
+CHECKPOINT, POLICY, CURVE, TABLE = "checkpoint.npz", "policy.npz", "curve.json", "seeds.json"
 """Names of the files of a run."""
 
 CHECK_SEED = 0xC4EC
@@ -60,7 +64,7 @@ class TrainResult:
     policy: Policy
     """Kept policy: the latest evaluated one with a success on the check set within two standard errors of the best."""
     env: DroneEnv
-    """Environment of the evaluations, without automatic resets."""
+    """Environment of the evaluations of all trainings of the program, without automatic resets."""
 
 
 def train(
@@ -71,18 +75,40 @@ def train(
     log: Callable[[str], None] = print,
     progress: bool = True,
     checkpoint_every: float | None = None,
-    on_iteration: Callable[[int, dict[str, float]], None] | None = None,
+    on_iteration: Callable[[int, dict[str, Any]], None] | None = None,
 ) -> TrainResult:
-    """Train a policy and write checkpoint, learning curve and policy into a folder.
+    """Train a policy and write checkpoint, learning curve and policy into a folder: ``train_many`` with one training.
 
-    Every evaluation flies two sets of initial states that are not used for training. The success on the check set
-    decides which policy is kept; the held-out set is only used for the reported figures.
+    Raises:
+        ConfigError, DivergedError, KeyboardInterrupt, SystemExit: As ``train_many``.
+    """
+    settings = (resume, evaluation_worlds, log, progress, checkpoint_every, on_iteration)
+    return train_many({"": config}, folder, *settings)[""]
+
+
+def train_many(
+    configs: Mapping[str, TrainConfig],
+    folder: str | Path,
+    resume: bool = False,
+    evaluation_worlds: int = 1000,
+    log: Callable[[str], None] = print,
+    progress: bool = True,
+    checkpoint_every: float | None = None,
+    on_iteration: Callable[[int, dict[str, Any]], None] | None = None,
+) -> dict[str, TrainResult]:
+    """Train policies in one program and write their files.
+
+    Each training has a block of worlds, and its learning curve and policy in a folder of its own; the checkpoint in the
+    folder above is of all. Every evaluation flies two sets of initial states that are not used for training. The
+    success on the check set decides which policy is kept; the held-out set is only used for the reported figures.
 
     Each evaluation writes a checkpoint. So does an interrupt (Ctrl-C), or a ``SystemExit`` from a signal handler,
-    before it is raised again. A resumed run is bit for bit the same as an uninterrupted one on the same machine.
+    before it is raised again. A resumed run is bit for bit the same as an uninterrupted one on the same machine. A
+    training that diverges keeps its last policy, and the others go on.
 
     Args:
-        config: Configuration of the run.
+        configs: Configuration of each training, by the name of its folder; they differ in seed and ``SWEEPABLE``
+            hyperparameters at most. The name may be empty if there is one.
         folder: Folder of the run.
         resume: True to continue from the checkpoint in the folder.
         evaluation_worlds: Number of initial states of the held-out set, and of the check set.
@@ -90,13 +116,13 @@ def train(
         progress: True to show a progress bar, if tqdm is installed and stderr is a terminal.
         checkpoint_every: Time after which a checkpoint is written between evaluations as well, s; None for none.
         on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name;
-            names of metrics of an evaluation after it begin with ``"evaluation "``. Each call waits for the device.
-            None for none.
+            names of metrics of an evaluation after it begin with ``"evaluation "``. A metric is a number, or an array
+            of the trainings if there are several. Each call waits for the device. None for none.
 
     Raises:
         ConfigError: If the folder holds a run and ``resume`` is False, or the run has another configuration or is
             damaged; if files cannot be written.
-        DivergedError: If weights or losses become non-finite; the last checkpoint stays.
+        DivergedError: If weights or losses of all trainings become non-finite; the last checkpoint stays.
         KeyboardInterrupt, SystemExit: After the checkpoint of an interrupted run has been written.
     """
     folder = Path(folder)
@@ -105,38 +131,53 @@ def train(
     evaluation_worlds = positive_integer("evaluation_worlds", evaluation_worlds)
     if checkpoint_every is not None:
         checkpoint_every = read_number("checkpoint_every", checkpoint_every, POSITIVE)
-    meta = _meta(config)
-    stored, curve, code, seconds_before = _read_run(path, config) if resume else ({}, [], meta["code"], 0.0)
-    check_key = jax.random.key(CHECK_SEED)
+    metas = {name: _meta(config) for name, config in configs.items()}
+    code = next(iter(metas.values()))["code"]
+    stored, runs, stored_code, seconds_before = _read_run(path, configs) if resume else ({}, {}, code, 0.0)
+    trainings = [_Training(name, config, folder / name, metas[name]) for name, config in configs.items()]
+    for training in trainings if resume else ():
+        training.curve, training.diverged = list(runs[training.name]["curve"]), runs[training.name]["diverged"]
+    config, n = trainings[0].config, len(trainings)
     if path.exists() and not resume:
         raise ConfigError(
             f"expected a folder without a run, got {folder}; continue the run with --resume, or choose another folder "
             f"with --out"
         )
-    algorithm, hyperparameters = ALGORITHMS[config.algorithm], config.algorithm_config()
-    base = config.make_env(config.n_worlds, **config.practice_options())
+    algorithm = ALGORITHMS[config.algorithm]
+    hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
+    n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
+    base = config.make_env(n * config.n_worlds, **config.practice_options())
     env = base if algorithm is apg else AutoReset(base)
-    eval_env = config.make_env(evaluation_worlds)
-    key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    eval_env = config.make_env(n * evaluation_worlds)
+    check_key = jax.random.key(CHECK_SEED)
+    keys = jnp.stack([jax.random.fold_in(jax.random.key(training.config.seed), 1) for training in trainings])
     init = jax.jit(algorithm.init, static_argnums=(0, 1))
-    shapes = init.eval_shape(env, hyperparameters, key)
-    kept_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
-    _make_folder(folder)
+    shapes = init.eval_shape(env, hyperparameters, keys)
+    policy_shapes = jax.eval_shape(lambda learner: learner.as_policy(), shapes)
+    kept_shapes = [jax.eval_shape(lambda policies: seed_of(policies, 0), policy_shapes)] * n
+    for training in trainings:
+        _make_folder(training.folder)
 
     @keep_programs()
-    def start() -> tuple[Learner, Policy]:
+    def start() -> tuple[Learner, list[Policy]]:
         if resume:
             files = checkpoint.restore(path, stored, {"learner": shapes, "kept": kept_shapes})
             files = jax.device_put(files, base.sim.device)
             return files["learner"], files["kept"]
-        learner = init(env, hyperparameters, jax.device_put(key, base.sim.device))
+        learner = init(env, hyperparameters, jax.device_put(keys, base.sim.device))
         require_finite_start(base.task, learner.env)
-        return learner, learner.as_policy()
+        policies = jax.device_get(learner.as_policy())
+        return learner, [seed_of(policies, i) for i in range(n)]
+
+    def evaluate_all(policies: Policy, key: Array | None) -> list[dict[str, float]]:
+        """Return the metrics of the policy of each training. Arrays of the host are sliced without a compilation."""
+        policy = seed_of(policies, 0) if n == 1 else Policies(policies)
+        return evaluate_blocks(eval_env, jax.device_put(policy, base.sim.device), key, n)
 
     @keep_programs()
     def compile_evaluation() -> dict[str, Any]:
-        zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), kept_shapes)
-        evaluate(eval_env, jax.device_put(zeros, base.sim.device))
+        zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy_shapes)
+        evaluate_all(zeros, None)
         return describe(base)
 
     @keep_programs()
@@ -151,17 +192,21 @@ def train(
         evaluating = pool.submit(compile_evaluation)
         (learner, kept), description = starting.result(), evaluating.result()
         iterate, compile_s = compiling.result()
+    for training, policy in zip(trainings, kept, strict=True):
+        training.kept = policy
     done = saved = int(learner.iteration)
     saved_at = time.perf_counter()
-    steps_per_iteration = config.n_worlds * base.sim.n_drones * hyperparameters.n_steps
+    steps_per_iteration = config.n_worlds * base.sim.n_drones * n_steps
+    times = "" if n == 1 else f"{n} times "
     log(
-        f"{config.title} by {config.algorithm}, seed {config.seed}: {hyperparameters.iterations} iterations of "
-        f"{steps_per_iteration:,} steps in {config.n_worlds:,} worlds, {base.sim.control.value} commands, "
+        f"{config.title} by {config.algorithm}, {f'seed {config.seed}' if n == 1 else ', '.join(configs)}: "
+        f"{n_iterations} iterations of {times}{steps_per_iteration:,} steps in {times}{config.n_worlds:,} worlds, "
+        f"{base.sim.control.value} commands, "
         f"{base.sim.explain().splitlines()[0]}" + (f"; continues after iteration {done}" if done else "")
     )
-    if code != meta["code"]:
+    if stored_code != code:
         log("the file of the task has changed since the checkpoint was written; it is used as it is now")
-    if done >= hyperparameters.iterations:
+    if done >= n_iterations:
         log(f"nothing is left to train after {done} iterations; continue with more: --iterations {2 * done or 100}")
 
     def seconds() -> float:
@@ -170,60 +215,63 @@ def train(
     def save(learner: Learner) -> None:
         """Write the checkpoint."""
         nonlocal saved, saved_at
-        checkpoint.save(path, {"learner": learner, "kept": kept}, meta | {"curve": curve, "seconds": seconds()})
+        runs = {x.name: x.meta | {"curve": x.curve, "diverged": x.diverged} for x in trainings}
+        meta = {"crazysim": crazysim.__version__, "code": code, "runs": runs, "seconds": seconds()}
+        checkpoint.save(path, {"learner": learner, "kept": [training.kept for training in trainings]}, meta)
         saved, saved_at = int(learner.iteration), time.perf_counter()
 
-    def record(learner: Learner, interrupted: bool = False) -> dict[str, Any]:
-        """Evaluate the policy, keep it if none was clearly better, write all files, and return the point."""
-        nonlocal kept
-        iteration, policy = int(learner.iteration), learner.as_policy()
-        require_finite(finite, iteration)
-        metrics, check = evaluate(eval_env, policy), evaluate(eval_env, policy, check_key)["success"]
-        curve[:] = [earlier for earlier in curve if earlier["iteration"] < iteration]
-        point = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds(), **metrics}
-        point |= {"compile_seconds": compile_s, "check": check}
-        best_check = max((earlier["check"] for earlier in curve if earlier["kept"]), default=0.0)
-        point["kept"] = check >= least_kept_success(best_check, evaluation_worlds)
-        best = policy if point["kept"] else kept
-        checkpoint.save(folder / POLICY, best, meta | description)
-        with replacing(folder / CURVE) as file:
-            file.write(json.dumps([*curve, point], indent=1).encode())
-        # An uninterrupted run makes no evaluation here, so this one must not influence the resumed run.
-        kept, point["kept"] = (kept, False) if interrupted else (best, point["kept"])
-        curve.append(point)
+    def record(learner: Learner, interrupted: bool = False) -> list[dict[str, Any]]:
+        """Evaluate the policies, keep each if none was clearly better, write all files, and return the points."""
+        iteration, policies = int(learner.iteration), jax.device_get(learner.as_policy())
+        stop_diverged(finite, iteration)
+        metrics, checks = evaluate_all(policies, None), evaluate_all(policies, check_key)
+        progress = {"iteration": iteration, "env_steps": iteration * steps_per_iteration, "seconds": seconds()}
+        for i, training in enumerate(trainings):
+            if training.diverged is None:
+                point = progress | metrics[i] | {"compile_seconds": compile_s, "check": checks[i]["success"]}
+                training.record(point, seed_of(policies, i), evaluation_worlds, description, interrupted)
+        if n > 1:
+            write_table(folder, [training.row for training in trainings])
         save(learner)
-        return point
+        return [training.curve[-1] for training in trainings]
 
-    def require_finite(finite: Array | bool, iteration: int) -> None:
-        if not finite:
+    def stop_diverged(finite: Any, iteration: int) -> None:
+        """Mark trainings that are no longer finite; raise an error if none is."""
+        for training, is_finite in zip(trainings, np.asarray(finite), strict=True):
+            if is_finite or training.diverged is not None:
+                continue
+            training.diverged = iteration
+            if n > 1:
+                log(f"{training.name} diverged: NaN or infinity in iteration {iteration}; the others go on")
+        if all(training.diverged is not None for training in trainings):
             raise DivergedError(
                 f"expected finite weights and losses, got NaN or infinity in iteration {iteration} of {config.title} "
                 f"by {config.algorithm}; {path} is of iteration {saved}, {POLICY} of "
-                f"iteration {kept_point(curve)['iteration']}. Use a smaller learning_rate or max_grad_norm, with "
-                f"another --out."
+                f"iteration {kept_point(trainings[0].curve)['iteration']}. Use a smaller learning_rate or "
+                f"max_grad_norm, with another --out."
             )
 
-    finite: Array | bool = True
+    finite: Any = np.full(n, True)
     metrics: dict[str, Array] = {}
     if not resume:
         record(learner)
     every = recipe_of(config.task, config.algorithm).evaluate_every
     try:
-        with _bar(hyperparameters.iterations, done, progress) as show:
-            for i in range(done, hyperparameters.iterations):
+        with _bar(n_iterations, done, progress) as show:
+            for i in range(done, n_iterations):
                 learner, metrics = iterate(learner)
-                require_finite(finite, i)  # checks the previous iteration while this one runs
+                stop_diverged(finite, i)  # checks the previous iteration while this one runs
                 finite = metrics["finite"]
                 show(metrics if i % 5 == 0 else None)
-                point = None
-                if (i + 1) % every == 0 and i + 1 < hyperparameters.iterations:
-                    point = record(learner)
-                    show(point, 0)
+                points = None
+                if (i + 1) % every == 0 and i + 1 < n_iterations:
+                    points = record(learner)
+                    show({name: [point[name] for point in points] for name in ("success", "error", "reward")}, 0)
                 elif checkpoint_every is not None and time.perf_counter() - saved_at > checkpoint_every:
-                    require_finite(finite, i + 1)
+                    stop_diverged(finite, i + 1)
                     save(learner)
-                if on_iteration is not None and i + 1 < hyperparameters.iterations:
-                    on_iteration(i + 1, _numbers(metrics, point))
+                if on_iteration is not None and i + 1 < n_iterations:
+                    on_iteration(i + 1, _numbers(metrics, points))
     except (KeyboardInterrupt, SystemExit):
         jax.block_until_ready(learner)
         record(learner, interrupted=True)
@@ -231,29 +279,101 @@ def train(
         raise
     last = record(learner)
     if on_iteration is not None and metrics:
-        on_iteration(hyperparameters.iterations, _numbers(metrics, last))
-    best = kept_point(curve)
-    if best is not last:
-        log(
-            f"kept the policy of iteration {best['iteration']}: later ones succeeded less often on "
-            f"{evaluation_worlds:,} other starts, by more than two standard errors"
-        )
-    point = best | {name: last[name] for name in ("env_steps", "seconds", "compile_seconds")}
+        on_iteration(n_iterations, _numbers(metrics, last))
     judged = f"error below {base.task.tolerance:g} {base.task.unit} for the last {base.task.hold:g} s"
     if type(base.task).succeeded is not Task.succeeded:
         judged = "as the task judges it"
-    log(
-        f"success {point['success']:.1%} of {evaluation_worlds:,} held-out starts ({judged}), "
-        f"{outcome(point, base.task.unit)}; "
-        f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
-    )
-    return TrainResult(folder, point, kept, eval_env)
+    results = {}
+    for training in trainings:
+        best, latest, name = kept_point(training.curve), training.curve[-1], f"{training.name}: " * (n > 1)
+        if best is not latest:
+            log(
+                f"{name}kept the policy of iteration {best['iteration']}: later ones succeeded less often on "
+                f"{evaluation_worlds:,} other starts, by more than two standard errors"
+            )
+        point = best | {name: latest[name] for name in ("env_steps", "seconds", "compile_seconds")}
+        log(
+            f"{name}success {point['success']:.1%} of {evaluation_worlds:,} held-out starts ({judged}), "
+            f"{outcome(point, base.task.unit)}; "
+            f"{point['env_steps']:,} steps in {point['seconds']:.1f} s, including {compile_s:.1f} s of compilation"
+        )
+        policy = jax.device_put(training.kept, base.sim.device)
+        results[training.name] = TrainResult(training.folder, point, policy, eval_env)
+    return results
 
 
-def _numbers(metrics: dict[str, Array], point: dict[str, Any] | None) -> dict[str, float]:
-    """Return the metrics of an iteration, and of the evaluation after it if there was one, as floats."""
-    numbers = {name: float(x) for name, x in jax.device_get(metrics).items() if name != "finite"}
-    return numbers | {f"evaluation {name}": float(x) for name, x in (point or {}).items() if name != "iteration"}
+@dataclass
+class _Training:
+    """One of the trainings of a program."""
+
+    name: str
+    """Name in messages and of its folder; empty if it is alone."""
+    config: TrainConfig
+    """Its configuration."""
+    folder: Path
+    """Folder of its learning curve and policy."""
+    meta: dict[str, Any]
+    """Metadata of its files."""
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    """Its evaluations."""
+    kept: Any = None
+    """The kept policy."""
+    diverged: int | None = None
+    """Iteration in which it became non-finite; None if it did not."""
+
+    def record(
+        self, point: dict[str, Any], policy: Policy, n_starts: int, description: dict[str, Any], interrupted: bool
+    ) -> None:
+        """Add an evaluation to the curve, keep the policy if none was clearly better, and write both."""
+        self.curve[:] = [earlier for earlier in self.curve if earlier["iteration"] < point["iteration"]]
+        best_check = max((earlier["check"] for earlier in self.curve if earlier["kept"]), default=0.0)
+        point["kept"] = point["check"] >= least_kept_success(best_check, n_starts)
+        best = policy if point["kept"] else self.kept
+        checkpoint.save(self.folder / POLICY, best, self.meta | description)
+        with replacing(self.folder / CURVE) as file:
+            file.write(json.dumps([*self.curve, point], indent=1).encode())
+        # An uninterrupted run makes no evaluation here, so this one must not influence the resumed run.
+        self.kept, point["kept"] = (self.kept, False) if interrupted else (best, point["kept"])
+        self.curve.append(point)
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """Its row in the table of all trainings: the settings that may differ, and its latest kept evaluation."""
+        best, latest = kept_point(self.curve), self.curve[-1]
+        swept = {name: self.config.config[name] for name in SWEEPABLE if name in self.config.config}
+        names = ("success", "crashed", "error", "reward", "check", "iteration")
+        return (
+            {"name": self.name, "seed": self.config.seed}
+            | swept
+            | {name: best[name] for name in names}
+            | {name: latest[name] for name in ("env_steps", "seconds")}
+            | {"diverged": self.diverged}
+        )
+
+
+def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
+    """Write the table of the trainings of a program as JSON and CSV, with empty cells where a value is missing."""
+    rows = [{name: None if x != x else x for name, x in row.items()} for row in rows]
+    with replacing(folder / TABLE) as file:
+        file.write(json.dumps(rows, indent=1).encode())
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with replacing((folder / TABLE).with_suffix(".csv")) as file:
+        file.write(text.getvalue().encode())
+
+
+def _numbers(metrics: dict[str, Array], points: list[dict[str, Any]] | None) -> dict[str, Any]:
+    """Return the metrics of an iteration, and of the evaluations after it if there were any.
+
+    They are floats, or arrays of several trainings.
+    """
+    numbers = {name: x for name, x in jax.device_get(metrics).items() if name != "finite"}
+    for name in points[0] if points else ():
+        if name != "iteration":
+            numbers[f"evaluation {name}"] = np.array([float(point[name]) for point in points])
+    return {name: float(x[0]) if len(x) == 1 else x for name, x in numbers.items()}
 
 
 def least_kept_success(success: float, n_worlds: int) -> float:
@@ -331,8 +451,8 @@ def _make_folder(folder: Path) -> None:
         raise ConfigError(f"expected a folder for the run, got {str(folder)!r}: {error}. Use another --out.") from error
 
 
-def stored_config(folder: str | Path) -> TrainConfig:
-    """Return the configuration in the checkpoint of a folder.
+def stored_configs(folder: str | Path) -> dict[str, TrainConfig]:
+    """Return the configurations of the trainings in the checkpoint of a folder, by name.
 
     Raises:
         ConfigError: If there is no intact checkpoint.
@@ -340,29 +460,39 @@ def stored_config(folder: str | Path) -> TrainConfig:
     path = Path(folder) / CHECKPOINT
     meta = checkpoint.read(path)[1]
     with checkpoint.reading_checkpoint(path):
-        return TrainConfig(**meta["settings"])
+        return {name: TrainConfig(**run["settings"]) for name, run in meta["runs"].items()}
 
 
-def _read_run(path: Path, config: TrainConfig) -> tuple[dict[str, Any], list[dict[str, Any]], str, float]:
-    """Return the arrays of a checkpoint, the learning curve until then, the hash of the task's code, and seconds.
+def _read_run(
+    path: Path, configs: Mapping[str, TrainConfig]
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str, float]:
+    """Return the arrays of a checkpoint, what it says of each training, the hash of the task's code, and seconds.
 
     Raises:
         ConfigError: If there is no intact checkpoint, or it belongs to a run with another configuration.
     """
     arrays, meta = checkpoint.read(path)
     with checkpoint.reading_checkpoint(path):
-        _require_same(path, meta, config)
-        return arrays, list(meta["curve"]), meta["code"], float(meta["seconds"])
+        if meta["crazysim"] != crazysim.__version__:
+            raise ConfigError(
+                f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a "
+                f"new run in another folder with --out"
+            )
+        runs = meta["runs"]
+        if list(runs) != list(configs):
+            raise ConfigError(
+                f"expected the seeds and the sweep of {path}, {', '.join(runs) or 'none'}, got "
+                f"{', '.join(configs) or 'none'}; resume with the same ones, or start a new run in another folder with "
+                f"--out"
+            )
+        for name, config in configs.items():
+            _require_same(path, runs[name]["settings"], config)
+        return arrays, runs, meta["code"], float(meta["seconds"])
 
 
-def _require_same(path: Path, meta: dict[str, Any], config: TrainConfig) -> None:
-    """Check that a checkpoint belongs to a run with this configuration, except for settings that may change."""
-    if meta["crazysim"] != crazysim.__version__:
-        raise ConfigError(
-            f"expected a checkpoint of crazysim {crazysim.__version__}, got {path} of {meta['crazysim']}; start a new "
-            f"run in another folder with --out"
-        )
-    stored, given = (_settings(settings) for settings in (meta["settings"], _meta(config)["settings"]))
+def _require_same(path: Path, settings: dict[str, Any], config: TrainConfig) -> None:
+    """Check that a stored run has this configuration, except for settings that may change."""
+    stored, given = (_settings(settings) for settings in (settings, _meta(config)["settings"]))
     for name in {**stored, **given}:
         if stored.get(name, "its default") != given.get(name, "its default"):
             alterable = [x for x in ALTERABLE_HYPERPARAMETERS if x in config.config]
@@ -395,7 +525,7 @@ def _bar(total: int, done: int, wanted: bool) -> Iterator[Callable[..., None]]:
         def show(metrics: dict[str, Any] | None, iterations: int = 1) -> None:
             if metrics is not None:
                 known = {k: metrics[k] for k in ("success", "error", "reward") if k in metrics}
-                shown.update({k: f"{float(np.asarray(v)):.3f}" for k, v in known.items()})
+                shown.update({k: f"{np.median(v):.3f}" for k, v in known.items()})
                 bar.set_postfix(shown, refresh=False)
             bar.update(iterations)
 

@@ -24,11 +24,12 @@ def test_the_reward_rises(task):
     algorithm, hyperparameters = ALGORITHMS[name], config.algorithm_config()
     env = config.make_env(**config.practice_options())
     env = env if algorithm is apg else AutoReset(env)
-    first = jax.jit(algorithm.init, static_argnums=(0, 1))(env, hyperparameters, jax.random.key(0))
-    kept = {x: getattr(first, x) for x in ("policy", "log_std") if hasattr(first, x)}
+    first = jax.jit(algorithm.init, static_argnums=(0, 1))(env, (hyperparameters,), jax.random.key(0)[None])
+    kept = {x: getattr(first.agents, x) for x in ("policy", "log_std") if hasattr(first.agents, x)}
     learner, untrained, gains = first, first, []
     for _ in range(hyperparameters.iterations):
-        learner, metrics = algorithm.iterate(learner, env, hyperparameters)
-        untrained, others = algorithm.iterate(untrained.replace(**kept), env, hyperparameters)
-        gains.append(float(metrics["reward"] - others["reward"]))
+        learner, metrics = algorithm.iterate(learner, env, (hyperparameters,))
+        untrained = untrained.replace(agents=untrained.agents.replace(**kept))
+        untrained, others = algorithm.iterate(untrained, env, (hyperparameters,))
+        gains.append(float(metrics["reward"][0] - others["reward"][0]))
     assert np.mean(gains[-10:]) > 2 * np.std(gains[-10:], ddof=1) / np.sqrt(10)

@@ -31,7 +31,9 @@ from crazysim.train import config as configs
 from crazysim.train import training as runs
 from crazysim.train.config import TrainConfig
 from crazysim.train.evaluation import evaluate, outcome
+from crazysim.train.networks import Policies
 from crazysim.train.runs import run
+from crazysim.train.seeds import seed_of, stack_rates
 from crazysim.train.show import plot_episode, read_curve
 from crazysim.train.training import CHECKPOINT, POLICY, load_policy, train
 
@@ -443,13 +445,13 @@ def test_evaluation_uses_tolerance_and_hold_of_the_task():
 
 def test_advantages_are_sums_of_discounted_errors(rng):
     """Generalised advantage: sum of (gamma lambda)^k delta_(t+k) up to the end of the episode, in NumPy."""
-    config = ppo.Config(discount=0.9, gae_lambda=0.7)
+    rates = stack_rates((ppo.Config(discount=0.9, gae_lambda=0.7),))
     reward, value = rng.normal(size=(2, 6, 3, 1)).astype(np.float32)
     last = rng.normal(size=(3, 1)).astype(np.float32)
     over = np.zeros((6, 3, 1), bool)
     over[2, 0], over[5, 1] = True, True
     sample = ppo.Sample(*(jnp.zeros(0),) * 3, value, reward, over)
-    advantages, returns = jax.jit(ppo._advantages, static_argnums=2)(sample, last, config)
+    advantages, returns = jax.jit(ppo._advantages)(sample, last, seed_of(rates, 0))
     after = np.concatenate([value[1:], last[None]])
     delta = reward + 0.9 * after * ~over - value
     expected = np.zeros_like(delta)
@@ -466,16 +468,20 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
     """The reward of a truncated step contains the discounted value of the final observation; no other step does."""
     env = AutoReset(make("hover", 4, seconds=0.06, engine="interpret"))  # three steps an episode
     config = ppo.Config(n_steps=4, minibatches=4, discount=0.5, hidden=(8,))
-    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
-    _, samples, _, _ = jax.jit(ppo._collect, static_argnums=(1, 2))(learner, env, config, jax.random.key(1))
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
+    collect = jax.jit(ppo._collect, static_argnums=(2, 3))
+    _, samples, _, _ = collect(
+        learner.agents, learner.env, env, config, stack_rates((config,)), jax.random.key(1)[None]
+    )
+    agent = seed_of(learner.agents, 0)
     state, step = learner.env, jax.jit(env.step)
     n_truncated = 0
     for k in range(4):
-        state = step(state, samples.action[k])
-        value = ppo._value(learner, learner.stats.normalize(flatten(state.info["final_obs"])))
+        state = step(state, samples.action[k, 0])
+        value = ppo._value(agent, agent.stats.normalize(flatten(state.info["final_obs"])))
         truncated = np.asarray(state.truncated & ~state.terminated)[:, None]
         n_truncated += truncated.sum()
-        np.testing.assert_allclose(samples.reward[k], state.reward + 0.5 * truncated * value, atol=1e-5)
+        np.testing.assert_allclose(samples.reward[k, 0], state.reward + 0.5 * truncated * value, atol=1e-5)
         assert np.abs(value).min() > 1e-3
     assert n_truncated == 4
 
@@ -483,13 +489,15 @@ def test_a_truncated_episode_is_credited_with_the_value_of_its_last_state():
 def test_values_stay_when_the_returns_that_scale_them_change(rng):
     """The last layer takes the change, so that the network predicts the same returns in other units."""
     env = AutoReset(make("hover", 4, engine="interpret"))
-    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, ppo.Config(minibatches=4, hidden=(8,)), jax.random.key(0))
-    obs = jnp.asarray(rng.normal(size=(5, learner.stats.mean.shape[0])), jnp.float32)
-    before = ppo._value(learner, obs)
-    returns = learner.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
-    after = learner.replace(value=ppo._rescale_value(learner.value, learner.returns, returns), returns=returns)
+    config = ppo.Config(minibatches=4, hidden=(8,))
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
+    agent = seed_of(learner.agents, 0)
+    obs = jnp.asarray(rng.normal(size=(5, agent.stats.mean.shape[0])), jnp.float32)
+    before = ppo._value(agent, obs)
+    returns = agent.returns.update(jnp.asarray(rng.normal(30.0, 7.0, (1000, 1)), jnp.float32))
+    after = agent.replace(value=ppo._rescale_value(agent.value, agent.returns, returns), returns=returns)
     np.testing.assert_allclose(ppo._value(after, obs), before, atol=30 * 1e-6)
-    assert np.abs(ppo._value(learner.replace(returns=returns), obs) - before).min() > 1
+    assert np.abs(ppo._value(agent.replace(returns=returns), obs) - before).min() > 1
     np.testing.assert_allclose(ppo._scale(returns), 7.0, rtol=0.1)
 
 
@@ -506,32 +514,33 @@ def test_ppo_finds_the_action_that_pays():
     base = make("hover", 128, freq=500, seconds=0.1)
     env = AutoReset(DroneEnv(base.sim, Pays(seconds=0.1), freq=500))
     config = ppo.Config(iterations=30, n_steps=16, minibatches=4, hidden=(16,), init_std=0.3, discount=0.5)
-    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
-    assert np.abs(learner.as_policy()(learner.env.obs)).max() < 0.1
+    learner = jax.jit(ppo.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
+    assert np.abs(Policies(learner.as_policy())(learner.env.obs)).max() < 0.1
     for _ in range(config.iterations):
-        learner, metrics = ppo.iterate(learner, env, config)
-    action = np.asarray(learner.as_policy()(learner.env.obs))
+        learner, metrics = ppo.iterate(learner, env, (config,))
+    action = np.asarray(Policies(learner.as_policy())(learner.env.obs))
     assert metrics["finite"]
-    _, metrics = ppo.iterate(learner.replace(log_std=learner.log_std + jnp.nan), env, config)
+    lost = learner.agents.replace(log_std=learner.agents.log_std + jnp.nan)
+    _, metrics = ppo.iterate(learner.replace(agents=lost), env, (config,))
     assert not metrics["finite"]
     assert np.abs(action.mean(axis=(0, 1)) - 0.5).max() < 0.1
-    assert float(jnp.exp(learner.log_std).max()) < 0.3
+    assert float(jnp.exp(learner.agents.log_std).max()) < 0.3
 
 
 def test_analytic_gradients_follow_the_eight():
     """Thirty updates with 32 worlds more than halve the distance from the trajectory."""
     config = apg.Config(iterations=30)
     env = make("track", 32, engine="plain", dynamics="so_rpy")
-    learner = jax.jit(apg.init, static_argnums=(0, 1))(env, config, jax.random.key(0))
+    learner = jax.jit(apg.init, static_argnums=(0, 1))(env, (config,), jax.random.key(0)[None])
     errors = []
     for _ in range(config.iterations):
-        learner, metrics = apg.iterate(learner, env, config)
-        errors.append(float(metrics["error"]))
-        assert np.isfinite(float(metrics["gradient"]))
+        learner, metrics = apg.iterate(learner, env, (config,))
+        errors.append(float(metrics["error"][0]))
+        assert np.isfinite(float(metrics["gradient"][0]))
         assert metrics["finite"]
     assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
-    broken = jax.tree.map(lambda x: x + jnp.inf, learner.policy)
-    assert not apg.iterate(learner.replace(policy=broken), env, config)[1]["finite"]
+    broken = learner.agents.replace(policy=jax.tree.map(lambda x: x + jnp.inf, learner.agents.policy))
+    assert not apg.iterate(learner.replace(agents=broken), env, (config,))[1]["finite"]
 
 
 def test_the_command_line_trains_evaluates_and_exports(tmp_path, capsys):

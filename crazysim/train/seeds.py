@@ -1,0 +1,55 @@
+"""Trainings of several seeds in one program: blocks of worlds, one for each seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from crazysim.pytree import float_dtype
+from crazysim.train.hyperparameters import SWEEPABLE
+
+T = TypeVar("T")
+Rates = dict[str, Array]
+"""Hyperparameters of ``SWEEPABLE`` by name, of one seed, (), or of all, (n_seeds,)."""
+
+
+def stack_rates(configs: Sequence[Any]) -> Rates:
+    """Return the hyperparameters that may differ between seeds. (n_seeds,) each"""
+    names = [name for name in SWEEPABLE if hasattr(configs[0], name)]
+    return {name: jnp.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
+
+
+def split_blocks(tree: T, n_seeds: int) -> T:
+    """Return arrays of all worlds divided into blocks. (n_worlds, ...) -> (n_seeds, n_worlds / n_seeds, ...) each"""
+    return jax.tree.map(lambda x: x.reshape(n_seeds, -1, *x.shape[1:]), tree)
+
+
+def join_blocks(tree: T) -> T:
+    """Return arrays of blocks of worlds joined. (n_seeds, n_worlds / n_seeds, ...) -> (n_worlds, ...) each"""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)
+
+
+def for_each_seed(fn: Callable[..., Any], *args: Any, axes: tuple[int, ...] | int = 0) -> Any:
+    """Return the results of a function of one seed for all seeds, stacked along their first axis.
+
+    A single seed is computed without ``jax.vmap``, so that its program is that of the function itself.
+
+    Args:
+        fn: Function of the arrays of one seed.
+        args: Trees of arrays that are stacked along an axis of seeds.
+        axes: That axis, of all arguments or of each.
+    """
+    axes = (axes,) * len(args) if isinstance(axes, int) else axes
+    if jax.tree.leaves(args[0])[0].shape[axes[0]] > 1:
+        return jax.vmap(fn, in_axes=axes)(*args)
+    first = [jax.tree.map(lambda x, axis=axis: x.squeeze(axis), arg) for arg, axis in zip(args, axes, strict=True)]
+    return jax.tree.map(lambda x: jnp.expand_dims(x, 0), fn(*first))
+
+
+def seed_of(tree: T, i: int) -> T:
+    """Return the arrays of one seed. (n_seeds, ...) -> (...) each"""
+    return jax.tree.map(lambda x: x[i], tree)

@@ -1,0 +1,187 @@
+"""Several seeds in one program: each is trained as it is alone."""
+
+import csv
+import functools
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from crazysim import ConfigError
+from crazysim.__main__ import main
+from crazysim.envs import AutoReset, make
+from crazysim.train import apg, checkpoint, ppo
+from crazysim.train import config as configs
+from crazysim.train import training as trainings
+from crazysim.train.evaluation import evaluate, evaluate_blocks
+from crazysim.train.networks import Policies
+from crazysim.train.runs import run_many, variants_of
+from crazysim.train.seeds import seed_of
+from crazysim.train.show import read_curve
+from crazysim.train.training import load_policy
+
+SECONDS = {"seconds": 0.2}
+PPO = [
+    ppo.Config(iterations=3, n_steps=12, minibatches=2, epochs=2, hidden=(8,), learning_rate=rate, discount=discount)
+    for rate, discount in ((1e-3, 0.98), (5e-3, 0.9))
+]
+APG = [apg.Config(iterations=3, n_steps=4, hidden=(8,), learning_rate=rate) for rate in (1e-3, 5e-3)]
+
+
+def worlds_of(state, i):
+    """Observations of a block of four worlds."""
+    return {name: np.asarray(x[4 * i : 4 * i + 4]) for name, x in state.obs.items()}
+
+
+@pytest.mark.long("compiles a training of one seed, and of two")
+@pytest.mark.parametrize(("algorithm", "hyperparameters"), [(ppo, PPO), (apg, APG)], ids=["ppo", "apg"])
+def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters):
+    """Initial states are equal; agents, metrics and worlds agree to rounding after three iterations, with episodes that
+    end in between. Hyperparameters of the seeds differ."""
+    wrap = AutoReset if algorithm is ppo else lambda env: env
+    one, both = (wrap(make("hover", n, randomize="crazyflie", **SECONDS)) for n in (4, 8))
+    keys = jax.random.split(jax.random.key(3), 2)
+    init = jax.jit(algorithm.init, static_argnums=(0, 1))
+    many, alone = (
+        init(both, tuple(hyperparameters), keys),
+        [init(one, (hyperparameters[i],), keys[i : i + 1]) for i in range(2)],
+    )
+    for i in range(2):
+        for name, x in worlds_of(alone[i].env, 0).items():
+            np.testing.assert_array_equal(worlds_of(many.env, i)[name], x, err_msg=name)
+    assert np.any(worlds_of(many.env, 0)["pos"] != worlds_of(many.env, 1)["pos"])
+    for _ in range(3):
+        many, metrics = algorithm.iterate(many, both, tuple(hyperparameters))
+        for i in range(2):
+            alone[i], others = algorithm.iterate(alone[i], one, (hyperparameters[i],))
+            for name in metrics:
+                np.testing.assert_allclose(metrics[name][i], others[name][0], rtol=1e-3, atol=1e-5, err_msg=name)
+    for i in range(2):
+        mine, others = (jax.tree.leaves(seed_of(x.agents, j)) for x, j in ((many, i), (alone[i], 0)))
+        for x, y in zip(mine, others, strict=True):
+            if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+                x, y = map(jax.random.key_data, (x, y))
+            np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
+        for name, x in worlds_of(alone[i].env, 0).items():
+            np.testing.assert_allclose(worlds_of(many.env, i)[name], x, rtol=1e-3, atol=1e-3, err_msg=name)
+    policies = many.as_policy()
+    found = evaluate_blocks(make("hover", 16, **SECONDS), Policies(policies), n_blocks=2)
+    for i in range(2):
+        expected = evaluate(make("hover", 8, **SECONDS), seed_of(policies, i))
+        for name, x in expected.items():
+            np.testing.assert_allclose(found[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_keys_must_divide_the_worlds():
+    with pytest.raises(ConfigError, match=r"expected one key, or keys .* 4 worlds, got keys of shape \(3,\)"):
+        make("hover", 4).reset(jax.random.split(jax.random.key(0), 3))
+
+
+SMALL = {"n_steps": 4, "minibatches": 1, "epochs": 1, "hidden": (8,), "iterations": 3}
+
+
+def trained(folder, log=lambda line: None, **settings):
+    """Train in 4 worlds for each seed."""
+    given = {"n_worlds": 4, "options": {"seconds": 0.2}, "config": SMALL} | settings
+    return run_many("hover", folder, evaluation_worlds=8, log=log, progress=False, **given)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_environments():
+    """Let runs with equal options share environments, and with them all that was compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(configs, "make", functools.cache(make))
+        patch.setattr(trainings, "AutoReset", functools.cache(AutoReset))
+        yield
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """Return a run of two seeds with two learning rates, one of which is too large, and its lines."""
+    folder, lines = tmp_path_factory.mktemp("run") / "swept", []
+    return trained(folder, lines.append, seeds=(3, 5), sweep={"learning_rate": [1e-3, 1e38]}), folder, lines
+
+
+@pytest.mark.long("compiles a training of four seeds")
+def test_each_training_has_a_policy_and_a_row_and_one_that_diverges_ends_alone(swept):
+    results, folder, lines = swept
+    names = [f"learning_rate-{rate}-seed-{seed}" for rate in (0.001, 1e38) for seed in (3, 5)]
+    assert list(results) == names
+    table = json.loads((folder / "seeds.json").read_text())
+    with (folder / "seeds.csv").open(newline="") as file:
+        cells = list(csv.DictReader(file))
+    for name, row, texts in zip(names, table, cells, strict=True):
+        policy, config, _ = load_policy(folder / name)
+        assert (config.seed, config.config["learning_rate"]) == (row["seed"], row["learning_rate"])
+        assert (row["name"], texts["name"], float(texts["success"])) == (name, name, row["success"])
+        assert row["success"] == results[name].metrics["success"]
+        curve = read_curve(folder / name)
+        lost = config.config["learning_rate"] > 1
+        assert [point["iteration"] for point in curve] == ([0] if lost else [0, 3])
+        assert (row["diverged"] is not None) == (texts["diverged"] != "") == lost
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(policy))
+        assert sum(line.startswith(f"{name} diverged: NaN or infinity in iteration") for line in lines) == lost
+    first = [load_policy(folder / name)[0].layers[0][0] for name in names]
+    assert np.any(first[0] != first[1])
+    assert (folder / "curve.png").stat().st_size > 5000
+
+
+@pytest.mark.long("compiles a training of two seeds, and two of one")
+def test_a_seed_of_a_run_is_that_of_a_run_alone_and_resumes(tmp_path, monkeypatch):
+    """An interrupted run resumes bit for bit; its learning curves are those of runs of one seed, to rounding."""
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    seen = []
+    trained(whole, seeds=range(2), on_iteration=lambda *call: seen.append(call))
+    assert [i for i, _ in seen] == [1, 2, 3]
+    assert seen[0][1]["reward"].shape == seen[-1][1]["evaluation success"].shape == (2,)
+
+    def interrupt(i, _):
+        if i == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(cut, seeds=range(2), on_iteration=interrupt)
+    with pytest.raises(
+        ConfigError, match=r"expected the seeds and the sweep of .*, seed-0, seed-1, got seed-1; resume"
+    ):
+        trained(cut, seeds=[1], resume=True)
+    assert main(["train", "hover", "--resume", "--out", str(cut)]) == 2
+    trained(cut, seeds=range(2), resume=True)
+    mine, others = (checkpoint.read(folder / "checkpoint.npz")[0] for folder in (cut, whole))
+    assert mine.keys() == others.keys()
+    for name, x in mine.items():
+        np.testing.assert_array_equal(x, others[name], err_msg=name)
+    alone = tmp_path / "alone"
+    trained(alone, seeds=[1])
+    for mine, other in zip(read_curve(whole / "seed-1"), read_curve(alone / "seed-1"), strict=True):
+        for name in ("success", "error", "reward", "check"):
+            np.testing.assert_allclose(mine[name], other[name], rtol=1e-3, err_msg=name)
+
+
+def test_wrong_seeds_and_sweeps_are_refused(capsys, tmp_path):
+    out = ["--out", str(tmp_path / "out")]
+    for texts, message in {
+        ("--seeds", "8:0"): "expected FIRST:END with FIRST below END, .*got '8:0'. Use for example 0:8",
+        ("--seeds", "0:8:2"): "got '0:8:2'",
+        ("--seeds", "1,2,1"): "each once, got '1,2,1'",
+        ("--seeds", "0:2", "--seed", "1"): "expected --seed or --seeds, got both",
+        ("--sweep", "learning_rate=fast"): r"expected NAME=VALUE,VALUE with numbers to sweep, got 'learning_rate=fast'",
+        ("--sweep", "hidden=8,16"): "expected hyperparameters to sweep among learning_rate, .*, got hidden, on which",
+        ("--sweep", "clip=0.1,0.1"): r"expected at least one value of clip, and each once, got \[0\.1, 0\.1\]",
+        ("--sweep", "clip=0.1", "--config", "clip=0.2"): "expected clip to be swept or given, got both",
+        ("--sweep", "discount=0.9,1.1"): "expected discount as a number from 0 to 1, got 1.1",
+    }.items():
+        try:
+            status = main(["train", "hover", *out, *texts])
+        except SystemExit as error:  # of argparse
+            status = error.code
+        assert status == 2
+        error = " ".join(capsys.readouterr().err.split())
+        assert re.search(message, error), error
+    with pytest.raises(ConfigError, match="expected settings among algorithm, n_worlds, options, config, got seed"):
+        run_many("hover", tmp_path / "out", seed=1)
+    with pytest.raises(ConfigError, match="expected at least one value of seeds, and each once, got none"):
+        variants_of([], {}, {})
+    assert not (tmp_path / "out").exists()
