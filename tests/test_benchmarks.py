@@ -390,8 +390,8 @@ def test_gradients_are_timed_beside_the_steps_that_they_go_through(run):
 def test_the_runs_of_any_task_are_below_the_folder_that_was_named(benchmarks, tmp_path):
     train = importlib.import_module("train")
     places = ["hover", "tasks/mine.py:Mine", "../mine.py:Mine", f"{tmp_path}/mine.py:Mine"]
-    folders = [train.folder_of(tmp_path / "out", place, 0, "cpu") for place in places]
-    others = train.folder_of(tmp_path / "out", "hover", 0, "cpu", "--set", "drone=a/b.toml")
+    folders = [train.folder_of(tmp_path / "out", place, "0", "cpu") for place in places]
+    others = train.folder_of(tmp_path / "out", "hover", "0", "cpu", "--set", "drone=a/b.toml")
     assert others.parent == folders[0].parent
     assert folders[0] == tmp_path / "out" / "hover-cpu-0"
     assert {folder.resolve().parent for folder in folders} == {tmp_path / "out"}
