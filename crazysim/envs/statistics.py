@@ -28,8 +28,8 @@ class RunningStats(PyTree):
 
     def update(self, x: Array) -> RunningStats:
         """Return the statistics with one more batch. (..., k)"""
-        x = x.reshape(-1, x.shape[-1])
-        n, mean, var = x.shape[0], x.mean(axis=0), x.var(axis=0)
+        axes = tuple(range(x.ndim - 1))  # reduced as they are: worlds that are spread over devices stay where they are
+        n, mean, var = x.size // x.shape[-1], x.mean(axis=axes), x.var(axis=axes)
         total = self.count + n
         delta = mean - self.mean
         spread = self.var * self.count + var * n + delta * delta * self.count * n / total

@@ -24,6 +24,11 @@ from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
 
+MAX_GROUPS = 64
+"""Groups of neighbouring worlds, at most, of which each minibatch gets as many worlds. A device holds whole groups, so that
+no device needs the samples of another one, and minibatches do not depend on the number of devices."""
+
+
 @dataclass(frozen=True)
 class Config:
     """Hyperparameters of PPO."""
@@ -260,11 +265,17 @@ def _update(
 ) -> tuple[Any, Any, dict[str, Array]]:
     """Return parameters, optimiser state and mean losses after all epochs on the samples of one seed."""
     n_worlds = data[0].shape[1]
+    n_groups = math.gcd(n_worlds // config.minibatches, MAX_GROUPS)
     transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
 
     def samples_of(worlds: Array) -> Any:
-        """Return the samples of some worlds, by their indices. (n_samples, ...) each"""
-        return jax.tree.map(lambda x: x[:, worlds].reshape(-1, *x.shape[3:]), data)
+        """Return the samples of some worlds, by their indices in each group. (n_steps, n_groups, k, n_drones, ...) each
+
+        Args:
+            worlds: Indices. (n_groups, k)
+        """
+        take = jax.vmap(lambda x, worlds: x[:, worlds], (1, 0), 1)
+        return jax.tree.map(lambda x: take(x.reshape(x.shape[0], n_groups, -1, *x.shape[2:]), worlds), data)
 
     def loss(parameters: Any, batch: Any) -> tuple[Array, dict[str, Array]]:
         policy, log_std, value = parameters
@@ -285,7 +296,9 @@ def _update(
         return (optax.apply_updates(parameters, updates), optimizer), losses
 
     def epoch(carry: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        minibatches = jax.random.permutation(key, n_worlds).reshape(config.minibatches, -1)
+        keys = jax.random.split(key, n_groups)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, n_worlds // n_groups))(keys)
+        minibatches = jnp.moveaxis(orders.reshape(n_groups, config.minibatches, -1), 1, 0)
         return jax.lax.scan(lambda carry, worlds: update(carry, samples_of(worlds)), carry, minibatches)
 
     carry, losses = jax.lax.scan(epoch, (parameters, optimizer), jax.random.split(key, config.epochs))
