@@ -47,9 +47,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--plot", type=Path, metavar="FILE", help="plot of the terms of the reward to write, .png")
     _add_task_and_device(add)
 
-    add = _add_policy_command(commands, "export", "write a trained policy as ONNX or as a C header", export)
+    text = "write a trained policy as ONNX, as a C header or as a controller of the Crazyflie's firmware"
+    add = _add_policy_command(commands, "export", text, export)
     add("--onnx", type=Path, metavar="FILE", help="ONNX file to write")
     add("--c", type=Path, metavar="FILE", help="C header to write; it includes only math.h")
+    out_of_tree = "existing folder for an out of tree controller of the Crazyflie's firmware"
+    add("--out-of-tree", type=Path, metavar="FOLDER", help=out_of_tree)
 
     add = _add_policy_command(commands, "render", "film a trained policy", render)
     add("--film", type=Path, metavar="FILE", help=".mp4 or .gif; by default policy.mp4 in the folder")
@@ -183,12 +186,18 @@ def export(options: argparse.Namespace) -> None:
     from crazysim.train.export import to_c, to_onnx
     from crazysim.train.training import load_policy
 
-    if options.onnx is None and options.c is None:
-        raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or both")
-    policy, _, meta = load_policy(options.folder)
+    if options.onnx is None and options.c is None and options.out_of_tree is None:
+        raise ValueError("expected a file to write, got none; use --onnx FILE, --c FILE, or --out-of-tree FOLDER")
+    policy, config, meta = load_policy(options.folder)
     for path, write in ((options.onnx, to_onnx), (options.c, to_c)):
         if path is not None:
             write(policy, path, meta)
+            print(f"wrote {path}")
+    if options.out_of_tree is not None:
+        from crazysim.train.out_of_tree import to_out_of_tree
+
+        env = config.make_env(1)
+        for path in to_out_of_tree(policy, options.out_of_tree, meta, env.sim.airframes[0], env.freq):
             print(f"wrote {path}")
 
 

@@ -1,0 +1,211 @@
+"""Policies as out of tree controllers of the Crazyflie's firmware, compiled against stubs of its headers."""
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import with_states
+
+from crazysim import ConfigError, Sim, rotation
+from crazysim.control import CFirmware
+from crazysim.drones import load_airframe
+from crazysim.engine.backends import native
+from crazysim.envs import make
+from crazysim.envs.actions import hover_rotors
+from crazysim.envs.statistics import RunningStats
+from crazysim.train.export import describe
+from crazysim.train.networks import Policy, init_mlp
+from crazysim.train.out_of_tree import to_out_of_tree
+
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="no C++ compiler here")
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
+CONTROLLER = """
+#pragma once
+#include <stdbool.h>
+#include <stdint.h>
+typedef struct { float x, y, z; } axes, point_t, velocity_t;
+typedef struct { float x, y, z, w; } quaternion_t;
+typedef struct { float roll, pitch, yaw; } attitude_t;
+typedef enum { modeDisable, modeAbs, modeVelocity } stab_mode_t;
+typedef enum { controlModeLegacy, controlModeForceTorque, controlModeForce } control_mode_t;
+typedef struct {
+  float thrust, thrustSi, torqueX, torqueY, torqueZ, normalizedForces[4];
+  control_mode_t controlMode;
+} control_t;
+typedef struct {
+  struct { stab_mode_t x, y, z, roll, pitch, yaw; } mode;
+  attitude_t attitude, attitudeRate;
+  axes position;
+  float thrust;
+} setpoint_t;
+typedef struct { quaternion_t attitudeQuaternion; axes position, velocity; attitude_t attitude; } state_t;
+typedef struct { axes gyro; } sensorData_t;
+typedef uint32_t stabilizerStep_t;
+void controllerOutOfTreeInit(void);
+void controllerOutOfTree(control_t *, const setpoint_t *, const sensorData_t *, const state_t *, stabilizerStep_t);
+"""
+POWER_DISTRIBUTION = """
+#include "controller.h"
+typedef struct { int32_t list[4]; } motors_thrust_uncapped_t;
+typedef struct { uint16_t list[4]; } motors_thrust_pwm_t;
+void powerDistribution(const control_t *, motors_thrust_uncapped_t *);
+bool powerDistributionCap(const motors_thrust_uncapped_t *, motors_thrust_pwm_t *);
+"""
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "out_of_tree.c"
+CONTROLLER_PID = """
+#include "controller.h"
+static setpoint_t below;
+static int started;
+static void controllerPidInit(void) { started = 1; }
+static bool controllerPidTest(void) { return started; }
+static void controllerPid(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors,
+                          const state_t *state, const stabilizerStep_t step) {
+  (void)sensors; (void)state; (void)step;
+  below = *setpoint;
+  control->controlMode = controlModeLegacy;
+  control->thrust = setpoint->thrust;
+}
+"""
+DRIVER = """
+#include "controller.c"
+void drive(int mode, unsigned step, const float *x, float *out) {
+  setpoint_t setpoint = {.mode = {mode, mode, mode, 0, 0, 0}, .position = {x[0], x[1], x[2]}};
+  state_t state = {.attitudeQuaternion = {x[6], x[7], x[8], x[9]}, .position = {x[3], x[4], x[5]},
+                   .velocity = {x[10], x[11], x[12]}};
+  sensorData_t sensors = {{x[13], x[14], x[15]}};
+  control_t control;
+  memset(&control, 1, sizeof control);
+  if (!controllerOutOfTreeTest()) controllerOutOfTreeInit();
+  controllerOutOfTree(&control, &setpoint, &sensors, &state, step);
+  const float results[] = {RESULTS};
+  memcpy(out, results, sizeof results);
+}
+"""
+RESULTS = {
+    "attitude": "below.attitude.roll, below.attitude.pitch, below.attitude.yaw, control.thrust, below.mode.roll, "
+                "below.mode.pitch, below.mode.yaw, below.mode.z, control.controlMode",
+    "body_rate": "below.attitudeRate.roll, below.attitudeRate.pitch, below.attitudeRate.yaw, control.thrust, "
+                 "below.mode.roll, below.mode.pitch, below.mode.yaw, below.mode.z, control.controlMode",
+    "force_torque": "control.thrustSi, control.torqueX, control.torqueY, control.torqueZ, control.controlMode",
+    "rotor_vel": "control.normalizedForces[0], control.normalizedForces[1], control.normalizedForces[2], "
+                 "control.normalizedForces[3], control.controlMode",
+}  # fmt: skip
+AIRFRAME = load_airframe("cf21B_500")
+FULL = 4 * float(AIRFRAME.value("rotors.thrust_max"))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Return a policy for hover of each level, the description of its actions, and the folder of its controller."""
+    made = {}
+
+    def of(level):
+        if level not in made:
+            meta = describe(make("hover", 1, control=level))
+            n = sum(meta["observations"].values())
+            stats = RunningStats(jnp.zeros(n), jnp.ones(n), jnp.asarray(1e4))
+            policy, folder = Policy(stats, init_mlp(jax.random.key(0), (n, 16, 4), 0.3)), tmp_path_factory.mktemp(level)
+            to_out_of_tree(policy, folder, meta, AIRFRAME, 50)
+            made[level] = policy, meta["actions"], folder
+        return made[level]
+
+    return of
+
+
+def command_of(policy, actions, x):
+    """Return the command of a policy for a goal, position, attitude, velocity and body rates in degrees. (16,)"""
+    goal, pos, quat, vel, ang_vel = np.split(x, [3, 6, 10, 13])
+    obs = {"pos": pos, "rot": np.ravel(rotation.matrix(jnp.asarray(quat))), "vel": vel,
+           "ang_vel": np.radians(ang_vel), "difference_to_goal": goal - pos}  # fmt: skip
+    action = np.asarray(policy({name: jnp.asarray(value, jnp.float32) for name, value in obs.items()}))
+    return np.asarray(actions["centre"]) + np.asarray(actions["scale"]) * action
+
+
+@pytest.mark.parametrize("level", RESULTS)
+def test_the_controller_gives_the_commands_of_the_policy_in_units_of_the_firmware(exported, level):
+    """Attitudes in degrees with the nose up, thrust over the largest, and off without a setpoint of the position."""
+    policy, actions, folder = exported(level)
+    (folder / "controller.h").write_text(CONTROLLER)
+    (folder / "controller_pid.h").write_text(CONTROLLER_PID)
+    (folder / "driver.c").write_text(DRIVER.replace("RESULTS", RESULTS[level]))
+    cc = shutil.which("cc") or shutil.which("gcc") or "cc"
+    subprocess.run([cc, *FLAGS, folder / "driver.c", "-o", folder / "driver.so", "-lm"], check=True)
+    drive = ctypes.CDLL(str(folder / "driver.so")).drive
+    x = np.array([0.3, -0.2, 1.0, 0.1, 0.2, 0.9, 0.1, -0.2, 0.3, 0.0, 0.4, -0.5, 0.2, 20.0, -30.0, 40.0], np.float32)
+    x[9] = np.sqrt(1 - np.sum(x[6:9] ** 2))
+    flying, off, later, moved = (np.empty(9, np.float32) for _ in range(4))
+
+    def call(mode, step, x, out):
+        drive(mode, step, *(a.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for a in (x, out)))
+
+    call(1, 40, x, flying)
+    command = command_of(policy, actions, x)
+    if level in ("attitude", "body_rate"):
+        mode = 1 if level == "attitude" else 2
+        expected = [*np.degrees(command[:3]) * [1, -1, 1], 65535 * command[3] / FULL, mode, mode, mode, 0, 0]
+    elif level == "force_torque":
+        expected = [*command, 1]
+    else:
+        thrust = np.polynomial.polynomial.polyval(command, AIRFRAME.value("rotors.thrust_curve"))
+        expected = [*4 * thrust / FULL, 2]
+    np.testing.assert_allclose(flying[: len(expected)], expected, rtol=3e-5, atol=1e-6)
+    call(1, 41, x + np.float32(0.1), later)  # between two ticks of the policy
+    call(1, 60, x + np.float32(0.1), moved)
+    np.testing.assert_array_equal(later[:4], flying[:4])
+    assert not np.allclose(moved[:4], flying[:4], rtol=1e-3)
+    call(0, 60, x, off)
+    assert off[3] == 0
+    assert off[len(expected) - 1] == expected[-1]
+
+
+def test_the_c_controller_flies_the_flight_of_the_policy_in_python(exported):
+    """In the firmware's place, at 50 Hz: the same flight within rounding of float32."""
+    policy, actions, folder = exported("rotor_vel")
+    library, n = folder / "policy.so", 3
+    words = ["-DCRAZYSIM", f"-I{CFirmware.include}", folder / "controller.c", "-o", library, "-lm"]
+    subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *words], check=True)
+    start = np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 1.2], [-0.4, 0.1, 0.9]])[:, None]
+    goal = np.array([0.1, 0.2, 1.1])
+    in_c = Sim(n, control="state", controller=CFirmware(library, motors="rpm", freq=50))
+    in_python = Sim(n, control="rotor_vel")
+    for sim in (in_c, in_python):
+        sim.data = with_states(sim.data, pos=start, rotor_vel=np.asarray(hover_rotors(sim.data.params)))
+    in_c.state_control(pos=goal)
+    act = jax.jit(policy)
+    for _ in range(50):
+        s = in_python.data.states
+        obs = {"pos": s.pos, "rot": rotation.matrix(s.quat).reshape(n, 1, 9), "vel": s.vel, "ang_vel": s.ang_vel,
+               "difference_to_goal": jnp.asarray(goal, s.pos.dtype) - s.pos}  # fmt: skip
+        in_python.rotor_vel_control(np.asarray(actions["centre"]) + np.asarray(actions["scale"]) * act(obs))
+        in_python.step(10)
+        in_c.step(10)
+    a, b = in_c.data.states, in_python.data.states
+    assert np.abs(np.asarray(b.pos) - start).max() > 0.05  # it went somewhere
+    for name in ("pos", "quat", "vel", "ang_vel"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=1e-4)
+
+
+def test_the_example_compiles_against_the_headers(tmp_path):
+    (tmp_path / "controller.h").write_text(CONTROLLER)
+    (tmp_path / "power_distribution.h").write_text(POWER_DISTRIBUTION)
+    folders = [f"-I{tmp_path}", f"-I{CFirmware.include}"]
+    subprocess.run([shutil.which("cc") or "gcc", *FLAGS, *folders, "-fsyntax-only", EXAMPLE], check=True)
+
+
+def test_policies_that_the_firmware_cannot_fly_are_refused(exported, tmp_path):
+    policy, *_ = exported("attitude")
+    meta = describe(make("hover", 1))
+    with pytest.raises(ConfigError, match="expected a rate that divides the firmware's 1000 Hz, got 60 Hz"):
+        to_out_of_tree(policy, tmp_path, meta, AIRFRAME, 60)
+    track = describe(make("track", 1))
+    with pytest.raises(ConfigError, match="got difference_to_target_vel, local_samples"):
+        to_out_of_tree(policy, tmp_path, track, AIRFRAME, 50)
+    positions = meta | {"actions": meta["actions"] | {"level": "state"}}
+    with pytest.raises(ConfigError, match="got one of positions"):
+        to_out_of_tree(policy, tmp_path, positions, AIRFRAME, 50)
+    assert not list(tmp_path.iterdir())
