@@ -1,4 +1,4 @@
-"""``crazysim live``: drones that circle, and can be watched, piloted, commanded and recorded."""
+"""``crazysim live``: drones that circle, or fly a policy, and can be watched, piloted, commanded and recorded."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import contextlib
 import os
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from crazysim.commands.options import DefaultsFormatter, add_page, add_simulation, given_options
 from crazysim.errors import ConfigError
+
+if TYPE_CHECKING:
+    from crazysim.lab.live.policy_pilot import PolicyPilot
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -19,7 +22,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("live", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
     add = parser.add_argument
-    add("--drones", type=int, default=4, metavar="N", help="drones in each world")
+    policy = "folder of a run whose policy flies, to goals that are typed, as x y z in m, or clicked"
+    add("--policy", type=Path, metavar="FOLDER", help=policy)
+    goals = "goals of the policy, one after another: x,y,z in each line, m"
+    add("--goals", type=Path, metavar="FILE", help=goals)
+    add("--drones", type=int, metavar="N", help="drones in each world; by default 4")
     add("--worlds", type=int, default=1, metavar="N", help="number of worlds")
     add("--seconds", type=float, help="simulated time, s; by default until all viewers are closed")
     add("--speed", default="1", help="simulated seconds per second, or max for as fast as possible")
@@ -28,8 +35,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     add("--headless", action="store_true", help="show nothing; requires --seconds")
     add_page(parser)
     add("--fps", type=float, default=50.0, help="pictures per second, sent to viewers")
-    add("--control-freq", type=int, default=100, metavar="HZ", help="rate of control steps, Hz")
-    add("--freq", type=int, default=500, metavar="HZ", help="rate of physics steps, Hz")
+    add("--control-freq", type=int, metavar="HZ", help="rate of control steps, Hz; by default 100")
+    add("--freq", type=int, metavar="HZ", help="rate of physics steps, Hz; by default 500")
     add("--record", type=Path, metavar="FILE", help="file to record to, for crazysim replay")
     add("--pilot", action="store_true", help="pilot the first drone with arrow keys, W, S, A, D and clicks")
     add("--gamepad", action="store_true", help="pilot the first drone with a gamepad and the keyboard")
@@ -42,6 +49,7 @@ def run(options: argparse.Namespace) -> None:
     from crazysim.lab.live import Browser, CommandServer, Fleet, Gamepad, Live, Pilot, RemoteCommands, Window
     from crazysim.lab.live.circles import Circles
     from crazysim.lab.live.piloting import Sticks, keyboard_sticks
+    from crazysim.lab.live.policy_pilot import typed_lines
     from crazysim.sim.sim import Sim
 
     viewers = [name for name in ("window", "browser") if getattr(options, name)]
@@ -56,12 +64,21 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError(
             "expected commands over TCP or a pilot, got both. Leave out --commands, or --pilot and --gamepad."
         )
-    n_worlds, control_freq = options.worlds, options.control_freq
-    settings = given_options(options, "drone", "controller", "device")
-    sim = Sim(n_worlds, options.drones, control="state", freq=options.freq, state_freq=control_freq, **settings)
+    policy_pilot, n_worlds = _policy_pilot(options), options.worlds
+    if policy_pilot is None:
+        control_freq = 100 if options.control_freq is None else options.control_freq
+        n_drones = 4 if options.drones is None else options.drones
+        settings: dict[str, Any] = {"freq": 500} | given_options(options, "freq", "drone", "controller", "device")
+        sim = Sim(n_worlds, n_drones, control="state", state_freq=control_freq, **settings)
+    else:
+        sim, control_freq = policy_pilot.env.sim, policy_pilot.env.freq
     with contextlib.ExitStack() as stack:
         live = stack.enter_context(Live(sim, control_freq, speed, options.fps))
-        if options.commands:
+        if policy_pilot is not None:
+            policy_pilot.join(live)
+            policy_pilot.listen(live, typed_lines())
+            print(f"type a goal as x y z, m{policy_pilot.arena and ': '}{policy_pilot.arena}", flush=True)
+        elif options.commands:
             fleet = Fleet(sim, teleport=False)
             live.add(RemoteCommands(fleet, stack.enter_context(CommandServer())), name="commands")
         else:
@@ -80,6 +97,25 @@ def run(options: argparse.Namespace) -> None:
         if options.record is not None:
             print(f"recording to {live.record(options.record)}", flush=True)
         print(live.run(options.seconds))
+        if options.goals is not None and policy_pilot is not None:
+            print(f"points passed: {', '.join(str(n) for n in policy_pilot.passed.ravel())}")
+
+
+def _policy_pilot(options: argparse.Namespace) -> PolicyPilot | None:
+    """Return the pilot of the policy to fly; None for a flight without one."""
+    others = ("drones", "control_freq", "freq", "drone", "controller", "pilot", "gamepad", "commands")
+    if options.policy is None:
+        if options.goals is not None:
+            raise ConfigError("expected --policy with --goals, got none. Use --policy out/hover, for example.")
+        return None
+    if given := [f"--{name.replace('_', '-')}" for name in others if getattr(options, name) not in (None, False)]:
+        raise ConfigError(f"expected the settings of the run with --policy, got {', '.join(given)}. Leave them out.")
+    from crazysim.lab.live.policy_pilot import PolicyPilot, read_points
+    from crazysim.train.training import load_policy
+
+    points = None if options.goals is None else read_points(options.goals)
+    policy, config, _ = load_policy(options.policy)
+    return PolicyPilot(config.with_device(options.device).make_env(options.worlds), policy, points)
 
 
 def _speed(text: str) -> float | Literal["max"]:

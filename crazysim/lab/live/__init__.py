@@ -27,6 +27,7 @@ from crazysim.lab.live.mocap import (
 )
 from crazysim.lab.live.pace import LiveReport
 from crazysim.lab.live.piloting import Pilot, keyboard_sticks
+from crazysim.lab.live.policy_pilot import PolicyPilot
 from crazysim.lab.live.radio import Radio
 from crazysim.lab.live.ros import RosBridge
 from crazysim.lab.live.server import CommandServer, StreamListener
@@ -58,6 +59,7 @@ __all__ = [
     "MotionCaptureSource",
     "Pilot",
     "Playback",
+    "PolicyPilot",
     "Radio",
     "RealTimeSource",
     "RemoteCommands",

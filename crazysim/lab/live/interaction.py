@@ -33,6 +33,8 @@ class Interaction:
     lights: NDArray
     """Colours of the drones' LEDs, red, green and blue from 0 to 1, which viewers draw; zero for off.
     (n_worlds, n_drones, 3)"""
+    goals: NDArray | None
+    """Positions that viewers mark in place of those in state commands, m; None for none. (n_worlds, n_drones, 3)"""
     quantities: dict[str, Callable[[Self], ArrayLike]]
     """Further quantities that viewers can plot, by name: functions of the loop that return numbers. (k,)"""
     on_click: Callable[[Self, int, NDArray], object] | None
@@ -42,7 +44,7 @@ class Interaction:
     def __init__(self, sim: Sim):
         self.sim = sim
         self.keyboard, self.controls, self.values, self.quantities = Keyboard(), [], {}, {}
-        self.selected, self.on_click = (0, 0), None
+        self.selected, self.on_click, self.goals = (0, 0), None, None
         self.lights = np.zeros((sim.n_worlds, sim.n_drones, 3))
         self._followed: tuple[int, str, int] | None = None
         self._slider = 0

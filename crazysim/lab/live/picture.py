@@ -43,7 +43,7 @@ class Picture:
     drones: NDArray
     """Positions of the drones, world frame, m. (n, n_drones, 3)"""
     setpoint: NDArray
-    """Positions in the state commands, world frame, m; empty at other command levels. (n, n_drones or 0, 3)"""
+    """Goals of the loop, or positions in the state commands, world frame, m; empty without. (n, n_drones or 0, 3)"""
     touching: NDArray
     """True where a drone touches something. (n, n_drones)"""
     wind: NDArray
@@ -93,7 +93,9 @@ class PictureSource:
         drones = np.asarray(data.states.pos, float)[worlds]
         empty = np.zeros((len(worlds), 0, 3))
         state, setpoint, wind = data.controls.state, empty, empty
-        if state is not None:
+        if live.goals is not None:
+            setpoint = live.goals[worlds]
+        elif state is not None:
             setpoint = np.asarray(state.staged_cmd, float)[worlds, :, :3]
         if self._wind and _winds(data):
             wind = np.asarray(self._wind_fn(data), float)[worlds]

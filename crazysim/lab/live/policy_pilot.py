@@ -1,0 +1,218 @@
+"""Trained policies in the live loop, which fly to goals that are typed, clicked or listed in a file."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from crazysim.core.data import SimData
+from crazysim.envs.env import DroneEnv
+from crazysim.envs.phases import vectorize_over_worlds
+from crazysim.envs.state import Obs, state_of_data
+from crazysim.envs.task import Task
+from crazysim.envs.tasks.goals import FLOOR, GoalTask
+from crazysim.errors import ConfigError
+from crazysim.lab.live.loop import Live
+from crazysim.storage import reading
+
+CLOSE = 0.15
+"""Distance from a listed goal at which a drone gets the next one, m."""
+MIN_HEIGHT = 0.5
+"""Least height of a clicked goal, m."""
+
+
+class PolicyPilot:
+    """Process that flies all drones with a policy, in the simulation of an environment.
+
+        env = config.make_env(1)
+        pilot = PolicyPilot(env, policy)
+        live = Live(env.sim, env.freq)
+        pilot.join(live)
+
+    The loop begins with the first episode of the environment, which does not end: a drone that crashes stays down until
+    the loop is reset. Policies of tasks without goals fly as well, but refuse goals.
+    """
+
+    def __init__(self, env: DroneEnv, policy: Callable[[Obs], Array], points: ArrayLike | None = None, seed: int = 0):
+        """Begin an episode in the simulation of the environment.
+
+        Args:
+            env: Environment of the policy, without wrappers.
+            policy: Trained policy, or any function from observations to actions.
+            points: Goals of every drone, one after another, world frame, m; None for the goal of the task. (n, 3)
+            seed: Random seed of the episode.
+
+        Raises:
+            ConfigError: If the task has no goals that can be set, or points lie outside of its arena.
+        """
+        self.env = env
+        self._points = None if points is None else np.asarray(points, float)
+        self._set_goal = jax.jit(lambda data, pos: env.set_goal(state_of_data(data), pos).data)
+        self._command = jax.jit(partial(_command, env, policy))
+        self._target = jax.jit(vectorize_over_worlds(env.task.target, env.task.batched))
+        self._start = jax.jit(env.reset)(jax.random.key(seed)).data
+        shape = self._start.states.pos.shape
+        self.goals = np.full(shape, np.nan)
+        """Goals of the drones, world frame, m; NaN if the task has none. (n_worlds, n_drones, 3)"""
+        self.passed = np.zeros(shape[:2], int)
+        """Number of listed points that each drone has passed. (n_worlds, n_drones)"""
+        self._follows = np.full(shape[:2], self._points is not None)
+        if type(env.task).set_goal is not Task.set_goal:
+            self.goals[:] = self._target(self._start)
+        if self._points is not None:
+            for i, point in enumerate(self._points):
+                self._check(point, f"point {i + 1}: ")
+            self.goals[:] = self._points[0]
+            self._start = self._set_goal(self._start, self.goals)
+        env.sim.data = self._start
+        self._command(self._start)  # compiles it before the clock starts
+
+    def join(self, live: Live) -> None:
+        """Fly in a loop from now on; clicks set goals, and viewers mark them."""
+        live.add(self, name="policy")
+        live.on_click, live.goals = self.click, self.goals
+
+    def __call__(self, live: Live) -> None:
+        """Write the command of this control step."""
+        if self._points is not None:
+            self._pass_points(live)
+        live.command[:] = self._command(live.sim.data)
+
+    def reset(self, live: Live) -> None:
+        """Begin the episode again after a reset, or take the goals of the time to which the loop went back."""
+        if live.step == 0:
+            live.sim.data = self._start
+            self.passed[:], self._follows[:] = 0, self._points is not None
+        if np.isfinite(self.goals).all():
+            self.goals[:] = self._target(live.sim.data)
+
+    def go_to(self, live: Live, pos: ArrayLike) -> None:
+        """Set the goal of the selected drone; it passes no further listed points.
+
+        Args:
+            live: Loop.
+            pos: Goal, world frame, m. (3,)
+
+        Raises:
+            ConfigError: If the task has no goals that can be set, the goal lies outside of its arena, or no drone is
+                selected.
+        """
+        if live.selected is None:
+            raise ConfigError("expected a selected drone, got none. Click on one, or press tab.")
+        pos = np.asarray(pos, float)
+        self._check(pos)
+        self._follows[live.selected] = False
+        self.goals[live.selected] = pos
+        live.sim.data = self._set_goal(live.sim.data, self.goals)
+
+    def click(self, live: Live, world: int, point: ArrayLike) -> None:
+        """Set the goal of the selected drone, if it is in that world, above a point on the ground, m. (3,)"""
+        if live.selected is not None and live.selected[0] == world:
+            x, y, _ = np.asarray(point, float)
+            self.go_to(live, [x, y, max(self.goals[live.selected][2], MIN_HEIGHT)])
+
+    def listen(self, live: Live, lines: Iterable[str]) -> threading.Thread:
+        """Set goals of the selected drone that are typed, such as ``0.5 0 1.2``, and return the thread that reads them.
+
+        Lines that are no goals are logged, and change nothing.
+        """
+
+        def read() -> None:
+            for line in lines:
+                if line.strip():
+                    live.post(partial(self._go_to_text, text=line))
+
+        thread = threading.Thread(target=read, name="typed goals", daemon=True)
+        thread.start()
+        return thread
+
+    @property
+    def arena(self) -> str:
+        """Arena in which goals may lie, in words; empty if the task has none."""
+        task = self.env.task
+        if not isinstance(task, GoalTask):
+            return ""
+        return f"x and y from {-task.half_width:g} to {task.half_width:g} m, z from {FLOOR:g} to {task.height:g} m"
+
+    def _go_to_text(self, live: Live, text: str) -> None:
+        self.go_to(live, as_point(text))
+
+    def _check(self, pos: NDArray, place: str = "") -> None:
+        """Check that a point can be a goal."""
+        task = self.env.task
+        if type(task).set_goal is Task.set_goal:
+            raise ConfigError(
+                f"{place}expected a policy whose goals are positions, got one of {task.name!r}. Use a policy of hover."
+            )
+        limits = np.array([task.half_width] * 2 + [task.height]) if isinstance(task, GoalTask) else np.full(3, np.inf)
+        low = np.append(-limits[:2], FLOOR if self.arena else -np.inf)
+        if pos.shape != (3,) or not np.isfinite(pos).all() or not ((low <= pos) & (pos <= limits)).all():
+            inside = f" within the arena of {task.name!r}, {self.arena}" if self.arena else ""
+            raise ConfigError(f"{place}expected x y z, m,{inside}, got {' '.join(f'{x:g}' for x in pos.ravel())}")
+
+    def _pass_points(self, live: Live) -> None:
+        """Give drones that are close to their listed goal the next one."""
+        points: Any = self._points
+        distance = np.linalg.norm(self.goals - np.asarray(live.sim.data.states.pos), axis=-1)
+        near = self._follows & (distance < CLOSE) & (self.passed < len(points))
+        if near.any():
+            self.passed += near
+            goes_on = near & (self.passed < len(points))
+            self.goals[goes_on] = points[self.passed[goes_on]]
+            live.sim.data = self._set_goal(live.sim.data, self.goals)
+
+
+def typed_lines() -> Iterator[str]:
+    """Yield the lines of the standard input, for another thread."""
+    # A daemon thread that waits in sys.stdin holds its lock when Python ends, which Python reports as a fatal error.
+    with contextlib.suppress(OSError), open(0, closefd=False) as lines:
+        yield from lines
+
+
+def as_point(text: str, place: str = "") -> NDArray:
+    """Return a point that is written as three numbers, m, separated by spaces or commas. (3,)
+
+    Args:
+        text: The numbers.
+        place: Beginning of the message of an error.
+    """
+    try:
+        point = np.array([float(x) for x in re.split(r"[,;\s]+", text.strip())])
+    except ValueError:
+        point = np.zeros(0)
+    if point.shape != (3,):
+        raise ConfigError(f"{place}expected x y z, m, got {text.strip()[:60]!r}. Write for example 0.5 0 1.2.")
+    return point
+
+
+def read_points(path: str | Path) -> NDArray:
+    """Return the points in a text file: three numbers a line, m, with spaces or commas; # begins a comment. (n, 3)
+
+    Raises:
+        ConfigError: If the file does not exist, or a line is not a point.
+    """
+    with reading(path, "a list of points", "Write x,y,z in each line, m."):
+        lines = Path(path).read_text().splitlines()
+    points = []
+    for number, line in enumerate(lines, 1):
+        if text := line.partition("#")[0].strip():
+            points.append(as_point(text, f"{path}, line {number}: "))
+    if not points:
+        raise ConfigError(f"expected points in {path}, got none. Write x,y,z in each line, m.")
+    return np.array(points)
+
+
+def _command(env: DroneEnv, policy: Callable[[Obs], Array], data: SimData) -> Array:
+    """Return the command of the policy's action for every drone. (n_worlds, n_drones, k)"""
+    seen = data if env.measure_states is None else vectorize_over_worlds(env.measure_states, env.task.batched)(data)
+    return env.actions.command(policy(vectorize_over_worlds(env.task.observe, env.task.batched)(seen)))
