@@ -22,7 +22,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     add = parser.add_argument
     task = "name of a task, such as hover, or FILE.py:CLASS for your task; list prints all names"
     add("task", help=task)
-    add("--algorithm", help="ppo or apg; by default the recipe's")
+    add("--algorithm", help="ppo, apg or dagger; by default the recipe's, or dagger with a teacher")
+    teacher = "folder of a run whose policy teaches this one, which sees what the task observes (DAgger)"
+    add("--teacher", metavar="FOLDER", help=teacher)
     add("--seed", type=int, help="random seed; by default 0")
     seeds = "several seeds in one program: 0:8 for 0 to 7, or 0,3,5; a folder for each in that of the run"
     add("--seeds", type=seeds_of, metavar="FIRST:END", help=seeds)
@@ -133,10 +135,10 @@ def train(options: argparse.Namespace) -> None:
     settings: dict[str, Any] = {
         "resume": options.resume,
         "checkpoint_every": options.checkpoint_every,
-        "algorithm": options.algorithm,
+        "algorithm": options.algorithm or (options.teacher and "dagger"),
         "n_worlds": options.worlds,
         "options": _pairs(options.set) | given_options(options, "device"),
-        "config": _pairs(options.config) | given_options(options, "iterations"),
+        "config": _pairs(options.config) | given_options(options, "iterations", "teacher"),
     }
     before = signal.signal(signal.SIGTERM, _exit)
     try:

@@ -19,10 +19,10 @@ from crazysim.envs.references import absolute_reference, is_reference, reference
 from crazysim.envs.registry import TASKS, entry_of, make
 from crazysim.envs.task import Task
 from crazysim.errors import ConfigError, UnknownNameError
-from crazysim.train import apg, ppo
+from crazysim.train import apg, dagger, ppo
 from crazysim.train.hyperparameters import SWEEPABLE
 
-ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg}
+ALGORITHMS: dict[str, Any] = {"ppo": ppo, "apg": apg, "dagger": dagger}
 """Algorithms by name: modules with ``Config``, ``init`` and ``iterate``."""
 
 
@@ -82,6 +82,7 @@ RECIPES: dict[str, Recipe] = {
 DEFAULT_RECIPES: dict[str, Recipe] = {
     "ppo": Recipe(),
     "apg": Recipe("apg", n_worlds=64, config={"iterations": 200}, evaluate_every=40),
+    "dagger": Recipe("dagger", n_worlds=256, evaluate_every=50),
 }
 """Recipes by algorithm, for tasks that have none for it."""
 

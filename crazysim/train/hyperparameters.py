@@ -28,11 +28,19 @@ def check_hyperparameters(config: Any) -> None:
         value, default = getattr(config, field.name), field.default
         if isinstance(default, tuple):
             value = _sizes(field.name, value)
+        elif isinstance(default, str):
+            value = _text(field.name, value)
         elif isinstance(default, int):
             value = positive_integer(field.name, value)
         else:
             value = _number(field.name, value, default)
         object.__setattr__(config, field.name, value)
+
+
+def _text(name: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise ConfigError(f"expected {name} as a text, got {value!r}. Use for example 'out/hover'.")
+    return value
 
 
 def _sizes(name: str, value: object) -> tuple[int, ...]:

@@ -34,7 +34,7 @@ from crazysim.errors import ConfigError, DivergedError
 from crazysim.progress import progress_bar
 from crazysim.storage import replacing
 from crazysim.tables import POSITIVE, read_number
-from crazysim.train import apg, checkpoint, ppo
+from crazysim.train import apg, checkpoint, dagger, ppo
 from crazysim.train.config import ALGORITHMS, ALTERABLE_HYPERPARAMETERS, TrainConfig, recipe_of
 from crazysim.train.evaluation import evaluate_blocks, outcome
 from crazysim.train.export import describe
@@ -47,7 +47,7 @@ CHECKPOINT, POLICY, CURVE, TABLE = "checkpoint.npz", "policy.npz", "curve.json",
 
 CHECK_SEED = 0xC4EC
 """Seed of the initial states on which the policy to keep is chosen; see ``EVALUATION_SEED``."""
-Learner = ppo.Learner | apg.Learner
+Learner = ppo.Learner | apg.Learner | dagger.Learner
 """State of a training run."""
 
 
@@ -147,7 +147,8 @@ def train_many(
     hyperparameters = tuple([training.config.algorithm_config() for training in trainings])
     n_iterations, n_steps = hyperparameters[0].iterations, hyperparameters[0].n_steps
     base = config.make_env(n * config.n_worlds, **config.practice_options())
-    env = base if algorithm is apg else AutoReset(base)
+    guided = dagger.with_teacher(base, hyperparameters[0]) if algorithm is dagger else base
+    env = base if algorithm is apg else AutoReset(guided)
     eval_env = config.make_env(n * evaluation_worlds)
     check_key = jax.random.key(CHECK_SEED)
     keys = jnp.stack([jax.random.fold_in(jax.random.key(training.config.seed), 1) for training in trainings])

@@ -78,6 +78,13 @@ def visits(result):
     assert distance.max() < 0.05
 
 
+def learns(result):
+    """Check that the student hovers nearly as often as its teacher."""
+    teacher, student = result
+    assert teacher > 0.98
+    assert student > 0.95
+
+
 CHECKS = {
     "crazyswarm2": lands,
     "fit_flight": fits,
@@ -87,12 +94,13 @@ CHECKS = {
     "pick_and_place": places,
     "race": races,
     "replayed_twin": repeats,
+    "student": learns,
     "waypoints": visits,
 }
 """Further checks of the values that ``main`` of an example returns."""
 
 
-LONG = {"waypoints": "trains a policy"}
+LONG = {"student": "trains two policies", "waypoints": "trains a policy"}
 
 
 @pytest.mark.parametrize(

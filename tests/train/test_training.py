@@ -203,7 +203,7 @@ def test_resuming_with_another_configuration_is_an_error(whole, tmp_path):
         trained(whole.folder, small_config(options={}), resume=True)
     with pytest.raises(ConfigError, match=r"expected an existing file with a checkpoint .*crazysim train"):
         trained(tmp_path / "nothing", small_config(), resume=True)
-    with pytest.raises(UnknownNameError, match="expected an algorithm of ppo, apg, got 'sac'"):
+    with pytest.raises(UnknownNameError, match="expected an algorithm of ppo, apg, dagger, got 'sac'"):
         small_config(algorithm="sac")
     with pytest.raises(UnknownNameError, match="task 'juggle' does not exist; there are hover"):
         small_config(task="juggle")

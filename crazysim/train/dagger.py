@@ -1,0 +1,324 @@
+"""DAgger (Ross, Gordon and Bagnell 2011): a student learns a teacher's actions from other observations.
+
+The student flies, so that it learns in the states that its own errors lead to, and the teacher's action in each state
+is its label. The paper's algorithm fits all samples so far. This one takes gradient steps on each rollout and drops it;
+the paper's bounds hold for any no-regret learner. A rollout of hundreds of worlds is large enough for that, and images
+of all iterations would not fit in memory.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from crazysim.core.data import SimData
+from crazysim.envs.env import Env
+from crazysim.envs.registry import entry_of
+from crazysim.envs.rollout import Transition, rollout
+from crazysim.envs.state import EnvState, Obs, flatten
+from crazysim.envs.statistics import RunningStats
+from crazysim.envs.wrappers import AutoReset, Wrapper
+from crazysim.errors import ConfigError, DivergedError
+from crazysim.pytree import PyTree
+from crazysim.train.evaluation import as_tree
+from crazysim.train.hyperparameters import check_hyperparameters
+from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
+from crazysim.train.seeds import Rates, for_each_seed, join_blocks, seed_of, split_blocks, stack_rates
+
+PREFIX = "teacher "
+"""Beginning of the names of the teacher's observations."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Hyperparameters of DAgger."""
+
+    teacher: str = ""
+    """Folder of the run whose policy is the teacher; empty in ``imitate``, which gets the teacher itself."""
+    iterations: int = 100
+    """Number of iterations, each a rollout and the updates on its samples."""
+    n_steps: int = 16
+    """Environment steps per world in one rollout."""
+    epochs: int = 2
+    """Passes over the samples of a rollout."""
+    minibatches: int = 4
+    """Minibatches, and hence updates, per epoch; each contains all samples of a subset of the worlds."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the hidden layers of the student."""
+    learning_rate: float = 3e-3
+    """Initial learning rate of Adam, annealed linearly to zero."""
+    teacher_decay: float = 0.8
+    """Ratio of the probability that the teacher acts in a step to that of the iteration before; it begins at 1."""
+    max_grad_norm: float = 1.0
+    """Largest global norm of a gradient; larger ones are scaled down to it."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_hyperparameters(self)
+        if self.teacher:  # so that the run can be resumed from any folder
+            object.__setattr__(self, "teacher", str(Path(self.teacher).resolve()))
+
+
+class Agent(PyTree):
+    """Network, optimiser and statistics of one student; in a ``Learner`` stacked, with a leading axis over seeds."""
+
+    student: Layers
+    """Network from normalised observations to the action before tanh."""
+    optimizer: optax.OptState
+    """State of the optimiser."""
+    stats: RunningStats
+    """Mean and variance with which observations are normalised."""
+    key: Array
+    """Random key. ()"""
+
+
+class Learner(PyTree):
+    """Complete state of a training run; saving and loading it resumes the run bit for bit."""
+
+    agents: Agent
+    """The students of all seeds. (n_seeds, ...) each"""
+    teacher: Any
+    """Policy of the teacher, which does not change."""
+    env: EnvState
+    """State of the environments: a block of worlds for each seed, of equal size."""
+    iteration: Array
+    """Number of completed iterations. ()"""
+
+    def as_policy(self) -> Policy:
+        """Return the students' policies. (n_seeds, ...) each"""
+        return Policy(self.agents.stats, self.agents.student)
+
+
+class Guided(Wrapper):
+    """Add the teacher's observations, ``teacher NAME``, to those of the student."""
+
+    def __init__(self, env: Env, observe: Callable[[SimData], Obs]):
+        """Wrap the student's environment.
+
+        Args:
+            env: Environment without automatic resets.
+            observe: Function from the true data to the teacher's observations, of one world, or of all if the task of
+                the environment is batched.
+        """
+        super().__init__(env)
+        self.observe, self.batched = observe, env.task.batched
+
+    def after_reset(self, state: EnvState) -> EnvState:
+        return self._add(state)
+
+    def after_step(self, state: EnvState) -> EnvState:
+        return self._add(state)
+
+    def _add(self, state: EnvState) -> EnvState:
+        return state.replace(obs=state.obs | {PREFIX + name: x for name, x in self.observe(state.data).items()})
+
+
+def with_teacher(env: Env, config: Config) -> Guided:
+    """Return an environment with the observations of the teacher in ``config.teacher`` as well.
+
+    Raises:
+        ConfigError: If there is no teacher, or its task observes what the student's task does not keep.
+    """
+    from crazysim.train.training import load_policy
+
+    if not config.teacher:
+        raise ConfigError("expected the folder of a teacher, got none. Use --teacher out/hover, for example.")
+    _, run, _ = load_policy(config.teacher)
+    entry = entry_of(run.task, named=False)
+    task = entry.task(**{name: x for name, x in run.options.items() if name in entry.options})
+    needs, has = type(task).Record, type(env.task).Record
+    if needs is not None and not (has is not None and issubclass(has, needs)):
+        raise ConfigError(
+            f"expected a teacher whose task has the same record as {env.task.name!r}, got {config.teacher} of "
+            f"{run.title!r}. Train the teacher with the same task, or with the base class of its class."
+        )
+    return Guided(env, task.observe)
+
+
+def init(env: Env, configs: Sequence[Config], keys: Array, teacher: Callable[[Obs], Array] | None = None) -> Learner:
+    """Return an untrained learner.
+
+    Args:
+        env: Environment of the training, with a block of worlds for each seed: ``Guided``, inside ``AutoReset``.
+        configs: Hyperparameters of each seed, which differ in those of ``SWEEPABLE`` at most.
+        keys: Random keys of the seeds. (n_seeds,)
+        teacher: Policy of the teacher; None for that of the folder in the hyperparameters.
+    """
+    config, n_worlds = configs[0], env.sim.n_worlds // len(configs)
+    if n_worlds % config.minibatches:
+        raise ConfigError(
+            f"expected minibatches that divide the {n_worlds} worlds, got {config.minibatches}. Use for "
+            f"example {math.gcd(n_worlds, 8)}."
+        )
+    k_student, k_env, k_agent = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), keys), 1, 0)
+    state = env.reset(k_env)
+    obs, shown = split_obs(state.obs)
+    teacher = _load_teacher(config.teacher, env, shown) if teacher is None else teacher
+
+    def init_agent(k_student: Array, key: Array, obs: Array) -> Agent:
+        student = init_mlp(k_student, (obs.shape[-1], *config.hidden, env.actions.size), 0.01)
+        optimizer = _optimizer(config, config.learning_rate, config.max_grad_norm).init(student)
+        return Agent(student, optimizer, RunningStats.create(obs.shape[-1]).update(obs), key)
+
+    agents = for_each_seed(init_agent, k_student, k_agent, split_blocks(flatten(obs), len(configs)))
+    return Learner(agents, as_tree(teacher), state, jnp.int32(0))
+
+
+@functools.partial(jax.jit, static_argnames=("env", "configs"))
+def iterate(learner: Learner, env: Env, configs: tuple[Config, ...]) -> tuple[Learner, dict[str, Array]]:
+    """Return the learner after one rollout and its updates, and the metrics of the iteration. (n_seeds,) each
+
+    The metric ``difference`` is the root mean square of the difference between the actions of student and teacher in
+    the states of the rollout; ``finite`` is True if weights and losses are finite.
+    """
+    key, k_fly, k_learn = jnp.moveaxis(for_each_seed(lambda key: jax.random.split(key, 3), learner.agents.key), 1, 0)
+    agents, rates, config = learner.agents.replace(key=key), stack_rates(configs), configs[0]
+    split = functools.partial(split_blocks, n_seeds=len(configs))
+    teacher_share = config.teacher_decay**learner.iteration
+
+    def act(agent: Agent, raw: Array, label: Array, key: Array) -> tuple[Array, Any]:
+        action = jnp.tanh(mlp(agent.student, agent.stats.normalize(raw)))
+        leads = jax.random.bernoulli(key, teacher_share, (len(action), 1, 1))
+        return jnp.where(leads, label, action), (raw, label, jnp.square(action - label).mean())
+
+    def policy(obs: Obs, memory: Any, keys: Array) -> tuple[Array, Any, Any]:
+        obs, shown = split_obs(obs)
+        label = jnp.clip(learner.teacher(shown), -1.0, 1.0)
+        action, extras = for_each_seed(act, agents, split(flatten(obs)), split(label), keys)
+        return join_blocks(action), memory, extras
+
+    def keep(transition: Transition) -> Any:
+        reward, error = split((transition.reward, transition.state.info["error"]))
+        crashed, over = split((transition.terminated, transition.done))
+        means = reward.mean(axis=(1, 2)), error.mean(axis=(1, 2))
+        return transition.extras, means, (crashed.sum(axis=1), over.sum(axis=1))
+
+    state, _, kept = rollout(env, learner.env, policy, k_fly, config.n_steps, keep)
+    (raw, labels, difference), (reward, error), (crashed, over) = kept
+    learn = functools.partial(_learn, config=config)
+    agents, finite = for_each_seed(learn, agents, raw, labels, rates, k_learn, axes=(0, 1, 1, 0, 0))
+    metrics = {
+        "reward": reward.mean(axis=0),
+        "crashed": crashed.sum(axis=0) / jnp.maximum(over.sum(axis=0), 1),
+        "error": error.mean(axis=0),
+        "difference": jnp.sqrt(difference.mean(axis=0)),
+        "finite": finite,
+    }
+    return Learner(agents, learner.teacher, state, learner.iteration + 1), metrics
+
+
+def imitate(
+    env: Env,
+    teacher: Callable[[Obs], Array],
+    config: Config | None = None,
+    seed: int = 0,
+    observe: Callable[[SimData], Obs] | None = None,
+    on_iteration: Callable[[int, dict[str, float]], None] | None = None,
+) -> Policy:
+    """Train a student in an environment, with its wrappers and sensors, and return its policy.
+
+    The policy takes the observations of ``env``, so that ``evaluate(env, policy)``, ``film`` and, with
+    ``describe(env)``, the export work as for other policies.
+
+    Args:
+        env: Environment of the student without automatic resets.
+        teacher: Trained policy, or any function from the teacher's observations to actions.
+        config: Hyperparameters; None for the defaults.
+        seed: Random seed.
+        observe: Function from the true data of one world to the teacher's observations, of all worlds if the task is
+            batched; None for the observations of the task.
+        on_iteration: Function that is called after each iteration with its number, from 1, and its metrics by name.
+
+    Raises:
+        DivergedError: If weights or losses become non-finite.
+    """
+    config = Config() if config is None else config
+    env = AutoReset(Guided(env, env.task.observe if observe is None else observe))
+    learner = jax.jit(functools.partial(init, env, (config,), teacher=teacher))(jax.random.key(seed)[None])
+    metrics: dict[str, Array] = {}
+    for i in range(config.iterations):
+        learner, metrics = iterate(learner, env, (config,))
+        if on_iteration is not None:
+            numbers = jax.device_get(metrics)
+            on_iteration(i + 1, {name: float(x[0]) for name, x in numbers.items() if name != "finite"})
+    if not metrics["finite"].all():
+        raise DivergedError("expected finite weights and losses, got NaN or infinity. Use a smaller learning_rate.")
+    return seed_of(learner.as_policy(), 0)
+
+
+def split_obs(obs: Obs) -> tuple[Obs, Obs]:
+    """Return the observations of the student and those of the teacher."""
+    shown = {name.removeprefix(PREFIX): x for name, x in obs.items() if name.startswith(PREFIX)}
+    return {name: x for name, x in obs.items() if not name.startswith(PREFIX)}, shown
+
+
+def _load_teacher(folder: str, env: Env, shown: Obs) -> Policy:
+    """Return the policy of a run, after checking that its observations and actions are those of the environment."""
+    from crazysim.train.training import load_policy
+
+    policy, _, meta = load_policy(folder)
+    sizes = {name: x.shape[-1] for name, x in shown.items()}
+    if sizes != meta["observations"]:
+        raise ConfigError(
+            f"expected a teacher that observes {sizes}, got {folder}, which observes {meta['observations']}. Train it "
+            f"again with this version."
+        )
+    own, actions = env.actions, meta["actions"]
+    same = own.control.value == actions["level"] and own.centre.shape == np.shape(actions["centre"])
+    if not (same and np.allclose([own.centre, own.scale], [actions["centre"], actions["scale"]])):
+        raise ConfigError(
+            f"expected a teacher whose actions have the meaning of the student's, {own}, got {folder} with "
+            f"{actions['level']} commands of centre {actions['centre']} and scale {actions['scale']}. Use the same "
+            f"control and drone for both."
+        )
+    return policy
+
+
+def _learn(agent: Agent, raw: Array, labels: Array, rates: Rates, key: Array, config: Config) -> tuple[Agent, Array]:
+    """Return the student of one seed after the updates on its rollout, and True if all its numbers are finite.
+
+    Args:
+        agent: The student before.
+        raw: Observations before normalisation. (n_steps, n_worlds, n_drones, n_obs)
+        labels: Actions of the teacher. (n_steps, n_worlds, n_drones, n_actions)
+        rates: Hyperparameters of the seed. () each
+        key: Random key.
+        config: Hyperparameters of all seeds; those in ``rates`` count.
+    """
+    transform = _optimizer(config, rates["learning_rate"], rates["max_grad_norm"])
+    samples = agent.stats.normalize(raw), labels
+
+    def loss(student: Layers, batch: tuple[Array, Array]) -> Array:
+        obs, label = batch
+        return jnp.square(jnp.tanh(mlp(student, obs)) - label).mean()
+
+    def update(carry: Any, worlds: Array) -> tuple[Any, Array]:
+        student, optimizer = carry
+        value, grads = jax.value_and_grad(loss)(student, jax.tree.map(lambda x: x[:, worlds], samples))
+        updates, optimizer = transform.update(grads, optimizer, student)
+        return (optax.apply_updates(student, updates), optimizer), value
+
+    def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
+        minibatches = jax.random.permutation(key, raw.shape[1]).reshape(config.minibatches, -1)
+        return jax.lax.scan(update, carry, minibatches)
+
+    keys = jax.random.split(key, config.epochs)
+    (student, optimizer), losses = jax.lax.scan(epoch, (agent.student, agent.optimizer), keys)
+    stats = agent.stats.update(raw)
+    return Agent(student, optimizer, stats, agent.key), all_finite((student, optimizer, stats, losses))
+
+
+def _optimizer(config: Config, learning_rate: Any, max_grad_norm: Any) -> optax.GradientTransformation:
+    n_updates = config.iterations * config.epochs * config.minibatches
+    schedule = optax.linear_schedule(learning_rate, 0.0, n_updates)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(schedule))

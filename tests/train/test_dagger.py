@@ -1,0 +1,97 @@
+"""A student learns what its teacher does from other observations, in Python and by the command."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from policies import save_steering, steer
+
+from crazysim import ConfigError, MotionCapture
+from crazysim.__main__ import main
+from crazysim.envs import Observe, make
+from crazysim.envs.state import flatten
+from crazysim.train import dagger
+from crazysim.train.config import TrainConfig
+from crazysim.train.training import load_policy, train
+
+SEEN = ("rot", "difference_to_goal", "vel")
+SMALL = {"n_steps": 4, "minibatches": 2, "epochs": 1, "hidden": (8,)}
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    return save_steering(tmp_path_factory.mktemp("teacher"))
+
+
+@pytest.mark.long("trains a student")
+def test_a_student_learns_the_actions_from_its_own_observations():
+    """The rollouts begin with the teacher's flight, and the student's actions become those of the teacher."""
+    env = Observe(make("hover", 64), lambda obs, _: {name: obs[name] for name in SEEN})
+    rows = []
+    config = dagger.Config(iterations=60, hidden=(16,), n_steps=8)
+    student = dagger.imitate(env, steer, config, on_iteration=lambda i, metrics: rows.append((i, metrics)))
+    assert [i for i, _ in rows] == list(range(1, 61))
+    assert rows[0][1].keys() == {"reward", "crashed", "error", "difference"}
+    assert rows[-1][1]["difference"] < 0.05 < 0.2 < rows[0][1]["difference"]
+    assert student.stats.mean.shape == (15,)
+    obs = jax.jit(env.reset)(jax.random.key(7)).obs
+    assert student(obs).shape == (64, 1, 4)
+
+
+def test_the_teacher_acts_first_and_less_and_less():
+    """With a student of zero actions, the share of the teacher's actions is the decay to the power of the iteration."""
+    env = dagger.AutoReset(dagger.Guided(make("hover", 64), lambda data: {"x": data.states.pos}))
+    config = dagger.Config(teacher_decay=0.5, n_steps=4)
+    init = jax.jit(lambda key: dagger.init(env, (config,), key[None], lambda obs: jnp.ones((64, 1, 4))))
+    learner = init(jax.random.key(0))
+    for iteration, share in ((0, 1.0), (1, 0.5), (30, 0.0)):
+        learner = learner.replace(iteration=jnp.int32(iteration))
+        after, _ = dagger.iterate(learner, env, (config,))
+        flown = (np.asarray(after.env.action) == 1.0).mean()
+        assert abs(flown - share) < 0.2
+
+
+def test_the_teacher_observes_the_truth_and_the_student_what_is_measured():
+    env = make("hover", 2, sensors=[MotionCapture(noise=0.1)])
+    guided = dagger.Guided(env, env.task.observe)
+    state = jax.jit(guided.step)(jax.jit(guided.reset)(jax.random.key(0)), jnp.zeros((2, 1, 4)))
+    student, shown = dagger.split_obs(state.obs)
+    np.testing.assert_array_equal(shown["pos"], state.data.states.pos)
+    assert student.keys() == shown.keys()
+    difference = np.abs(student["pos"] - shown["pos"]).max(axis=-1)
+    assert (difference > 0.001).all()
+    assert flatten(shown).shape == (2, 1, 21)
+
+
+@pytest.mark.long("trains and resumes by the command")
+def test_the_command_trains_a_student_and_resumes(teacher, tmp_path, capsys):
+    arguments = ["train", "hover", "--worlds", "4", "--set", "seconds=0.2", "--out", str(tmp_path / "run"), "--no-film"]
+    few = ["--config", "n_steps=4", "minibatches=2", "epochs=1", "hidden=[8]"]
+    assert main([*arguments, "--teacher", str(teacher), "--iterations", "2", *few]) == 0
+    assert "hover by dagger, seed 0: 2 iterations" in capsys.readouterr().out
+    assert main([*arguments, "--resume", "--iterations", "3"]) == 0
+    assert "continues after iteration 2" in capsys.readouterr().out
+    policy, config, meta = load_policy(tmp_path / "run")
+    assert config.config["teacher"] == str(teacher.resolve())
+    assert sum(meta["observations"].values()) == 21
+    assert policy(jax.jit(config.make_env(2).reset)(jax.random.key(0)).obs).shape == (2, 1, 4)
+
+
+def test_teachers_that_do_not_fit_are_refused(teacher, tmp_path):
+    def run(task, teacher, **options):
+        config = TrainConfig.create(
+            task, "dagger", n_worlds=4, options=options, config=SMALL | {"iterations": 2, "teacher": teacher}
+        )
+        train(config, tmp_path / "run", evaluation_worlds=4, log=lambda _: None, progress=False)
+
+    with pytest.raises(ConfigError, match="expected the folder of a teacher, got none"):
+        run("hover", "")
+    with pytest.raises(ConfigError, match="an existing file with a checkpoint"):
+        run("hover", str(tmp_path / "nothing"))
+    with pytest.raises(ConfigError, match="a teacher whose task has the same record as 'track'"):
+        run("track", str(teacher))
+    with pytest.raises(ConfigError, match="actions have the meaning of the student's"):
+        run("hover", str(teacher), control="body_rate")
+    with pytest.raises(ConfigError, match="expected teacher as a text, got 3"):
+        run("hover", 3)
+    assert not (tmp_path / "run").exists()
