@@ -9,7 +9,7 @@ from crazysim.cache import enable_cache
 from crazysim.control import Control, Controller
 from crazysim.core.data import SimData
 from crazysim.core.integration import Integrator
-from crazysim.core.others import reduce_over_others
+from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.plugin import Plugin, StagePlacement, parameter
 from crazysim.core.population import Population
 from crazysim.core.stage import stage

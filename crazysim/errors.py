@@ -86,31 +86,31 @@ class UnsupportedError(Exception):
     name them.
     """
 
-    def __init__(self, why: str, primitive: str = "", stage: str = ""):
+    def __init__(self, cause: str, primitive: str = "", stage: str = ""):
         """Keep the reason and its place.
 
         Args:
-            why: The reason, as a sentence without a full stop.
+            cause: The reason, as a sentence without a full stop.
             primitive: Name of the JAX primitive, if it is known.
             stage: Name of the stage, if it is known.
         """
-        super().__init__(why, primitive, stage)
-        self.why, self.primitive, self.stage = why, primitive, stage
+        super().__init__(cause, primitive, stage)
+        self.cause, self.primitive, self.stage = cause, primitive, stage
 
     @property
     def jax_version(self) -> str:
         """Version of JAX whose jaxpr was read."""
         return jax.__version__
 
-    def located(self, primitive: str = "", stage: str = "") -> UnsupportedError:
+    def with_location(self, primitive: str = "", stage: str = "") -> UnsupportedError:
         """Return the error with a primitive and a stage, where it has none yet."""
-        return type(self)(self.why, self.primitive or primitive, self.stage or stage)
+        return type(self)(self.cause, self.primitive or primitive, self.stage or stage)
 
     @property
     def reason(self) -> str:
         """Reason, with the primitive."""
-        named = not self.primitive or f"'{self.primitive}'" in self.why
-        return self.why if named else f"primitive {self.primitive!r}: {self.why}"
+        named = not self.primitive or f"'{self.primitive}'" in self.cause
+        return self.cause if named else f"primitive {self.primitive!r}: {self.cause}"
 
     def __str__(self) -> str:
         """Return the reason, with the stage and the version of JAX where the stage is known."""

@@ -158,7 +158,7 @@ def z_axis(q: Array) -> Array:
     return matrix(q)[..., 2]
 
 
-def turn(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
+def integrate_attitude(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
     """Return the attitude after a rotation with a constant angular velocity, for small angles. (..., 4)
 
     The result is ``q (sin(h) ang_vel / |ang_vel|, cos(h))`` with half the angle ``h = |ang_vel| dt / 2``, up to
@@ -182,8 +182,8 @@ def turn(q: Array, ang_vel: Array, dt: float, normalize: bool = True) -> Array:
     signed = [(-1) ** (n // 2) * c * (dt / 2) ** n for n, c in enumerate(coefficients)]
     square = dot(ang_vel, ang_vel)
     step = jnp.concatenate([_polynomial(square, signed[1::2]) * ang_vel, _polynomial(square, signed[::2])], axis=-1)
-    turned = multiply(q, step)
-    return turned * lax.rsqrt(dot(turned, turned)) if normalize else turned
+    product = multiply(q, step)
+    return product * lax.rsqrt(dot(product, product)) if normalize else product
 
 
 def _polynomial(x: Array, coefficients: list[float]) -> Array:

@@ -60,10 +60,10 @@ def test_rotations_act_on_vectors(p, q, v):
 
 
 @given(q=unit_quats, rotvec=vectors(3, np.pi / np.sqrt(3)))
-def test_turn_is_a_rotation_about_a_body_axis(q, rotvec):
+def test_integrated_attitude_is_a_rotation_about_a_body_axis(q, rotvec):
     """Up to half a revolution the approximations are exact to rounding, normalised or not, whatever the duration."""
-    out = rot.turn(jnp.asarray(q), jnp.asarray(rotvec) * 500, 1 / 500)
-    bare = rot.turn(jnp.asarray(q), jnp.asarray(rotvec), 1.0, normalize=False)
+    out = rot.integrate_attitude(jnp.asarray(q), jnp.asarray(rotvec) * 500, 1 / 500)
+    bare = rot.integrate_attitude(jnp.asarray(q), jnp.asarray(rotvec), 1.0, normalize=False)
     np.testing.assert_allclose(bare, out, rtol=0, atol=1e-15)
     angle = np.linalg.norm(rotvec)
     by_hand = np.array([*(0.5 * rotvec * np.sinc(angle / 2 / np.pi)), np.cos(angle / 2)])
@@ -72,8 +72,8 @@ def test_turn_is_a_rotation_about_a_body_axis(q, rotvec):
     same_rotation(out, expected)
 
 
-def test_turn_renormalises():
-    out = rot.turn(jnp.array([0.0, 0.0, 0.0, 1.01]), jnp.array([0.1, 0.2, 0.3]), 1.0)
+def test_integrated_attitude_is_normalised():
+    out = rot.integrate_attitude(jnp.array([0.0, 0.0, 0.0, 1.01]), jnp.array([0.1, 0.2, 0.3]), 1.0)
     np.testing.assert_allclose(jnp.linalg.norm(out), 1.0, rtol=1e-15)
 
 
@@ -182,7 +182,7 @@ def values_and_jacobians(q):
 @jax.jit
 def jacobians_of_small_turns(rpy, quat, rotvec):
     """Return the derivatives of quaternions by angles and by a turn."""
-    return jax.jacobian(rot.from_rpy)(rpy), *jax.jacobian(rot.turn, (0, 1))(quat, rotvec, 1.0)
+    return jax.jacobian(rot.from_rpy)(rpy), *jax.jacobian(rot.integrate_attitude, (0, 1))(quat, rotvec, 1.0)
 
 
 TINY = (0.0, 1e-45, 1e-30, 1e-22, 1e-19, 1e-10, 1e-4)
@@ -231,7 +231,7 @@ def quaternion_of_turned_axes(q, rotvec):
     """Return the quaternion of the axes of a turned quaternion, and its derivatives by the turn."""
 
     def there_and_back(rotvec):
-        axes = jnp.moveaxis(rot.matrix(rot.multiply(q, rot.turn(jnp.eye(4)[3], rotvec, 1.0))), -1, 0)
+        axes = jnp.moveaxis(rot.matrix(rot.multiply(q, rot.integrate_attitude(jnp.eye(4)[3], rotvec, 1.0))), -1, 0)
         return rot.quat_from_axes(*axes)
 
     return there_and_back(rotvec), jax.jacfwd(there_and_back)(rotvec)

@@ -9,7 +9,7 @@ from jax import Array
 from crazysim.control import Control, Controller, Setpoint
 from crazysim.core.data import SimData, controls_of
 from crazysim.core.pipeline import Pipeline
-from crazysim.core.stage import Stage, tick
+from crazysim.core.stage import Stage, acts_now
 
 
 def controller_stages(controller: Controller, control: Control) -> Pipeline:
@@ -21,10 +21,10 @@ def controller_stages(controller: Controller, control: Control) -> Pipeline:
     level = control.value
 
     def command_ticks(data: SimData) -> Array | None:
-        return tick(data, getattr(data.controls, level).freq)
+        return acts_now(data, getattr(data.controls, level).freq)
 
     def controller_ticks(data: SimData) -> Array | None:
-        return tick(data, getattr(data.controls, level).controller.freq)
+        return acts_now(data, getattr(data.controls, level).controller.freq)
 
     def run_outer(data: SimData) -> SimData:
         data = _apply_staged_command(data, control)

@@ -16,7 +16,7 @@ from crazysim import jaxcompat
 from crazysim.control import COMMAND_FIELDS, Control, Setpoint
 from crazysim.core.data import SimData, command_shape
 from crazysim.core.settings import check_flag
-from crazysim.core.stage import tick
+from crazysim.core.stage import acts_now
 from crazysim.errors import ConfigError, short_repr
 
 FEEDFORWARD_FIELDS = "jerk x, y, z [m/s^3], snap x, y, z [m/s^4], yaw rate [rad/s], yaw acceleration [rad/s^2]"
@@ -221,7 +221,7 @@ def time(data: SimData) -> Array:
 def controllable(data: SimData) -> Array:
     """Return True in worlds where a staged command takes effect at the next step. (n_worlds, 1)"""
     mode = data.controls.mode
-    mask = None if mode == Control.rotor_vel else tick(data, getattr(data.controls, mode.value).freq)
+    mask = None if mode == Control.rotor_vel else acts_now(data, getattr(data.controls, mode.value).freq)
     return jnp.ones_like(data.core.steps, bool) if mask is None else mask
 
 

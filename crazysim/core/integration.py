@@ -92,7 +92,7 @@ def apply_derivative(data: SimData, deriv: SimStateDeriv, dt: float, final: bool
     ang_vel = s.ang_vel + dt * deriv.ang_acc
     states = s.replace(
         pos=s.pos + dt * deriv.vel,
-        quat=rotation.turn(s.quat, deriv.ang_vel, dt, normalize=final),
+        quat=rotation.integrate_attitude(s.quat, deriv.ang_vel, dt, normalize=final),
         vel=s.vel + dt * deriv.acc,
         ang_vel=limit_ang_vel(ang_vel, data.core.freq) if final else ang_vel,
         rotor_vel=s.rotor_vel + dt * deriv.rotor_acc,
@@ -169,7 +169,7 @@ class Integration:
         """Return the stage of a step pipeline.
 
         Without plugins it accepts any leading batch axes; plugins are written for one drone or one world. ``deriv_fn``
-        must be one of the derivatives of this package, so that the stage without plugins can be declared fixed.
+        must be one of the derivatives of this package, since the stage without plugins is traced once in a process.
         """
         scope = "world" if self.couples_world else "drone"
-        return Stage(self, scope, batched=not self.plugins, name="integration", fixed=not self.plugins)
+        return Stage(self, scope, batched=not self.plugins, name="integration", trace_once=not self.plugins)

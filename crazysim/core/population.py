@@ -22,7 +22,7 @@ from crazysim.core.influence import plugin_rates
 from crazysim.core.integration import Integrator, advance_record
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement
 from crazysim.core.settings import dividing_rate
-from crazysim.core.stage import RESERVED_SCOPES, Stage, tick
+from crazysim.core.stage import RESERVED_SCOPES, Stage, acts_now
 from crazysim.errors import ConfigError
 from crazysim.pytree import Members, PyTree, float_dtype
 
@@ -148,7 +148,7 @@ class Population(Plugin):
         cls, placements = type(self), []
         if cls.control is not Population.control:
             rate = self.control_freq
-            when = None if rate is None else functools.partial(tick, freq=rate)
+            when = None if rate is None else functools.partial(acts_now, freq=rate)
             name = f"{self.name}_control"
             placements.append(StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name))
         if cls.derivative is not Population.derivative:

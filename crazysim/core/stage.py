@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from crazysim.core.data import SimData
-from crazysim.core.others import MEMBER_AXIS
+from crazysim.core.pair_reductions import MEMBER_AXIS
 from crazysim.errors import ConfigError
 from crazysim.pytree import (
     PyTree,
@@ -51,17 +51,18 @@ class Stage:
         when: Callable[..., Array | None] | None = None,
         batched: bool = False,
         name: str | None = None,
-        fixed: bool = False,
-        why: str = "it is not declared for one drone or one world",
+        trace_once: bool = False,
+        unfused_reason: str = "it is not declared for one drone or one world",
         phase: Phase = "each",
     ):
         """Declare a stage; see ``stage``.
 
-        ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``fixed`` declares that they always
-        do the same, without reading the numbers of worlds and drones, so that an engine traces them only once in a
-        process. ``why`` is the reason for the scope ``"batch"``, for messages.
+        ``batched`` declares that ``fn`` and ``when`` also accept any leading axes. ``trace_once`` declares that they
+        always do the same, without reading ``n_worlds`` and ``n_drones``, so that an engine traces them only once in a
+        process. ``unfused_reason`` is the reason for the scope ``"batch"``, for messages.
         """
-        self.fn, self.when, self.batched, self.fixed, self.why = fn, when, batched, fixed, why
+        self.fn, self.when, self.batched, self.trace_once = fn, when, batched, trace_once
+        self.unfused_reason = unfused_reason
         self.scope: StageScope = scope
         self.phase: Phase = phase
         self.__name__ = name or getattr(fn, "__name__", type(fn).__name__)
@@ -137,8 +138,8 @@ def stage(
     return lambda fn: Stage(fn, scope, when, phase=phase)
 
 
-def tick(data: SimData, freq: int) -> Array | None:
-    """Return True in worlds where a controller with a rate, Hz, acts at this step; None if it acts at every step.
+def acts_now(data: SimData, freq: int) -> Array | None:
+    """Return whether a stage with a rate, Hz, acts at this step, for each world; None if it acts at every step.
 
     Returns:
         (n_worlds, 1), or () for data of one world
@@ -162,7 +163,7 @@ def as_stages(pipeline: Mapping[str, Callable[..., Any]]) -> list[Stage]:
     A function without a declared scope receives the full batch.
     """
     return [
-        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.fixed, fn.why, fn.phase)
+        Stage(fn.fn, fn.scope, fn.when, fn.batched, name, fn.trace_once, fn.unfused_reason, fn.phase)
         if isinstance(fn, Stage)
         else Stage(fn, "batch", name=name)
         for name, fn in pipeline.items()
@@ -175,7 +176,7 @@ class Axes:
     def __init__(self, data: SimData):
         paths, self.treedef = jax.tree_util.tree_flatten_with_path(data)
         self.names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in paths]
-        self.numbers = leaf_indices(data)
+        self.leaf_indices = leaf_indices(data)
         """Record with the index of every leaf in place of the leaf."""
         self.scopes: list[str] = jax.tree.leaves(scopes(data))
 

@@ -17,7 +17,7 @@ from crazysim.core.data import SimData, SimState, SimStateDeriv, controls_of
 from crazysim.core.integration import INTEGRATORS, DerivFn, Integration, Integrator
 from crazysim.core.pipeline import Pipeline
 from crazysim.core.settings import as_mask
-from crazysim.core.stage import Stage, StageScope, tick
+from crazysim.core.stage import Stage, StageScope, acts_now
 from crazysim.dynamics import Dynamics, first_principles, fitted
 from crazysim.pytree import Members, has_members, n_batch_axes, scopes, select_worlds
 
@@ -27,12 +27,12 @@ FLOOR_HEIGHT = -0.001
 
 def _built_in(scope: StageScope, when: Callable[[SimData], Array | None] | None = None) -> Callable[..., Stage]:
     """Return a decorator that declares a built-in stage, whose function takes data of one drone, one world or all."""
-    return lambda fn: Stage(fn, scope, when, batched=True, fixed=True)
+    return lambda fn: Stage(fn, scope, when, batched=True, trace_once=True)
 
 
 def _ticks(controller: str) -> Callable[[SimData], Array | None]:
     """Return the condition under which a controller acts: at its own rate."""
-    return lambda data: tick(data, getattr(data.controls, controller).freq)
+    return lambda data: acts_now(data, getattr(data.controls, controller).freq)
 
 
 def build_step_pipeline(

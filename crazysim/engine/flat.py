@@ -85,8 +85,8 @@ class ZerosCache:
     def _indices(self, data: SimData, leaves: list[Any], treedef: Any) -> list[int]:
         key = (treedef, *[x.ndim for x in leaves])
         if key not in self._shared:
-            numbers = leaf_indices(data)
-            parameters = set(jax.tree.leaves((numbers.params, numbers.controls)))
+            indices = leaf_indices(data)
+            parameters = set(jax.tree.leaves((indices.params, indices.controls)))
             rows = zip(jax.tree.leaves(scopes(data)), jax.tree.leaves(leaf_flags(data, "sparse")), leaves, strict=True)
             self._shared[key] = [
                 i

@@ -66,15 +66,15 @@ class HostLeaves:
         x = self.items[i]
         return x.array(i) if isinstance(x, CallResults) else np.asarray(x)
 
-    def replace(self, numbers: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
+    def replace(self, indices: Iterable[int], arrays: Iterable[Any]) -> HostLeaves:
         """Return the leaves with some replaced by arrays that are never written again."""
         arrays = [np.ascontiguousarray(x) for x in arrays]
-        return self.replace_items(numbers, arrays, [_address(x) for x in arrays])
+        return self.replace_items(indices, arrays, [_address(x) for x in arrays])
 
-    def replace_items(self, numbers: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
+    def replace_items(self, indices: Iterable[int], items: Iterable[Any], addresses: Iterable[int]) -> HostLeaves:
         """Return the leaves with some replaced by items with known addresses."""
         new = HostLeaves(list(self.items), list(self.addresses), self._views, self._sharding)
-        for i, x, address in zip(numbers, items, addresses, strict=True):
+        for i, x, address in zip(indices, items, addresses, strict=True):
             new.items[i], new.addresses[i] = x, address
         return new
 
@@ -206,8 +206,8 @@ class HostCall:
         """Return a NumPy view of a JAX array, after waiting for it. The last view of each leaf is cached."""
         entry = self._held.get(i)
         if entry is None or entry[0] is not x:
-            numbers = jax.random.key_data(x) if jaxcompat.is_key(x) else x
-            entry = self._held[i] = x, np.ascontiguousarray(numbers)
+            key_data = jax.random.key_data(x) if jaxcompat.is_key(x) else x
+            entry = self._held[i] = x, np.ascontiguousarray(key_data)
         return entry[1]
 
     def __call__(self, leaves: HostLeaves, n_steps: int) -> HostLeaves:

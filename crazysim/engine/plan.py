@@ -59,7 +59,7 @@ class Plan:
 
     engine: str
     """Engine that runs."""
-    why: str
+    engine_reason: str
     """Reason why no faster engine was chosen; empty for ``fused``."""
     programs: tuple[Program, ...]
     """Programs that the engine runs, one for each group of populations that depend on each other. The group of the
@@ -75,13 +75,13 @@ class Plan:
     """Leaves whose rows are other leaves, after the packed leaf; empty if no leaf is stored as rows."""
     written: tuple[int, ...]
     """Indices of the leaves that the compiled step returns."""
-    numbers: SimData
+    leaf_indices: SimData
     """Record with the index of every leaf in place of the leaf, as ``leaf_indices`` returns it."""
-    dynamic: Callable[..., Any]
+    traced_count_step: Callable[..., Any]
     """Compiled step that takes the number of steps as an array."""
-    static: Callable[..., Any]
+    static_count_step: Callable[..., Any]
     """Compiled step that takes the number of steps as a Python number, and can be differentiated in reverse mode."""
-    direct: Callable[..., Any] | None = None
+    numpy_step: Callable[..., Any] | None = None
     """Step in NumPy for arguments that are not traced; None unless ``interpret`` runs all of it without a mesh."""
     host_call: HostCall | None = None
     """Step without XLA, for a simulation that holds its data between calls; None if it is not possible."""
@@ -89,7 +89,7 @@ class Plan:
     @property
     def synced(self) -> int:
         """Index of the leaf ``core.mjx_synced``, which is False after a step."""
-        return int(self.numbers.core.mjx_synced)
+        return int(self.leaf_indices.core.mjx_synced)
 
     @property
     def program(self) -> Program | None:
@@ -128,7 +128,7 @@ class Planner(NamedTuple):
             return self._plain(data, "it was chosen")
         try:
             plan, problems = self._fast(data, zeros, separate)
-            if plan.direct is None:
+            if plan.numpy_step is None:
                 trace(plan)
         except (ConfigError, MemoryError):
             raise
@@ -175,28 +175,28 @@ class Planner(NamedTuple):
         problems = [f"stage {s.unfused}" for s in unfused if not isinstance(s.error, LimitError)]
         if self.location.is_distributed and unfused:
             return self._plain(data, f"with a mesh every stage must be fused, and {unfused[0].unfused}"), problems
-        engine, why, runs = self.engine, "it was chosen", []
+        engine, reason, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
-            engine, why = "lanes", fused.unavailable_reason(self.location.platform) or ""
-            if not why:
+            engine, reason = "lanes", fused.unavailable_reason(self.location.platform) or ""
+            if not reason:
                 try:
                     without_rows = None if select is None else optimise(lowered[0])
                     runs, engine = [fused.build(x, self.location, without_rows) for x in programs], "fused"
                 except UnsupportedError as error:
                     error = self._error_of_stage(error, data)
-                    why = str(error)
+                    reason = str(error)
                     problems.append(self._without_kernel(error))
-            if why and self.engine == "fused":
-                raise ConfigError(f"engine 'fused' cannot run this pipeline: {why}. Use 'lanes' or 'auto'.")
+            if reason and self.engine == "fused":
+                raise ConfigError(f"engine 'fused' cannot run this pipeline: {reason}. Use 'lanes' or 'auto'.")
         runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
         inputs = {i for program in programs for i in _inputs(program)}
         run, written = _join_runs(groups, programs, runs)
-        plan = self._wrap(engine, why, data, programs, inputs, written, run, len(programs[0].leaves))
+        plan = self._wrap(engine, reason, data, programs, inputs, written, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
         if on_host and is_possible(kernels):
             owned = [group.owned for group in groups]
-            call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.numbers.core.nonfinite))
+            call = HostCall(kernels, owned, jax.tree.leaves(data), int(plan.leaf_indices.core.nonfinite))
             plan = dataclasses.replace(plan, host_call=call)
         return plan, problems
 
@@ -207,13 +207,15 @@ class Planner(NamedTuple):
         if self.location.mesh is None:
             return f"the data is spread over devices by a {type(data.states.pos.sharding).__name__}, not over a mesh"
         stage = next((s for s in self.stages if s.scope == "batch"), None)
-        return "" if stage is None else f"a mesh needs stages of one drone or world; {stage.__name__!r}: {stage.why}"
+        if stage is None:
+            return ""
+        return f"a mesh needs stages of one drone or world; {stage.__name__!r}: {stage.unfused_reason}"
 
-    def _plain(self, data: SimData, why: str) -> Plan:
+    def _plain(self, data: SimData, reason: str) -> Plan:
         run, written = plain.build(self.stages, data)
         all_leaves = tuple(range(len(jax.tree.leaves(data))))
         # XLA itself distributes the computation of ``plain`` over the devices.
-        return self._wrap("plain", why, data, (), all_leaves, tuple(written), run, len(all_leaves))
+        return self._wrap("plain", reason, data, (), all_leaves, tuple(written), run, len(all_leaves))
 
     @property
     def _has_kernels(self) -> bool:
@@ -222,7 +224,7 @@ class Planner(NamedTuple):
     def _wrap(
         self,
         engine: str,
-        why: str,
+        reason: str,
         data: SimData,
         programs: tuple[Program, ...],
         needed: Collection[int],
@@ -230,10 +232,10 @@ class Planner(NamedTuple):
         run: Run,
         n_leaves: int,
     ) -> Plan:
-        numbers, inputs = leaf_indices(data), tuple(sorted(needed))
+        indices, inputs = leaf_indices(data), tuple(sorted(needed))
         # If a stage writes the flags itself, no check is added.
-        checks = any(p.check is not None for p in programs) if programs else numbers.core.nonfinite not in written
-        flags = (numbers.core.nonfinite,) if checks else ()
+        checks = any(p.check is not None for p in programs) if programs else indices.core.nonfinite not in written
+        flags = (indices.core.nonfinite,) if checks else ()
         written = (*written, *flags)
         main = programs[0] if programs else None
         packed = main.packed if main is not None else ()
@@ -246,9 +248,11 @@ class Planner(NamedTuple):
 
         if programs and self.location.mesh is not None:
             advance = self._over_mesh(advance, data, inputs, written)
-        plan = Plan(engine, why, programs, self.location, inputs, packed, rows, written, numbers, *_jit_step(advance))
-        direct = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
-        return dataclasses.replace(plan, direct=_results_on_device(advance)) if direct else plan
+        plan = Plan(
+            engine, reason, programs, self.location, inputs, packed, rows, written, indices, *_jit_step(advance)
+        )
+        in_numpy = engine == "interpret" and self.location.mesh is None and all(p.fused for p in programs)
+        return dataclasses.replace(plan, numpy_step=_results_on_device(advance)) if in_numpy else plan
 
     def _over_mesh(
         self, advance: Callable[..., Any], data: SimData, inputs: Sequence[int], outputs: Sequence[int]
@@ -315,12 +319,12 @@ def _jit_step(advance: Callable[..., Any]) -> tuple[Callable[..., Any], Callable
 def _results_on_device(advance: Callable[..., Any]) -> Callable[..., Any]:
     """Return a step in NumPy that puts its results on the device of its arguments."""
 
-    def direct(values: list[Any], n_steps: int | Array) -> list[Any]:
+    def step(values: list[Any], n_steps: int | Array) -> list[Any]:
         committed = next((x for x in values if getattr(x, "committed", False)), None)
         device = None if committed is None else next(iter(committed.devices()))
         return jax.device_put(advance(values, n_steps), device)
 
-    return direct
+    return step
 
 
 def _join_runs(

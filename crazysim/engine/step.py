@@ -49,18 +49,19 @@ class FlatData:
         record = self._record
         if record is None:
             # Without a reference to this object, so that no cycle keeps arrays in memory.
-            record = self._record = lazy_record(self.plan.numbers, functools.partial(_leaf, self.leaves, self.plan))
+            read_leaf = functools.partial(_leaf, self.leaves, self.plan)
+            record = self._record = lazy_record(self.plan.leaf_indices, read_leaf)
         return record
 
-    def replace(self, numbers: Sequence[int], values: Sequence[Any]) -> FlatData:
+    def replace(self, indices: Sequence[int], values: Sequence[Any]) -> FlatData:
         """Return the data with other values of some leaves."""
-        if any(i in rows.members for rows in self.plan.rows for i in numbers):
+        if any(i in rows.members for rows in self.plan.rows for i in indices):
             raise ValueError(
                 "expected leaves that are not in rows, got one that is. Name it in separate= of Step.flatten."
             )
         if isinstance(self.leaves, HostLeaves):
-            return FlatData(self.leaves.replace(numbers, values), self.plan)
-        return FlatData(replace_leaves(self.leaves, numbers, values), self.plan)
+            return FlatData(self.leaves.replace(indices, values), self.plan)
+        return FlatData(replace_leaves(self.leaves, indices, values), self.plan)
 
     def stage_command(self, reference: SimData, command: Any, feedforward: Any = None) -> FlatData:
         """Return the data with a checked command, as ``crazysim.core.functional.stage_command`` does.
@@ -70,9 +71,10 @@ class FlatData:
             command: Command, which must not be changed afterwards. (n_worlds, n_drones, k)
             feedforward: Feedforward of a setpoint; None for the default of ``stage_command``.
         """
-        numbers, values = staged_leaves(self.plan.numbers), staged_fields(self.plan.numbers, command, feedforward)
+        leaf_indices = self.plan.leaf_indices
+        indices, values = staged_leaves(leaf_indices), staged_fields(leaf_indices, command, feedforward)
         on_host = isinstance(self.leaves, HostLeaves)
-        return self.replace(numbers, [x if on_host else put_command(reference, x) for x in values.values()])
+        return self.replace(indices, [x if on_host else put_command(reference, x) for x in values.values()])
 
     def inputs(self) -> list[Any]:
         """Return the arguments of the compiled step other than the number of steps."""
@@ -204,9 +206,9 @@ class Step:
     def advance(self, flat: FlatData, n_steps: int | Array) -> FlatData:
         """Return the data some steps later, still flattened."""
         plan = flat.plan
-        step, inputs = plan.static if isinstance(n_steps, int) else plan.dynamic, flat.inputs()
-        if plan.direct is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
-            step = plan.direct
+        step, inputs = plan.static_count_step if isinstance(n_steps, int) else plan.traced_count_step, flat.inputs()
+        if plan.numpy_step is not None and not any(isinstance(x, jax.core.Tracer) for x in (*inputs, n_steps)):
+            step = plan.numpy_step
         program = id(plan), n_steps if isinstance(n_steps, int) else None
         with keep_programs(when=program not in self._called):
             out = step(inputs, n_steps)
@@ -238,7 +240,7 @@ class Step:
         """Return the step lowered for this data, as ``jax.jit(...).lower`` does: to inspect, or to compile ahead."""
         _check_steps(n_steps)
         flat = self.flatten(data, None, n_steps)
-        step = flat.plan.static if isinstance(n_steps, int) else flat.plan.dynamic
+        step = flat.plan.static_count_step if isinstance(n_steps, int) else flat.plan.traced_count_step
         return step.lower(flat.inputs(), n_steps)
 
     @property
@@ -255,7 +257,8 @@ class Step:
         """Return the number of compiled programs, as for a jitted function; the tests of law 6 count them."""
         count = jaxcompat.n_compilations
         called = [plan.host_call is not None and plan.host_call.used for plan in self._plans.values()]
-        return sum(called) + sum(count(plan.dynamic) + count(plan.static) for plan in self._plans.values())
+        steps = [step for plan in self._plans.values() for step in (plan.traced_count_step, plan.static_count_step)]
+        return sum(called) + sum(map(count, steps))
 
     def _all_leaves(self, plan: Plan, leaves: list[Any]) -> list[Any]:
         """Return the leaves of the data, followed by the leaves that the plan adds."""
@@ -297,7 +300,7 @@ class Step:
             def trace(plan: Plan) -> None:
                 flat = FlatData(jax.eval_shape(lambda leaves: self._all_leaves(plan, leaves), leaves), plan)
                 known = isinstance(n_steps, int)
-                step = plan.static if known else plan.dynamic
+                step = plan.static_count_step if known else plan.traced_count_step
                 step.trace(flat.inputs(), n_steps if known else jnp.int32(1))
 
             plan = self._plans[key] = planner.plan(data, zeros, trace, separate)

@@ -193,7 +193,7 @@ class Env(ABC):
             flat: Result of ``flatten`` or ``advance``.
             action: Action of every drone, with the dtype of the state's action; not checked. (n_worlds, n_drones, k)
         """
-        flat = flat.replace([flat.plan.numbers.plugins[NAME].next_action], [action])
+        flat = flat.replace([flat.plan.leaf_indices.plugins[NAME].next_action], [action])
         return self.step_fn.advance(flat, self.n_substeps)
 
     def _check_reset_mode(self, state: EnvState) -> None:

@@ -77,11 +77,17 @@ class Phases:
             batched: Reason why all phases need all worlds at once; None if each runs in one world.
         """
 
-        def stage(name: str, fn: Callable[..., SimData], phase: Phase, why: str | None, when: Any = None) -> Stage:
-            if why is None:
+        def stage(
+            name: str, fn: Callable[..., SimData], phase: Phase, unfused_reason: str | None, when: Any = None
+        ) -> Stage:
+            if unfused_reason is None:
                 return Stage(functools.partial(fn, vectorize=skip_vectorization), "world", when, name=name, phase=phase)
             return Stage(
-                functools.partial(fn, vectorize=vectorize_over_worlds), "batch", name=name, phase=phase, why=why
+                functools.partial(fn, vectorize=vectorize_over_worlds),
+                "batch",
+                name=name,
+                phase=phase,
+                unfused_reason=unfused_reason,
             )
 
         def must_reset(data: SimData) -> Array:

@@ -77,7 +77,7 @@ class EnvStepper:
     def _compile(self, flat: FlatData) -> None:
         """Compile the step. Its carry omits results that the next step does not read."""
         plan, env = flat.plan, self._env
-        record, n = plan.numbers.plugins[NAME], len(flat.leaves)
+        record, n = plan.leaf_indices.plugins[NAME], len(flat.leaves)
         flags = [record.terminated, record.truncated]
         outputs = set(jax.tree.leaves([getattr(record, name) for name in OUTPUTS]))
         self._carried = carried = [i for i in plan.written if i not in outputs - set(plan.inputs) and i not in flags]

@@ -17,7 +17,7 @@ from crazysim.core.functional import stage_command
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, check_parameter, parameter
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
-from crazysim.core.stages import tick
+from crazysim.core.stages import acts_now
 from crazysim.errors import ConfigError
 from crazysim.pytree import PyTree, device_array, leaf, static
 from crazysim.trajectories.trajectory import Trajectory
@@ -121,7 +121,7 @@ class Follow(Plugin):
         )
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
-        ticks = stage("drone", when=lambda data: tick(data, data.controls.state.freq))
+        ticks = stage("drone", when=lambda data: acts_now(data, data.controls.state.freq))
         return [StagePlacement(ticks(self.stage_setpoint), before="state_controller")]
 
     def stage_setpoint(self, data: SimData) -> SimData:

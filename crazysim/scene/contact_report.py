@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.others import reduce_over_others
+from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError
 from crazysim.geometry import Shape, distance

@@ -18,7 +18,7 @@ from crazysim.core.data import SimData
 from crazysim.core.settings import check_flag
 from crazysim.errors import ConfigError, UnknownNameError
 from crazysim.scene.collision import CollisionModel, body_name
-from crazysim.scene.first_hit import NOBODY
+from crazysim.scene.first_hit import IGNORES_NONE
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 from crazysim.scene.object_poses import ListPlugins, moving_plugins, with_moved_objects
 from crazysim.scene.ray_casting import Hits, RayKernels, cast_rays_in_worlds
@@ -144,10 +144,10 @@ def build_depth_fn(
     looks = np.zeros((len(cameras), height * width, 4))
     for camera, rays in zip(cameras, looks, strict=True):
         rays[:, :3] = pixel_directions(camera.fovy, width, height).reshape(-1, 3)[order]
-        rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else NOBODY
+        rays[:, 3] = camera.row if camera.carrier == "drone" and hide_own else IGNORES_NONE
     n_rays = len(cameras) * width * height
 
-    def of_worlds(data: SimData) -> Hits:
+    def cast_in_worlds(data: SimData) -> Hits:
         eyes = jnp.stack([jnp.concatenate([pos, rot.reshape(-1, 9)], axis=-1)
                           for pos, rot in (_camera_pose(camera, data) for camera in cameras)], axis=1)  # fmt: skip
         hits = cast_rays_in_worlds(in_data, data, eyes, looks, drones, kernels)
@@ -171,15 +171,15 @@ def build_depth_fn(
         max_rays = MAX_RAYS if kernels.platform is None else MAX_RAYS_OF_KERNEL
         n_worlds, at_a_time = data.core.n_worlds, max(1, max_rays // n_rays)
         if n_worlds <= at_a_time:
-            return of_worlds(data)
+            return cast_in_worlds(data)
         objects = None if data.objects is None else data.objects.replace(mocap_ids=None)
 
-        def of_one(poses: MocapPoses) -> Hits:
+        def cast_in_world(poses: MocapPoses) -> Hits:
             pos, quat, objects = jax.tree.map(lambda x: x[None], poses)
             states = data.states.replace(pos=pos, quat=quat)
-            return jax.tree.map(lambda x: x[0], of_worlds(data.replace(states=states, objects=objects)))
+            return jax.tree.map(lambda x: x[0], cast_in_worlds(data.replace(states=states, objects=objects)))
 
-        return jax.lax.map(of_one, (data.states.pos, data.states.quat, objects), batch_size=at_a_time)
+        return jax.lax.map(cast_in_world, (data.states.pos, data.states.quat, objects), batch_size=at_a_time)
 
     return depth
 

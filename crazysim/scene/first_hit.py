@@ -26,8 +26,8 @@ from crazysim.geometry.shapes import N_SIZES, bounding_box, bounding_radius
 from crazysim.scene import hierarchy
 from crazysim.scene.collision import CollisionGeom, CollisionModel
 
-NOBODY, NO_DRONE = -1, -2
-"""Drone index of rays that pass through no drone, and drone index of geoms that belong to no drone."""
+IGNORES_NONE, NOT_A_DRONE = -1, -2
+"""Drone index of rays that ignore no drone, and drone index of geoms that belong to no drone."""
 
 BALL_SLACK = 1e-3
 """Relative enlargement of a ball for rounding, in addition to ``hierarchy.BOX_PADDING``."""
@@ -46,8 +46,8 @@ class Target:
     """Kind of its body; the world's do not move."""
     row: int
     """Row of the body among the objects or drones."""
-    number: int
-    """Number of the body in ``Hits.number``."""
+    body_index: int
+    """Index of the body, as in ``Hits.body_index``."""
 
     @property
     def surface(self) -> Surface:
@@ -55,7 +55,7 @@ class Target:
         shape = self.geom.shape
         return shape if shape.kind in ("mesh", "hfield") else shape.kind
 
-    def numbers(self, pos: np.ndarray) -> np.ndarray:
+    def table_row(self, pos: np.ndarray) -> np.ndarray:
         """Return position, a zero, rotation by rows, and size in three numbers: a row of the table of geoms. (16,)
 
         Args:
@@ -78,7 +78,7 @@ class Hierarchy(NamedTuple):
     links: Array
     """Index of the node behind the subtree of each node, and its geom or -1. (8 * n_nodes, 2)"""
     geoms: Array
-    """Geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
+    """Geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
 
 
 class Tables(NamedTuple):
@@ -93,7 +93,7 @@ class Tables(NamedTuple):
     links: Array
     """As in ``Hierarchy``. (8 * n_nodes, 2)"""
     fixed: Array
-    """Fixed geoms, world frame; see ``Target.numbers``. (n_fixed, 16)"""
+    """Fixed geoms, world frame; see ``Target.table_row``. (n_fixed, 16)"""
     balls: Array
     """Centre and radius of a ball around each movable geom, m. (n_worlds * n_movable, 4)"""
     movable: Array
@@ -101,28 +101,28 @@ class Tables(NamedTuple):
     eyes: Array
     """Position, and axes by rows, of the cameras. (n_worlds * n_cameras, 12)"""
     pixels: Array
-    """Direction of the rays in the frame of their camera, and drone that they pass. (n_cameras * n_pixels, 4)"""
+    """Direction of each ray in the frame of its camera, and ``Ray.ignored_drone``. (n_cameras * n_pixels, 4)"""
 
 
 class Targets:
     """Geoms that rays can meet, and their tables."""
 
-    def __init__(self, model: CollisionModel, n_drones: int, drones: bool, passed: int = NOBODY):
+    def __init__(self, model: CollisionModel, n_drones: int, drones: bool, ignored_drone: int = IGNORES_NONE):
         """Sort the geoms of a model.
 
         Args:
             model: Model, without bodies whose poses are not part of the data.
             n_drones: Drones of a world.
             drones: True for rays to meet drones.
-            passed: Drone that all rays pass through; ``NOBODY`` for no drone.
+            ignored_drone: Drone that all rays pass through; ``IGNORES_NONE`` for none.
         """
         targets = [Target(geom, "world", 0, 0) for geom in model.floor]
-        for number, body in enumerate(model.objects, start=1):
+        for index, body in enumerate(model.objects, start=1):
             carrier = "world" if body.row is None else "object"
-            targets += [Target(geom, carrier, body.row or 0, number) for geom in body.geoms]
+            targets += [Target(geom, carrier, body.row or 0, index) for geom in body.geoms]
         for kind in model.drones if drones else ():
             for row in range(n_drones) if kind.drones is None else kind.drones:
-                if row != passed:
+                if row != ignored_drone:
                     targets += [Target(geom, "drone", row, 1 + len(model.objects) + row) for geom in kind.geoms]
         self.fixed = [x for x in targets if x.carrier == "world"]
         """Geoms that do not move."""
@@ -132,7 +132,7 @@ class Targets:
         """All geoms, in the order of their indices."""
         self.surfaces: tuple[Surface, ...] = tuple(dict.fromkeys(x.surface for x in self.all))
         """Distinct surfaces of the geoms."""
-        owners = [x.row if x.carrier == "drone" else NO_DRONE for x in self.all]
+        owners = [x.row if x.carrier == "drone" else NOT_A_DRONE for x in self.all]
         codes = [(self.surfaces.index(x.surface), owner) for x, owner in zip(self.all, owners, strict=True)]
         self.codes = np.array(codes, np.int32).reshape(-1, 2)
         """Index of the surface of each geom, and the drone that it belongs to. (n, 2)"""
@@ -146,7 +146,7 @@ class Targets:
             centre, half = np.array(target.geom.pos) + rot @ centre, np.abs(rot) @ half
             low[k], high[k] = centre - half, centre + half
         boxes, links = (x.reshape(-1, x.shape[-1]) for x in hierarchy.build_hierarchy(low, high))
-        geoms = np.array([x.numbers(np.array(x.geom.pos)) for x in self.fixed]).reshape(-1, 16)
+        geoms = np.array([x.table_row(np.array(x.geom.pos)) for x in self.fixed]).reshape(-1, 16)
         codes = self.codes[: len(self.fixed)]
         return Hierarchy(jnp.asarray(codes), jnp.asarray(boxes, dtype), jnp.asarray(links), jnp.asarray(geoms, dtype))
 
@@ -169,7 +169,7 @@ class Targets:
             else:
                 poses = states.pos, states.quat
             pos, quat = (x[:, np.array([t.row for t in targets])] for x in poses)
-            rows = np.array([t.numbers(np.array(t.geom.pos)) for t in targets])
+            rows = np.array([t.table_row(np.array(t.geom.pos)) for t in targets])
             rot = rows[:, 4:13].reshape(-1, 3, 3)
             middles = [r @ bounding_box(t.geom.shape)[0] for r, t in zip(rot, targets, strict=True)]
             radii = np.array([bounding_radius(t.geom.shape) for t in targets])
@@ -192,7 +192,7 @@ class Targets:
             balls: From ``movable_rows``.
             geoms: From ``movable_rows``.
             eyes: Position, m, and axes by rows, of the cameras. (n_worlds, n_cameras, 12)
-            pixels: Directions in the frame of the camera, and the drone that a ray passes. (n_cameras, n_pixels, 4)
+            pixels: Directions in the frame of the camera, and ``Ray.ignored_drone``. (n_cameras, n_pixels, 4)
         """
         fixed = self.hierarchy(eyes.dtype)
         counts = np.array([[len(fixed.boxes) // hierarchy.N_ORDERS, len(self.fixed), len(self.movable)]], np.int32)
@@ -209,8 +209,8 @@ class Ray(NamedTuple):
     """Origin, world frame, m."""
     direction: Components
     """Unit direction, world frame."""
-    passes: Array
-    """Drone that it passes through, or ``NOBODY``."""
+    ignored_drone: Array
+    """Index of the drone that it passes through, or ``IGNORES_NONE``."""
 
 
 BestHit = tuple[Array, Array]
@@ -234,25 +234,25 @@ def first_hit(surfaces: Sequence[Surface], n_pixels: int, n_cameras: int, index:
     view = lax.div(index, jnp.int32(n_pixels))
     world = lax.div(view, jnp.int32(n_cameras))
     camera, pixel = view - world * n_cameras, index - view * n_pixels
-    eye, (*look, passes) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
+    eye, (*look, ignored_drone) = table_rows(t.eyes, view), table_rows(t.pixels, camera * n_pixels + pixel)
     x, y, z = (eye[k] * look[0] + eye[k + 1] * look[1] + eye[k + 2] * look[2] for k in (3, 6, 9))
-    ray = Ray((eye[0], eye[1], eye[2]), (x, y, z), passes.astype(jnp.int32))
+    ray = Ray((eye[0], eye[1], eye[2]), (x, y, z), ignored_drone.astype(jnp.int32))
     best = jnp.full_like(eye[0], jnp.inf), jnp.int32(-1)
 
     best = first_fixed_hit(surfaces, Hierarchy(t.codes, t.boxes, t.links, t.fixed), ray, best, n_nodes)
 
-    def turn(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
+    def check_movable(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
         k, best = carry
         row, geom = world * n_movable + k, n_fixed + k
         code, owner = table_rows(t.codes, geom)
-        meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.passes)
+        meets = _meets_ball(table_rows(t.balls, row), ray, best[0]) & (owner != ray.ignored_drone)
 
         def visit(best: BestHit) -> BestHit:
             return _nearer_hit(surfaces, code, geom, table_rows(t.movable, row), ray, meets, best)
 
         return k + 1, compute_where(any_lane(meets), visit, best)
 
-    return lax.while_loop(lambda carry: carry[0] < n_movable, turn, (jnp.int32(0), best))[1]
+    return lax.while_loop(lambda carry: carry[0] < n_movable, check_movable, (jnp.int32(0), best))[1]
 
 
 def first_fixed_hit(
@@ -273,7 +273,7 @@ def first_fixed_hit(
     signs = [any_lane(d < 0) for d in ray.direction]
     start = sum(jnp.where(sign, jnp.int32(1 << k), 0) for k, sign in enumerate(signs)) * n_nodes
 
-    def walk(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
+    def check_node(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
         node, best = carry
         box, (after, geom) = table_rows(tables.boxes, start + node), table_rows(tables.links, start + node)
         meets = _meets_box(box[:3], box[3:], scaled, inverse, best[0])
@@ -282,12 +282,12 @@ def first_fixed_hit(
             code, _ = table_rows(tables.codes, geom)
             return _nearer_hit(surfaces, code, geom, table_rows(tables.geoms, geom), ray, meets, best)
 
-        def go_in(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
+        def descend(carry: tuple[Array, BestHit]) -> tuple[Array, BestHit]:
             return node + 1, compute_where(geom >= 0, visit, carry[1])
 
-        return compute_where(any_lane(meets), go_in, (after, best))
+        return compute_where(any_lane(meets), descend, (after, best))
 
-    return lax.while_loop(lambda carry: carry[0] < n_nodes, walk, (jnp.int32(0), best))[1]
+    return lax.while_loop(lambda carry: carry[0] < n_nodes, check_node, (jnp.int32(0), best))[1]
 
 
 def _maximum(a: Array, b: Array) -> Array:
@@ -334,19 +334,19 @@ def _nearer_hit(
 ) -> BestHit:
     """Return the best hit, or a nearer hit of geom ``k`` where a ray may meet it."""
     start, along = ray_in_frame(row, ray.origin, ray.direction)
-    for number, surface in enumerate(surfaces):
+    for index, surface in enumerate(surfaces):
 
-        def of_surface(best: BestHit, surface: Surface = surface) -> BestHit:
+        def hit_surface(best: BestHit, surface: Surface = surface) -> BestHit:
             far = _ray_length(surface, row, start, along)
             closer = meets & ((far < best[0]) | ((far == best[0]) & (k < best[1])))
             return jnp.where(closer, far, best[0]), jnp.where(closer, k, best[1])
 
-        best = compute_where(code == number, of_surface, best) if len(surfaces) > 1 else of_surface(best)
+        best = compute_where(code == index, hit_surface, best) if len(surfaces) > 1 else hit_surface(best)
     return best
 
 
 def ray_in_frame(row: Sequence[Array], origin: Components, direction: Components) -> tuple[Components, Components]:
-    """Return a ray in the frame of the geom with the given row; see ``Target.numbers``."""
+    """Return a ray in the frame of the geom with the given row; see ``Target.table_row``."""
     away = [o - p for o, p in zip(origin, row, strict=False)]
     start, along = (
         tuple(sum(row[4 + 3 * i + k] * v[i] for i in range(3)) for k in range(3)) for v in (away, direction)
@@ -355,7 +355,7 @@ def ray_in_frame(row: Sequence[Array], origin: Components, direction: Components
 
 
 def geom_shape(surface: Surface, row: Sequence[Array]) -> Shape | SizedShapes:
-    """Return the shape of the geom with the given row; see ``Target.numbers``."""
+    """Return the shape of the geom with the given row; see ``Target.table_row``."""
     return SizedShapes(surface, row[13 : 13 + N_SIZES[surface]]) if isinstance(surface, str) else surface
 
 
@@ -372,7 +372,7 @@ def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) ->
     """Return the distance along one ray to a mesh, in a loop over its planes; see ``hit_distance``. m, ()"""
     planes = jnp.asarray(np.column_stack([shape.array("normals"), shape.array("offsets")]), origin[0].dtype)
 
-    def turn(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:
+    def cut_by_plane(carry: tuple[Array, Interval], _: None) -> tuple[tuple[Array, Interval], None]:
         k, (near, far, meets) = carry
         x, y, z, offset = table_rows(planes, k)
         below = offset - (x * origin[0] + y * origin[1] + z * origin[2])
@@ -385,5 +385,5 @@ def _mesh_ray_length(shape: Shape, origin: Components, direction: Components) ->
 
     infinite = jnp.full_like(origin[0], jnp.inf)
     initial = jnp.int32(0), (-infinite, infinite, infinite > 0)
-    (_, (near, far, meets)), _ = lax.scan(turn, initial, length=len(planes))
+    (_, (near, far, meets)), _ = lax.scan(cut_by_plane, initial, length=len(planes))
     return first_distance((near, far, meets & (near <= far)))

@@ -24,7 +24,16 @@ from crazysim.geometry.points import components
 from crazysim.geometry.rays import hit_distance, hit_normal
 from crazysim.pytree import PyTree, static
 from crazysim.scene.collision import CollisionGeom, CollisionModel
-from crazysim.scene.first_hit import NOBODY, Ray, Surface, Targets, first_fixed_hit, first_hit, geom_shape, ray_in_frame
+from crazysim.scene.first_hit import (
+    IGNORES_NONE,
+    Ray,
+    Surface,
+    Targets,
+    first_fixed_hit,
+    first_hit,
+    geom_shape,
+    ray_in_frame,
+)
 from crazysim.scene.mocap import MocapPoses, require_poses, with_mocap_bodies
 
 MAX_UNROLLED_GEOMS = 16
@@ -43,14 +52,14 @@ class Hits(PyTree):
     """Length of the ray, m; infinite where it meets nothing."""
     normal: Array
     """Unit normal of the surface, world frame; zero where the ray meets nothing. (..., 3)"""
-    number: Array
-    """Index in ``body_names`` of the body; -1 where the ray meets nothing."""
+    body_index: Array
+    """Index of the body in ``names``; -1 where the ray meets nothing."""
     names: tuple[str, ...] = static()
     """Floor, objects and drones, in that order."""
 
 
 def body_names(model: CollisionModel, n_drones: int) -> tuple[str, ...]:
-    """Return the names of everything that rays can meet, in the order of ``Hits.number``."""
+    """Return the names of everything that rays can meet, in the order of ``Hits.body_index``."""
     return ("floor", *(body.name for body in model.objects), *(f"drone:{i}" for i in range(n_drones)))
 
 
@@ -59,7 +68,7 @@ def cast_rays(
     data: SimData,
     origin: Array,
     direction: Array,
-    drone_of_ray: np.ndarray | None = None,
+    ignored_drones: np.ndarray | None = None,
     drones: bool = True,
     mocap: MocapPoses = None,
     kernels: RayKernels | None = None,
@@ -72,7 +81,7 @@ def cast_rays(
         data: Simulation, for the poses of objects and drones.
         origin: Origins of the rays, world frame, m. (n_worlds, n_rays, 3), without n_worlds in one world or drone
         direction: Unit directions, world frame. The same shape
-        drone_of_ray: Index of the drone that a ray passes through; None for no drone. (n_rays,)
+        ignored_drones: Index of the drone that a ray passes through; None for no drone. (n_rays,)
         drones: True for rays to meet drones; a stage of one drone has no access to the others.
         mocap: Poses of bodies that are moved through ``mjx_data``; None if there are none.
         kernels: Kernels that may cast the rays of all worlds; None for XLA.
@@ -82,31 +91,31 @@ def cast_rays(
     data = with_mocap_bodies(model, data, mocap)
     if origin.ndim == 3:
         # Each ray is a camera of one pixel, whose first axis is the direction of the ray.
-        zero, passes = (
+        zero, ignored = (
             jnp.zeros((*direction.shape, 2), direction.dtype),
-            NOBODY if drone_of_ray is None else drone_of_ray,
+            IGNORES_NONE if ignored_drones is None else ignored_drones,
         )
         axes = jnp.concatenate([direction[..., None], zero], axis=-1).reshape(*direction.shape[:2], 9)
         ahead = np.zeros((origin.shape[1], 1, 4))
-        ahead[..., 0], ahead[:, 0, 3] = 1.0, passes
+        ahead[..., 0], ahead[:, 0, 3] = 1.0, ignored
         eyes = jnp.concatenate([origin, axes], axis=-1)
         return cast_rays_in_worlds(model, data, eyes, ahead, drones, kernels or RayKernels())
     best = Hits(
         distance=jnp.full(origin.shape[:-1], jnp.inf, origin.dtype),
         normal=jnp.zeros_like(origin),
-        number=jnp.full(origin.shape[:-1], -1, jnp.int32),
+        body_index=jnp.full(origin.shape[:-1], -1, jnp.int32),
         names=body_names(model, data.core.n_drones if drones else 0),
     )
     targets = Targets(model, 0, drones=False)
     if len(targets.fixed) * len(origin) <= MAX_PAIRS:
         for target in targets.fixed:
-            best = _nearer_hits(best, *_hit_geom(target.geom, origin, direction), target.number)
+            best = _nearer_hits(best, *_hit_geom(target.geom, origin, direction), target.body_index)
     else:
         best = _nearer_hits(best, *_hit_fixed_geoms(targets, origin, direction, limit))
     groups: dict[tuple[CollisionGeom, ...], list[tuple[int, int]]] = {}
-    for number, body in enumerate(model.objects, start=1):
+    for index, body in enumerate(model.objects, start=1):
         if body.row is not None:
-            groups.setdefault(body.geoms, []).append((body.row, number))
+            groups.setdefault(body.geoms, []).append((body.row, index))
     if data.objects is not None:
         pos, quat = data.objects.pos, data.objects.quat
         for geoms, group in groups.items():
@@ -116,7 +125,7 @@ def cast_rays(
         for kind in model.drones:
             rows = np.arange(data.core.n_drones) if kind.drones is None else np.asarray(kind.drones)
             group = np.stack([rows, rows + 1 + len(model.objects)], axis=-1)
-            best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, drone_of_ray)
+            best = _hit_bodies(best, kind.geoms, pos, quat, group, origin, direction, ignored_drones)
     return best
 
 
@@ -128,7 +137,7 @@ def _hit_bodies(
     group: np.ndarray,
     origin: Array,
     direction: Array,
-    row_of_ray: np.ndarray | None,
+    ignored_rows: np.ndarray | None,
 ) -> Hits:
     """Return the nearer of earlier hits and hits of movable bodies with equal geoms.
 
@@ -137,23 +146,23 @@ def _hit_bodies(
         geoms: Geoms of each body, in its frame.
         pos: Positions of all movable bodies, m. (..., n, 3)
         quat: Their attitudes, xyzw. (..., n, 4)
-        group: Row of each body of the group in ``pos``, and its number in ``Hits.number``. (k, 2)
+        group: Row of each body of the group in ``pos``, and its index, as in ``Hits.body_index``. (k, 2)
         origin: Origins of the rays. (..., n_rays, 3)
         direction: Their directions. (..., n_rays, 3)
-        row_of_ray: Row of the body that a ray passes through. (n_rays,)
+        ignored_rows: Row of the body that a ray passes through. (n_rays,)
     """
 
-    def with_one(best: Hits, row: Array, number: Array) -> Hits:
+    def nearer_hits_of_body(best: Hits, row: Array, body_index: Array) -> Hits:
         p, q = (jnp.take(x, row, axis=-2)[..., None, :] for x in (pos, quat))
         start, along = rotation.rotate_inverse(q, origin - p), rotation.rotate_inverse(q, direction)
         for geom in geoms:
             far, normal = _hit_geom(geom, start, along)
-            far = far if row_of_ray is None else jnp.where(row_of_ray == row, jnp.inf, far)
-            best = _nearer_hits(best, far, rotation.rotate(q, normal), number)
+            far = far if ignored_rows is None else jnp.where(ignored_rows == row, jnp.inf, far)
+            best = _nearer_hits(best, far, rotation.rotate(q, normal), body_index)
         return best
 
-    for row, number in group:
-        best = with_one(best, row, number)
+    for row, body_index in group:
+        best = nearer_hits_of_body(best, row, body_index)
     return best
 
 
@@ -174,12 +183,12 @@ def _constant_product(matrix: np.ndarray, vectors: Array) -> Array:
     return jnp.stack([functools.reduce(jnp.add, row) for row in terms], axis=-1)
 
 
-def _nearer_hits(best: Hits, far: Array, normal: Array, number: Array | int) -> Hits:
+def _nearer_hits(best: Hits, far: Array, normal: Array, body_index: Array | int) -> Hits:
     closer = far < best.distance
     return best.replace(
         distance=jnp.where(closer, far, best.distance),
         normal=jnp.where(closer[..., None], normal, best.normal),
-        number=jnp.where(closer, jnp.asarray(number, jnp.int32), best.number),
+        body_index=jnp.where(closer, jnp.asarray(body_index, jnp.int32), best.body_index),
     )
 
 
@@ -200,28 +209,28 @@ def _hit_fixed_geoms(
     Returns:
         Distance, m, infinite for none. (n_rays,)
         Unit normal, world frame, zero for none. (n_rays, 3)
-        Number of the body, as in ``Hits``. (n_rays,)
+        Index of the body, as in ``Hits.body_index``. (n_rays,)
     """
     tables = targets.hierarchy(origin.dtype)
     surfaces = targets.surfaces[: 1 + targets.codes[: len(targets.fixed), 0].max()]
     starts, ways = jax.lax.stop_gradient((origin, direction))
     initial = jax.lax.stop_gradient(jnp.asarray(limit, origin.dtype)), jnp.int32(-1)
 
-    def of_some(starts: Array, ways: Array) -> Array:
-        def turn(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+    def first_geoms(starts: Array, ways: Array) -> Array:
+        def cast_next(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             k, which = carry
-            ray = Ray(components(starts[k]), components(ways[k]), jnp.int32(NOBODY))
+            ray = Ray(components(starts[k]), components(ways[k]), jnp.int32(IGNORES_NONE))
             return (k + 1, which.at[k].set(first_fixed_hit(surfaces, tables, ray, initial)[1])), None
 
-        none = jnp.int32(0), jnp.full(len(starts), -1, jnp.int32)
-        return jax.lax.scan(turn, none, length=len(starts))[0][1]
+        initial_carry = jnp.int32(0), jnp.full(len(starts), -1, jnp.int32)
+        return jax.lax.scan(cast_next, initial_carry, length=len(starts))[0][1]
 
     chunks = [slice(k, k + MAX_LOOP_RAYS) for k in range(0, len(starts), MAX_LOOP_RAYS)]
-    which = jnp.concatenate([of_some(starts[chunk], ways[chunk]) for chunk in chunks])
+    which = jnp.concatenate([first_geoms(starts[chunk], ways[chunk]) for chunk in chunks])
     rows = jnp.take(tables.geoms, jnp.maximum(which, 0), axis=0)
     distance, normal_at = _hit_rows(surfaces, targets.codes, which, rows, origin, direction)
-    numbers = jnp.asarray([target.number for target in targets.fixed], jnp.int32)
-    return distance, normal_at(distance), jnp.take(numbers, jnp.maximum(which, 0))
+    body_indices = jnp.asarray([target.body_index for target in targets.fixed], jnp.int32)
+    return distance, normal_at(distance), jnp.take(body_indices, jnp.maximum(which, 0))
 
 
 def _hit_rows(
@@ -233,7 +242,7 @@ def _hit_rows(
         surfaces: ``Targets.surfaces``, or the first of them.
         codes: Index of the surface of each geom in the first column. (n, 2)
         which: Index of the geom of each ray, -1 for none. (...)
-        rows: Rows of these geoms; see ``Target.numbers``. (..., 16)
+        rows: Rows of these geoms; see ``Target.table_row``. (..., 16)
         origin: Origins of the rays, world frame, m. (..., 3)
         direction: Unit directions, world frame. (..., 3)
     """
@@ -243,22 +252,22 @@ def _hit_rows(
     code = jnp.take(jnp.asarray(codes[:, 0]), jnp.maximum(which, 0))
     hits = []
     exact = jnp.full_like(start[0], jnp.inf)
-    for number, surface in enumerate(surfaces):
-        mine = (which >= 0) & (code == number)
+    for index, surface in enumerate(surfaces):
+        selected = (which >= 0) & (code == index)
         # Geoms of other kinds get sizes of 1, so that derivatives are finite.
-        shape = geom_shape(surface, [*row[:13], *(jnp.where(mine, x, 1.0) for x in row[13:])])
+        shape = geom_shape(surface, [*row[:13], *(jnp.where(selected, x, 1.0) for x in row[13:])])
         if isinstance(shape, Shape) and shape.kind == "hfield":
             far, normal = ray_distance(shape, ray_start, ray_direction)
         else:
             far, normal = hit_distance(shape, start, along), None
-        exact = jnp.where(mine, far, exact)
-        hits.append((mine, shape, normal))
+        exact = jnp.where(selected, far, exact)
+        hits.append((selected, shape, normal))
 
     def normal_at(distance: Array) -> Array:
         across = jnp.zeros_like(origin)
-        for mine, shape, normal in hits:
+        for selected, shape, normal in hits:
             normal = hit_normal(shape, ray_start, ray_direction, distance) if normal is None else normal
-            across = jnp.where(mine[..., None], normal, across)
+            across = jnp.where(selected[..., None], normal, across)
         return jnp.stack([sum(row[4 + 3 * i + k] * across[..., k] for k in range(3)) for i in range(3)], axis=-1)
 
     return exact, normal_at
@@ -280,13 +289,13 @@ def cast_rays_in_worlds(
         model: Model, without bodies whose poses are not part of the data.
         data: Simulation, for the poses of objects and drones.
         eyes: Position, m, and axes by rows, of the cameras, world frame. (n_worlds, n_cameras, 12)
-        pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``NOBODY``.
+        pixels: Unit directions in the frame of the camera, and the drone that a ray passes through or ``IGNORES_NONE``.
             (n_cameras, n_pixels, 4)
         drones: True for rays to meet drones.
         kernels: Kernels that may be used.
     """
-    passed = np.unique(pixels[..., 3])
-    targets = Targets(model, data.core.n_drones, drones, int(passed[0]) if len(passed) == 1 else NOBODY)
+    ignored = np.unique(pixels[..., 3])
+    targets = Targets(model, data.core.n_drones, drones, int(ignored[0]) if len(ignored) == 1 else IGNORES_NONE)
     n_worlds, (n_cameras, n_pixels, _) = eyes.shape[0], pixels.shape
     balls, movable = targets.movable_rows(data)
     n, tables = n_worlds * n_cameras * n_pixels, targets.tables(balls, movable, eyes, jnp.asarray(pixels, eyes.dtype))
@@ -305,8 +314,8 @@ def cast_rays_in_worlds(
     exact, normal_at = _hit_rows(targets.surfaces, targets.codes, which, rows, origin, direction)
     distance = _replace_derivative(distance, exact)
     normal = normal_at(distance)
-    numbers = jnp.asarray([*(target.number for target in targets.all), -1], jnp.int32)
-    return Hits(distance, normal, numbers[which], body_names(model, data.core.n_drones if drones else 0))
+    body_indices = jnp.asarray([*(target.body_index for target in targets.all), -1], jnp.int32)
+    return Hits(distance, normal, body_indices[which], body_names(model, data.core.n_drones if drones else 0))
 
 
 @dataclasses.dataclass

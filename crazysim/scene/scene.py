@@ -261,8 +261,8 @@ class Scene:
         """Return ``depth(data, mocap=None) -> Hits``, pure: depth images of all worlds, by one ray for each pixel.
 
         ``Hits.distance`` is the image in m, (n_worlds, n_cameras, height, width), along with ``normal`` and
-        ``number``, the index of the body that was hit. Inside jit, fields that are not used are not computed. Objects
-        of plugins, such as loads, are where the plugins' records in ``data`` have them.
+        ``body_index``, the index of the body that was hit. Inside jit, fields that are not used are not computed.
+        Objects of plugins, such as loads, are where the plugins' records in ``data`` have them.
 
         Args:
             camera: ``fpv_cam`` or ``track_cam`` for the cameras of all drones (n_cameras is n_drones then); or the name

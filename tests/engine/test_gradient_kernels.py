@@ -241,7 +241,7 @@ def test_the_gradient_is_that_of_the_platform_that_jax_compiles_for():
 )
 def test_a_gradient_on_a_gpu_has_limited_memory(n_lanes, n_steps, n_blocks, interval):
     """24 numbers of 2**20 lanes at once, as 100 and as 32 + 32 states, would take 10 and 6 GB."""
-    kernel = Kernel("", (), (), kept=24 * 4)
+    kernel = Kernel("", (), (), state_bytes=24 * 4)
     blocks, count, (memory,) = cuda._plan_memory(kernel, n_lanes, n_steps)
     assert blocks * kernel.lanes * -(-n_lanes // (blocks * kernel.lanes)) >= n_lanes
     assert count.tolist() == [n_steps, interval]

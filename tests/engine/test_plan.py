@@ -179,7 +179,7 @@ def test_a_compiler_that_fails_costs_speed_and_says_so(sim, monkeypatch, tmp_pat
     with pytest.warns(EngineWarning, match=re.escape(words)) as caught:
         plan = step.plan(sim.data)
     assert plan.engine == "lanes"
-    assert words in plan.why
+    assert words in plan.engine_reason
     assert "sway, " in str(caught[0].message)
     assert_steps_like_plain(sim, step, (sway,))
     with pytest.raises(ConfigError, match=re.escape(words)):

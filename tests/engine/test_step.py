@@ -533,7 +533,7 @@ def test_every_pipeline_compiles_for_a_gpu(settings):
     assert parameters.count(".param") == 2 + len(source.inputs) + len(source.outputs) + 1  # sizes, count, ..., flags
     assert text.count("st.global") >= sum(plan.program.leaves[i].size for i in source.outputs)  # nothing is lost
     inputs = step.flatten(sim.data).inputs()
-    lowered = plan.dynamic.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
+    lowered = plan.traced_count_step.trace(inputs, jnp.int32(3)).lower(lowering_platforms=("cuda",))
     assert lowered.as_text().count(cuda.PTX_TARGET) == 1  # one kernel for all stages and steps
 
 

@@ -183,7 +183,7 @@ def test_the_shell_computes_nothing(module):
         "x = jnp.where(on, a, b)",
         "x = np.cross(a, b)",
         "x = jax.vmap(f)(a)",
-        "x = rotation.turn(q, v)",
+        "x = rotation.integrate_attitude(q, v)",
         "pos[0] = 1.0",
         "up = rotation_matrix @ thrust",
     ],

@@ -141,7 +141,7 @@ def _lookups(sim):
 
 
 def _compiled(sim):
-    return sim.step_fn.plan(sim.data).dynamic._cache_size()
+    return sim.step_fn.plan(sim.data).traced_count_step._cache_size()
 
 
 def test_resets_restore_slots_starts_and_indices():

@@ -312,7 +312,7 @@ def test_cameras_see_such_bodies_and_hang_on_them(attached):
     first = np.asarray(sim.depth(**look))
     hits = jax.device_get(jax.jit(sim.scene.depth_fn(**look))(sim.data, sim.mjx_data))
     np.testing.assert_allclose(hits.distance, first, atol=1e-6)
-    assert "rock:0" in {hits.names[k] for k in np.unique(hits.number)}
+    assert "rock:0" in {hits.names[k] for k in np.unique(hits.body_index)}
     np.testing.assert_allclose(first.min(), 1 - 0.3, atol=1e-5)  # from 1 m over its middle to its upper side
     move_rocks(sim, [0, 0, 3])
     depth = np.asarray(sim.depth(**look))

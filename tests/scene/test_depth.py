@@ -62,7 +62,7 @@ def test_a_wall_a_floor_and_a_ball_are_where_they_are(room, look_ahead):
     hits = jax.device_get(look_ahead(sim.data))
     np.testing.assert_allclose(hits.distance[0, 0], expected, rtol=1e-5)
     which = np.stack([floor, wall, ball]).argmin(axis=0)
-    names = np.array(hits.names)[hits.number[0, 0]]
+    names = np.array(hits.names)[hits.body_index[0, 0]]
     np.testing.assert_array_equal(names, np.array(["floor", "wall:0", "sphere:0"])[which])
     assert set(which.ravel()) == {0, 1, 2}
     normal = hits.normal[0, 0]
@@ -85,7 +85,7 @@ def test_depth_follows_the_objects_of_each_world(room, look_ahead):
     sim, _, box = room
     data = box.set_pose(sim.data, np.array([[[1.0, 0, 1.0]], [[0, 0, -50.0]]]))
     hits = look_ahead(data)
-    seen = (np.asarray(hits.number) == hits.names.index("box:0")).reshape(2, -1).sum(axis=1)
+    seen = (np.asarray(hits.body_index) == hits.names.index("box:0")).reshape(2, -1).sum(axis=1)
     assert seen[0] > 20
     assert seen[1] == 0
 
@@ -104,13 +104,13 @@ def test_a_drone_sees_others_and_not_itself(room):
         for camera, hide_own in (("fpv_cam", True), ("track_cam:1", False), ("track_cam:1", True))
     )
     first = hits.names.index("drone:0")
-    assert not (hits.number[:, 1] >= first).any()
-    others = hits.number[0, 0] == first + 1
-    assert not (hits.number[:, 0] == first).any()
+    assert not (hits.body_index[:, 1] >= first).any()
+    others = hits.body_index[0, 0] == first + 1
+    assert not (hits.body_index[:, 0] == first).any()
     assert 4 < others.sum() < 400
     assert np.argwhere(others)[:, 1].min() > 48, "what is at -y is in the right half"
-    assert (own.number[0, 0] == first + 1).sum() > 8
-    assert not (hidden.number[0, 0] == first + 1).any()
+    assert (own.body_index[0, 0] == first + 1).sum() > 8
+    assert not (hidden.body_index[0, 0] == first + 1).any()
 
 
 @pytest.mark.usefixtures("opengl")
@@ -402,13 +402,13 @@ def test_rays_of_all_worlds_are_those_of_each_world(x64, crowd, rng):
 
     by_kernel, by_xla, by_world = one_by_one(crowd, own)
     ((_, together), slopes), ((_, each), expected) = map(answer, (by_kernel, by_world))
-    seen = {together.names[k].partition(":")[0] for k in np.unique(together.number) if k >= 0}
+    seen = {together.names[k].partition(":")[0] for k in np.unique(together.body_index) if k >= 0}
     assert seen == {"floor", "fixed", "moving", "drone"}
-    np.testing.assert_array_equal(together.number, each.number)
+    np.testing.assert_array_equal(together.body_index, each.body_index)
     np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9)
     np.testing.assert_allclose(together.normal, each.normal, atol=1e-9)
     unfused = jax.jit(by_xla)(data, origin, direction)
-    for name in ("number", "distance", "normal"):
+    for name in ("body_index", "distance", "normal"):
         np.testing.assert_allclose(getattr(unfused, name), getattr(together, name), rtol=1e-9, atol=1e-9)
     for slope, known in zip(slopes, expected, strict=True):
         assert np.abs(known).max() > 0.1
@@ -435,7 +435,7 @@ def test_rays_meet_geoms_of_every_kind_where_c_mujoco_has_them(crowd, rng):
         else:
             met.add(int(crowd.mj_model.geom_type[geom[0]]))
             body = crowd.mj_model.body_rootid[crowd.mj_model.geom_bodyid[geom[0]]]
-            assert hits.names[hits.number[1, k]] == (crowd.mj_model.body(body).name if body else "floor")
+            assert hits.names[hits.body_index[1, k]] == (crowd.mj_model.body(body).name if body else "floor")
             assert hits.distance[1, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
     assert len(met) == 8
 
@@ -478,7 +478,7 @@ def test_each_of_many_equal_geoms_is_known_by_name(forest, rng, platform):
             assert not np.isfinite(hits.distance[0, k])
             continue
         body = sim.mj_model.body(sim.mj_model.body_rootid[sim.mj_model.geom_bodyid[geom[0]]])
-        assert hits.names[hits.number[0, k]] == (body.name if body.id else "floor")
+        assert hits.names[hits.body_index[0, k]] == (body.name if body.id else "floor")
         assert hits.distance[0, k] == pytest.approx(far, rel=1e-4, abs=1e-4)
         met.add(body.name)
     assert len(met) > 50

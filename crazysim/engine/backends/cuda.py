@@ -27,7 +27,7 @@ from crazysim import jaxcompat
 from crazysim.engine.backends import ffi_handlers, kernel_cache
 from crazysim.engine.backends.exchange import WARP_THREADS
 from crazysim.engine.backends.ffi_handlers import check_driver
-from crazysim.engine.backends.frame import ANY_NUMBER_OF_BLOCKS, Kernel, interval
+from crazysim.engine.backends.frame import ANY_NUMBER_OF_BLOCKS, Kernel, steps_per_interval
 from crazysim.engine.backends.native import Launch
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
@@ -89,7 +89,7 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
     def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
         kernel = few if n_lanes < RESIDENT_LANES else many
         n_blocks, memory = -(-n_lanes // kernel.lanes), []
-        if kernel.kept:
+        if kernel.state_bytes:
             n_blocks, count, memory = _plan_memory(kernel, n_lanes, int(count[0]))
         grid = {"grid_x": n_blocks, "grid_y": 1, "grid_z": 1}
         block = {"block_x": kernel.threads, "block_y": 1, "block_z": 1}
@@ -128,9 +128,9 @@ def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.nd
     If the memory would exceed ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, which each process several groups
     of lanes in turn.
     """
-    here = interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.kept, MAX_GRADIENT_MEMORY_BYTES)
+    here = steps_per_interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.state_bytes, MAX_GRADIENT_MEMORY_BYTES)
     n_states = here + max(-(-n_steps // here), 1)
-    size = n_states * kernel.kept * kernel.threads
+    size = n_states * kernel.state_bytes * kernel.threads
     n_blocks = -(-n_lanes // kernel.lanes)
     turns = -(-n_blocks // max(MAX_GRADIENT_MEMORY_BYTES // size, 1))
     n_blocks = -(-n_blocks // turns)
@@ -168,7 +168,7 @@ def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
         least, *found = pool.map(lambda c: resources(c, device), candidates)
     # Measured on an H200: docs/concepts/engine.md. Gradients are slower with 168 registers and 248 bytes than with 255.
-    bearable = 16 if least.registers <= 224 or kernel.kept else 256
+    bearable = 16 if least.registers <= 224 or kernel.state_bytes else 256
     suitable = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
     return next(suitable, kernel)
 
@@ -178,7 +178,7 @@ def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
 
     Kernels of gradients, of large worlds, and with few registers for each thread stay as they are.
     """
-    stays = kernel.kept or kernel.group > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
+    stays = kernel.state_bytes or kernel.group > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
     return (
         kernel
         if stays or resources(kernel, device).code <= INSTRUCTION_CACHE_BYTES

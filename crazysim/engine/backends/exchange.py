@@ -95,7 +95,7 @@ class Exchange(Protocol):
         ...
 
 
-class OneLane(Exchange):
+class UnsplitLane(Exchange):
     """Base of exchanges in which the code of a lane is not split, so that its variables stay defined."""
 
     depth = 0
@@ -115,7 +115,7 @@ class OneLane(Exchange):
         pass
 
 
-class Registers(OneLane):
+class Registers(UnsplitLane):
     """Lanes of one warp or vector, which read each other's registers."""
 
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
@@ -130,7 +130,7 @@ class Registers(OneLane):
         return []
 
 
-class SharedMemory(OneLane):
+class SharedMemory(UnsplitLane):
     """Threads of one block of a GPU, which exchange numbers through the block's memory."""
 
     def __init__(self, lanes: int):
@@ -167,8 +167,10 @@ class SharedMemory(OneLane):
         return lines
 
 
-class Sweeps(Exchange):
-    """Several vectors of the host for a world: each part of a step is computed for all before the next part begins.
+class HostMemory(Exchange):
+    """Several vectors of the host for a world, which exchange numbers through memory.
+
+    Each part of a step is computed for all vectors before the next part begins.
 
     Numbers that later parts use are kept in memory.
     """
@@ -176,7 +178,7 @@ class Sweeps(Exchange):
     depth = 1
 
     def __init__(self) -> None:
-        self.kept: list[str] = []
+        self._fields: list[str] = []
 
     def publish(self, writer: LineWriter, values: Published, live: Live, depth: int) -> list[Read]:
         arrays = []
@@ -191,7 +193,7 @@ class Sweeps(Exchange):
         return [lambda j, x=x: f"of_place(w.{x}, {j})" for x in arrays]
 
     def variable(self, writer: LineWriter, name: str, kind: str, value: str, depth: int) -> str:
-        self.kept.append(f"{kind}v {name}[VECTORS];")
+        self._fields.append(f"{kind}v {name}[VECTORS];")
         writer.line(f"w.{name}[v] = {kind}_lanes({value});", depth)
         return f"w.{name}[v]"
 
@@ -206,14 +208,14 @@ class Sweeps(Exchange):
 
     @property
     def declarations(self) -> list[str]:
-        return ["struct World {", *(f"  {line}" for line in self.kept), "};"]
+        return ["struct World {", *(f"  {line}" for line in self._fields), "};"]
 
 
 def exchange_for(target: str, group: int) -> Exchange:
     """Return the way in which the drones of a world read each other's numbers on a target."""
     if target == "cuda":
         return Registers() if group <= WARP_THREADS else SharedMemory(lanes_of_block(group)[1])
-    return Registers() if group <= MAX_IN_VECTOR else Sweeps()
+    return Registers() if group <= MAX_IN_VECTOR else HostMemory()
 
 
 def lanes_of_block(group: int) -> tuple[int, int]:

@@ -35,8 +35,8 @@ class Kernel:
     """Threads of a block that are lanes. If drones read each other's numbers, they make up whole worlds."""
     group: int = 1
     """Drones of a world that read each other's numbers."""
-    kept: int = 0
-    """Memory that a lane keeps for each step of an interval, bytes; 0 for a kernel without backward pass. A kernel with
+    state_bytes: int = 0
+    """Memory in which a lane stores the state before a step, bytes; 0 for a kernel without backward pass. A kernel with
     backward pass takes the number of steps of an interval after the number of all steps."""
 
     def aliases(self) -> dict[int, int]:
@@ -56,18 +56,18 @@ class Kernel:
         return dataclasses.replace(self, text=text, threads=n, lanes=self.lanes * n // self.threads)
 
 
-def interval(n_steps: int, size: int, memory: int) -> int:
-    """Return the steps of an interval of the backward pass: all steps if the state before each fits in memory.
+def steps_per_interval(n_steps: int, state_bytes: int, memory_bytes: int) -> int:
+    """Return the number of steps in an interval of the backward pass: all if the state before each step fits in memory.
 
     Otherwise it is the square root of the number of steps, rounded up. The state before each interval is stored too,
     and this choice needs the least memory.
 
     Args:
         n_steps: Number of steps.
-        size: Memory of the state before a step, bytes.
-        memory: Available memory, bytes.
+        state_bytes: Memory of the state before a step, bytes.
+        memory_bytes: Available memory, bytes.
     """
-    return max(n_steps, 1) if n_steps * size <= memory else math.isqrt(n_steps - 1) + 1
+    return max(n_steps, 1) if n_steps * state_bytes <= memory_bytes else math.isqrt(n_steps - 1) + 1
 
 
 def _preamble(target: str) -> str:
@@ -97,7 +97,7 @@ def make_kernel(
     in_place: tuple[int, ...] = (),
     group: int = 1,
     in_memory: bool = False,
-    kept: int | None = None,
+    n_stored: int | None = None,
 ) -> Kernel:
     """Return the kernel with the given code.
 
@@ -113,22 +113,22 @@ def make_kernel(
         in_place: Leaves that it updates in place.
         group: Drones of a world that read each other's numbers.
         in_memory: True if the numbers of a world are in memory, only on the host.
-        kept: Numbers that a lane keeps for each step of an interval; None for a kernel without backward pass.
+        n_stored: Numbers that a lane stores for each step; None for a kernel without backward pass.
     """
     threads, lanes = lanes_of_block(group)
     lines, body = "\n".join(shared), "\n".join(code)
     if target == "cuda":
-        frame = _cuda(pointers, lines, body, kept is not None)
+        frame = _cuda(pointers, lines, body, n_stored is not None)
     else:
-        frame = _host(pointers, lines, body, in_memory, kept is not None)
+        frame = _host(pointers, lines, body, in_memory, n_stored is not None)
     widest = 8 if any("f64*" in pointer for pointer in pointers) else 4
     defines = f"#define WIDEST {widest}\n#define GROUP {group}\n" + BLOCK_THREADS.format(threads)
     defines += f"#define OPERATIONS {sum(map(_n_operations, blocks))}\n"
     before = "".join(f"{line}\n" for line in declared)
-    if kept is not None:
-        before = f"#define N_KEPT {kept}\n{_preamble(target + '_kept')}{before}"
+    if n_stored is not None:
+        before = f"#define N_KEPT {n_stored}\n{_preamble(target + '_kept')}{before}"
     text = defines + _preamble(target) + before + frame + _epilogue(target)
-    return Kernel(text, inputs, outputs, in_place, threads, lanes, group, (kept or 0) * widest)
+    return Kernel(text, inputs, outputs, in_place, threads, lanes, group, (n_stored or 0) * widest)
 
 
 def _n_operations(block: Block) -> int:

@@ -136,7 +136,7 @@ class Body:
         outputs: tuple[int, ...],
         in_place: tuple[int, ...],
         blocks: Sequence[Block],
-        kept: int | None = None,
+        n_stored: int | None = None,
     ) -> Kernel:
         """Return the kernel of the lines that were written.
 
@@ -146,13 +146,13 @@ class Body:
             outputs: Leaves that it writes.
             in_place: Leaves that it updates in place.
             blocks: Blocks of a step, whose operations are counted.
-            kept: Numbers that each lane stores for each step of an interval; None for a kernel without backward pass.
+            n_stored: Numbers that each lane stores for each step; None for a kernel without backward pass.
         """
         shared, code = self.writer.lines[: self._n_shared], self.writer.lines[self._n_shared :]
         return make_kernel(
             self.target, pointers, shared, code, blocks, [*self.writer.tables, *self.exchange.declarations],
             inputs=inputs, outputs=outputs, in_place=in_place, group=self.program.group,
-            in_memory=self.exchange.depth > 0, kept=kept,
+            in_memory=self.exchange.depth > 0, n_stored=n_stored,
         )  # fmt: skip
 
     def _slots(self) -> tuple[dict[Slot, None], dict[Slot, None]]:

@@ -27,7 +27,7 @@ from jax import Array
 from crazysim import jaxcompat
 from crazysim.cache import cpu_features
 from crazysim.engine.backends import kernel_cache
-from crazysim.engine.backends.frame import Kernel, interval
+from crazysim.engine.backends.frame import Kernel, steps_per_interval
 from crazysim.engine.errors import KernelError
 from crazysim.engine.ir import dump
 from crazysim.errors import ConfigError
@@ -85,14 +85,13 @@ class HostLaunch:
     """A compiled kernel, which traced functions can call."""
 
     def __init__(self, kernel: Kernel):
-        self._name, self._aliases, self._kept = target(kernel), kernel.aliases(), kernel.kept
+        self._name, self._aliases, self._state_bytes = target(kernel), kernel.aliases(), kernel.state_bytes
 
     def __call__(self, n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        if self._kept:
-            lanes_of_vector = VECTOR_BYTES // 4
-            count = np.append(
-                count, np.int32(interval(int(count[0]), self._kept * lanes_of_vector, GRADIENT_MEMORY_BYTES))
-            )
+        if self._state_bytes:
+            state_bytes = self._state_bytes * (VECTOR_BYTES // 4)  # of the lanes of a vector
+            interval = steps_per_interval(int(count[0]), state_bytes, GRADIENT_MEMORY_BYTES)
+            count = np.append(count, np.int32(interval))
         run = jax.ffi.ffi_call(self._name, list(outputs), input_output_aliases=self._aliases)
         return list(run(np.asarray([n_lanes], np.int32), count, *inputs))
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from crazysim import jaxcompat
-from crazysim.core.others import safe_max, safe_min
+from crazysim.core.pair_reductions import safe_max, safe_min
 from crazysim.engine.ir import ops
 from crazysim.engine.ir.blocks import Block, Element, Operation, Value
 

@@ -104,7 +104,7 @@ class Lowering:
             with jaxcompat.read_equation(eqn) as equation:
                 return RULES[name](self, equation, args)
         except UnsupportedError as error:
-            raise error.located(name) from None
+            raise error.with_location(name) from None
 
     def elementwise(self, op: str, args: Sequence[Elements], dtype: Any, params: tuple = ()) -> Elements:
         """Return the results of an operation on every element; operands are broadcast."""

@@ -53,7 +53,7 @@ class RelativeStage(Stage):
             scope = next(iter(scopes))
             if scope == "world":
                 fn, when = world_function(stage, axes.original), None
-        super().__init__(fn, scope, when, name=stage.__name__, why=stage.why, phase=stage.phase)
+        super().__init__(fn, scope, when, name=stage.__name__, unfused_reason=stage.unfused_reason, phase=stage.phase)
 
     def __call__(self, data: Any) -> Any:
         treedef, views = self.axes.treedef, self.axes.views

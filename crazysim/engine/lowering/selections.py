@@ -1,8 +1,8 @@
 """The smallest or largest number over other drones, in a form that has derivatives.
 
 Its derivative is the derivative of the number of the first drone that has the smallest or largest number, as
-``crazysim.core.others`` defines it. That drone is identified by its index, not by comparing numbers, since numbers that
-are computed twice may be rounded differently.
+``crazysim.core.pair_reductions`` defines it. That drone is identified by its index, not by comparing numbers, since
+numbers that are computed twice may be rounded differently.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 import crazysim.engine.lowering.rules  # noqa: F401  (fills the table of rules)
-from crazysim.core.others import reduce_over_others_p
+from crazysim.core.pair_reductions import reduce_over_others_p
 from crazysim.core.stage import PHASES, Axes, Phase, Stage, is_first_step
 from crazysim.engine.errors import LimitError, UnsupportedError
 from crazysim.engine.ir.blocks import Builder, Element, Value, constant, prune
@@ -57,7 +57,7 @@ def lower_stages(
     for phase in PHASES:
         in_phase = [stage for stage in stages if stage.phase == phase]
         lowered = [_lower_stage(axes.stage(x), phase, axes, leaves, known, n_drones, tracer) for x in in_phase]
-        segments += _before_the_steps(lowered, in_phase, axes.numbers.core.steps) if phase == "each" else lowered
+        segments += _before_the_steps(lowered, in_phase, axes.leaf_indices.core.steps) if phase == "each" else lowered
     described = tuple([
         Leaf(name, scope, tuple(x.shape), x.dtype)
         for name, scope, x in zip(axes.names, axes.scopes, leaves, strict=True)
@@ -68,11 +68,11 @@ def lower_stages(
     if changed:  # an element is only known to be zero while no stage writes it
         zeros = tuple([(i, indices) for i, indices in zeros if i not in changed])
         return lower_stages(stages, data, zeros, watched, population, tracer)
-    core = axes.numbers.core
+    core = axes.leaf_indices.core
     if watched is None or core.nonfinite in program.written:
         return program
     members = {i for i, scope in enumerate(axes.scopes) if scope == "drone"}
-    checked = sorted((members | axes.views & set(program.written)) & set(watched(axes.numbers)))
+    checked = sorted((members | axes.views & set(program.written)) & set(watched(axes.leaf_indices)))
     return dataclasses.replace(program, check=_finite_check(axes, leaves, core.nonfinite, core.steps, checked))
 
 
@@ -103,7 +103,7 @@ def _lower_stage(
 ) -> Segment | UnfusedStage:
     try:
         if stage.scope == "batch":
-            raise LimitError(stage.why)
+            raise LimitError(stage.unfused_reason)
         traced = tracer(stage, axes, leaves)
         # If a stage of a world uses no leaf of drones, every drone can run it for its world.
         of_drones = any(axes.scopes[i] == "drone" for i in (*traced.used, *traced.written))
@@ -123,8 +123,8 @@ def _lower_stage(
     except UnsupportedError as error:
         traced = TracedStage(Stage(stage, "batch", name=stage.__name__), axes, leaves)
         traced.dump(stage.__name__)
-        why = error.located(stage=stage.__name__)
-        return UnfusedStage(stage.__name__, phase, traced.fn, tuple(traced.used), tuple(traced.written), why)
+        error = error.with_location(stage=stage.__name__)
+        return UnfusedStage(stage.__name__, phase, traced.fn, tuple(traced.used), tuple(traced.written), error)
 
 
 def _segment(

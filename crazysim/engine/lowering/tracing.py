@@ -67,7 +67,7 @@ class Tracer:
         shapes = tuple([(x.shape, x.dtype) for x in axes.shapes_of_one(list(leaves), stage.scope)])
         key = (id(stage.fn), id(stage.when), axes.treedef, shapes)  # a callable object may have no hash
         if key not in self._found:
-            if stage.fixed:
+            if stage.trace_once:
                 traced = _trace_once(stage, axes, leaves, shapes)
             else:
                 traced = TracedStage(stage, axes, leaves)
@@ -77,15 +77,15 @@ class Tracer:
 
 
 _TRACED_STAGES: dict[Any, TracedStage] = {}
-"""Traced fixed stages, for all simulations of this process."""
+"""Traced stages with ``trace_once``, for all simulations of this process."""
 MAX_TRACED_STAGES = 256
 """Maximum number of traced stages that are kept."""
 
 
 def _trace_once(stage: Stage, axes: Axes, leaves: Sequence[Any], shapes: Any) -> TracedStage:
-    """Return a traced fixed stage, from the cache of this process if possible.
+    """Return a traced stage with ``trace_once``, from the cache of this process if possible.
 
-    The stage must not read the numbers of worlds and drones.
+    The stage must not read ``n_worlds`` and ``n_drones``.
     """
     data = axes.treedef.unflatten(leaves)
     kind = jax.tree.structure(data.replace(core=data.core.replace(n_worlds=0, n_drones=0)))

@@ -24,7 +24,7 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
         zeros: As for ``Step``; with it, ``data`` may be shapes and types.
     """
     plan = step.plan(data, zeros)
-    lines = [f"engine: {plan.engine}" + (f" ({plan.why})" if plan.why else "")]
+    lines = [f"engine: {plan.engine}" + (f" ({plan.engine_reason})" if plan.engine_reason else "")]
     if plan.program is None:
         return "\n".join([*lines, f"stages: {', '.join(s.__name__ for s in step.stages)}"])
     for program in plan.programs:

@@ -12,7 +12,7 @@ from jax import Array
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.others import reduce_over_others
+from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.settings import setting
 from crazysim.core.stage import stage
 from crazysim.envs import terms

@@ -178,7 +178,7 @@ def predict(
         pos, quat, vel, ang_vel, more_states = state
         return (
             pos + duration * rates[0],
-            rotation.turn(quat, rates[1], duration, normalize=True),
+            rotation.integrate_attitude(quat, rates[1], duration, normalize=True),
             vel + duration * rates[2],
             ang_vel + duration * rates[3],
             more_states + duration * rates[4],

@@ -167,8 +167,8 @@ class FreeBodies(Population):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         touching = BodyContacts(sim, self)
-        name, why = f"{self.name}_contacts", "it solves the contacts of all worlds at once"
-        contact = Stage(lambda data: touching.respond(data), "batch", name=name, why=why)
+        name, reason = f"{self.name}_contacts", "it solves the contacts of all worlds at once"
+        contact = Stage(lambda data: touching.respond(data), "batch", name=name, unfused_reason=reason)
         return [*super().stages(sim), StagePlacement(contact, before="increment_steps", name=name)]
 
     def derivative(self, data: SimData) -> Mapping[str, Array]:

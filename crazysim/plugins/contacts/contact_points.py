@@ -205,7 +205,7 @@ def _nearest_plate_point(
     pos, quat = data.states.pos[..., None, :], data.states.quat[..., None, :]
 
     def pose(move: Array, turn: Array) -> tuple[Array, Array]:
-        q = rotation.turn(quat, turn, 1.0, normalize=False)
+        q = rotation.integrate_attitude(quat, turn, 1.0, normalize=False)
         columns = [into(rotation.rotate(q, jnp.eye(3, dtype=pos.dtype)[k]), False) for k in range(3)]
         return into(pos + move + rotation.rotate(q, middle), True), jnp.stack(columns, axis=-1)
 

@@ -90,5 +90,5 @@ class DroneCollisions(Plugin):
             states = states_after_contact(data.states, solved, slice(n))
             return self.write(data.replace(states=states), record.replace(**changes))
 
-        solve = Stage(vmap_worlds(of_world), "batch", why="it solves the contacts of all worlds at once")
+        solve = Stage(vmap_worlds(of_world), "batch", unfused_reason="it solves the contacts of all worlds at once")
         return [StagePlacement(solve, before="increment_steps")]

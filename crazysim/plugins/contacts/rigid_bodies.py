@@ -178,7 +178,7 @@ def states_after_contact(states: Any, solved: SolvedBodies, rows: slice) -> Any:
         rows: Rows of these states among the solved bodies.
     """
     ang_vel, angle = (rotation.rotate_inverse(states.quat, x[rows]) for x in (solved.bodies.ang_vel, solved.turned))
-    quat = rotation.turn(states.quat, angle, 1.0)
+    quat = rotation.integrate_attitude(states.quat, angle, 1.0)
     return states.replace(pos=solved.bodies.pos[rows], quat=quat, vel=solved.bodies.vel[rows], ang_vel=ang_vel)
 
 

@@ -71,7 +71,7 @@ class Terrain(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         scope = "drone" if self._check_heights(sim)[0].size <= MAX_FUSED_VALUES else "batch"
-        stop = Stage(self.stop, scope, batched=True, why=WHY_UNFUSED)
+        stop = Stage(self.stop, scope, batched=True, unfused_reason=WHY_UNFUSED)
         return [StagePlacement(stop, before="increment_steps", replaces="clip_floor_pos")]
 
     def stop(self, data: SimData) -> SimData:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from crazysim import rotation
 from crazysim.core.data import SimData
-from crazysim.core.others import reduce_over_others
+from crazysim.core.pair_reductions import reduce_over_others
 from crazysim.core.plugin import Plugin, Simulation, StagePlacement, airframe_numbers, parameter
 from crazysim.core.stage import stage
 from crazysim.drones.airframe_estimate import AIR_DENSITY

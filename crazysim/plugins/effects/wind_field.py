@@ -87,7 +87,8 @@ class WindField(Plugin):
 
     def stages(self, sim: Simulation) -> Sequence[StagePlacement]:
         is_small = np.size(self.field.values) <= MAX_FUSED_VALUES
-        return [StagePlacement(Stage(self.look_up, "drone" if is_small else "batch", batched=True, why=WHY_UNFUSED))]
+        scope = "drone" if is_small else "batch"
+        return [StagePlacement(Stage(self.look_up, scope, batched=True, unfused_reason=WHY_UNFUSED))]
 
     @property
     def resets_episode(self) -> bool:

@@ -14,7 +14,7 @@ from crazysim import rotation
 from crazysim.core.data import SimData
 from crazysim.core.plugin import Simulation, drone_array
 from crazysim.core.settings import setting
-from crazysim.core.stage import Stage, tick
+from crazysim.core.stage import Stage, acts_now
 from crazysim.plugins.estimators import error_state, inertial_path, updates
 from crazysim.plugins.estimators.error_state import Estimate
 from crazysim.plugins.estimators.error_state_filter import ErrorStateFilter
@@ -218,7 +218,7 @@ def _rows_in_transit(sensor: Sensor, data: SimData) -> int:
 
 def _sampling_predicate(sensor: Sensor) -> Callable[[SimData], Array | None]:
     """Return a function that is true in the steps in which a sensor takes a measurement."""
-    return lambda data: tick(data, sensor.freq or data.core.freq)
+    return lambda data: acts_now(data, sensor.freq or data.core.freq)
 
 
 def _bias_walk(triad: TriadData, dt: float) -> Array:

@@ -109,7 +109,7 @@ class RotorJet(Plugin):
 
         numbers = 0 if self.table is None else sum(np.size(x) for x in (self.table.pressure, self.table.velocity))
         scope = "world" if self.all_drones else "drone" if numbers <= MAX_FUSED_VALUES else "batch"
-        return [StagePlacement(Stage(press, scope, batched=not self.all_drones, why=WHY_UNFUSED))]  # type: ignore[arg-type]
+        return [StagePlacement(Stage(press, scope, batched=not self.all_drones, unfused_reason=WHY_UNFUSED))]  # type: ignore[arg-type]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the force of the jet on the load, world frame, N."""

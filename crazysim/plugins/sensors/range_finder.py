@@ -112,8 +112,9 @@ class RangeFinder(Plugin):
 
         fn = measure_at_times if scope == "batch" and period > 1 else measure
         when = None if period == 1 else is_due
-        why = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a separate kernel"
-        return [StagePlacement(Stage(fn, scope, when, name="range_finder", why=why), before="increment_steps")]
+        reason = f"rays among {n_movable} movable geoms, more than {MAX_UNROLLED_GEOMS}, are cast by a separate kernel"
+        measuring = Stage(fn, scope, when, name="range_finder", unfused_reason=reason)
+        return [StagePlacement(measuring, before="increment_steps")]
 
     def observations(self, data: SimData) -> dict[str, Array]:
         """Return the distances, m."""
@@ -136,10 +137,10 @@ class RangeFinder(Plugin):
         direction = rotation.rotate(quat[..., None, :], record.direction)
         n_drones, n_rays = direction.shape[-3:-1]
         origin = jnp.broadcast_to(pos[..., None, :], direction.shape)
-        drone_of_ray = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
+        ignored_drones = np.repeat(np.arange(n_drones), n_rays) if self.drones else None
         origin, direction = (x.reshape(*pos.shape[:-2], n_drones * n_rays, 3) for x in (origin, direction))
         hits = cast_rays(
-            model, data, origin, direction, drone_of_ray, self.drones, kernels=kernels, limit=record.max_range
+            model, data, origin, direction, ignored_drones, self.drones, kernels=kernels, limit=record.max_range
         )
         distance = jnp.minimum(hits.distance, record.max_range).reshape(*pos.shape[:-1], n_rays)
         return record.replace(distance=distance[0] if of_drone else distance)

@@ -17,7 +17,7 @@ from crazysim.core.data import Objects, SimData
 from crazysim.core.plugin import Simulation, StagePlacement, parameter
 from crazysim.core.population import Population
 from crazysim.core.settings import color, default_rates
-from crazysim.core.stage import Stage, tick
+from crazysim.core.stage import Stage, acts_now
 from crazysim.dynamics.models import GRAVITY
 from crazysim.errors import ConfigError
 from crazysim.plugins.effects.ground import TerrainData, ground_at
@@ -171,7 +171,7 @@ class Cars(Population):
         inherited = [x for x in Population.stages(self, sim) if x.name != f"{self.name}_control"]
         if self.follows is None and self.level == "drive":
             return inherited
-        name, when = f"{self.name}_control", functools.partial(tick, freq=self.rate_in(sim.data.core.freq))
+        name, when = f"{self.name}_control", functools.partial(acts_now, freq=self.rate_in(sim.data.core.freq))
         return [StagePlacement(Stage(self._controlled, self.name, when, name=name), name=name), *inherited]
 
     def control(self, data: SimData) -> CarData:

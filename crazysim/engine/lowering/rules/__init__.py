@@ -6,9 +6,9 @@ from crazysim.engine.lowering.rules import (
     indexing,
     linalg,
     movement,
-    others,
+    pair_reductions,
     random,
     reductions,
 )
 
-__all__ = ["control_flow", "elementwise", "indexing", "linalg", "movement", "others", "random", "reductions"]
+__all__ = ["control_flow", "elementwise", "indexing", "linalg", "movement", "pair_reductions", "random", "reductions"]

@@ -138,20 +138,22 @@ class _Bits:
         self.ctx, self.dtype = ctx, np.dtype(f"u{np.dtype(dtype).itemsize}")
         self.n_bits = 8 * self.dtype.itemsize
 
-    def of(self, x: Elements) -> Elements:
+    def from_number(self, x: Elements) -> Elements:
         return self.ctx.elementwise("bitcast_convert_type", [x], self.dtype)
 
-    def do(self, op: str, a: Elements, b: Elements | int) -> Elements:
+    def apply(self, op: str, a: Elements, b: Elements | int) -> Elements:
         b = constants(b, self.dtype) if isinstance(b, int) else b
         return self.ctx.elementwise(op, [a, b], self.dtype)
 
     def count(self, x: Elements) -> Elements:
         """Count the bits that are set: add them up in pairs, fours and bytes, and sum the bytes by a product."""
         pairs, fours, eights, ones = (self.mask(byte) for byte in (0x55, 0x33, 0x0F, 0x01))
-        x = self.do("sub", x, self.do("and", self.do("shift_right_logical", x, 1), pairs))
-        x = self.do("add", self.do("and", x, fours), self.do("and", self.do("shift_right_logical", x, 2), fours))
-        x = self.do("and", self.do("add", x, self.do("shift_right_logical", x, 4)), eights)
-        return self.do("shift_right_logical", self.do("mul", x, ones), self.n_bits - 8)
+        x = self.apply("sub", x, self.apply("and", self.apply("shift_right_logical", x, 1), pairs))
+        x = self.apply(
+            "add", self.apply("and", x, fours), self.apply("and", self.apply("shift_right_logical", x, 2), fours)
+        )
+        x = self.apply("and", self.apply("add", x, self.apply("shift_right_logical", x, 4)), eights)
+        return self.apply("shift_right_logical", self.apply("mul", x, ones), self.n_bits - 8)
 
     def mask(self, byte: int) -> int:
         return int.from_bytes(bytes([byte] * self.dtype.itemsize), "little")
@@ -161,7 +163,7 @@ class _Bits:
 def _population_count(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
-    return [ctx.elementwise("bitcast_convert_type", [bits.count(bits.of(args[0]))], dtype)]
+    return [ctx.elementwise("bitcast_convert_type", [bits.count(bits.from_number(args[0]))], dtype)]
 
 
 @rule("clz")
@@ -169,11 +171,11 @@ def _leading_zeros(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[E
     """Set all bits below the highest set bit, and count the bits that are still zero."""
     dtype = eqn.outvars[0].aval.dtype
     bits = _Bits(ctx, dtype)
-    x, shift = bits.of(args[0]), 1
+    x, shift = bits.from_number(args[0]), 1
     while shift < bits.n_bits:
-        x = bits.do("or", x, bits.do("shift_right_logical", x, shift))
+        x = bits.apply("or", x, bits.apply("shift_right_logical", x, shift))
         shift *= 2
-    left = bits.do("sub", constants(bits.n_bits, bits.dtype), bits.count(x))
+    left = bits.apply("sub", constants(bits.n_bits, bits.dtype), bits.count(x))
     return [ctx.elementwise("bitcast_convert_type", [left], dtype)]
 
 
@@ -184,20 +186,20 @@ def _reduce_precision(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> lis
     if dtype not in ops.DTYPES:
         raise UnsupportedError(f"numbers of type {dtype.name}")
     info, bits = np.finfo(dtype), _Bits(ctx, dtype)
-    x = bits.of(args[0])
+    x = bits.from_number(args[0])
     dropped = info.nmant - mantissa
     if dropped > 0:
-        odd = bits.do("and", bits.do("shift_right_logical", x, dropped), 1)
-        x = bits.do("add", x, bits.do("add", odd, (1 << (dropped - 1)) - 1))
-        x = bits.do("and", x, (1 << bits.n_bits) - (1 << dropped))
+        odd = bits.apply("and", bits.apply("shift_right_logical", x, dropped), 1)
+        x = bits.apply("add", x, bits.apply("add", odd, (1 << (dropped - 1)) - 1))
+        x = bits.apply("and", x, (1 << bits.n_bits) - (1 << dropped))
     if exponent < info.nexp:
         bias, largest = (1 << (info.nexp - 1)) - 1, (1 << (exponent - 1)) - 1
         infinite = ((1 << info.nexp) - 1) << info.nmant
-        sign = bits.do("and", x, 1 << (bits.n_bits - 1))
-        size = bits.do("and", x, infinite)
+        sign = bits.apply("and", x, 1 << (bits.n_bits - 1))
+        size = bits.apply("and", x, infinite)
         over = ctx.elementwise("gt", [size, constants((bias + largest) << info.nmant, bits.dtype)], bool)
         under = ctx.elementwise("le", [size, constants((bias - largest) << info.nmant, bits.dtype)], bool)
-        x = ctx.elementwise("select_n", [over, x, bits.do("or", sign, infinite)], bits.dtype)
+        x = ctx.elementwise("select_n", [over, x, bits.apply("or", sign, infinite)], bits.dtype)
         x = ctx.elementwise("select_n", [under, x, sign], bits.dtype)
     rounded = ctx.elementwise("bitcast_convert_type", [x], dtype)
     is_nan = ctx.elementwise("ne", [args[0], args[0]], bool)
