@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import platform
+import re
 import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -28,7 +30,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     text = "compare with closed forms, other simulators and logs"
     parser = commands.add_parser("validate", help=text, formatter_class=DefaultsFormatter)
     parser.set_defaults(run=run)
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder with logs in idsia/ and nanobench/")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with logs in idsia/ and nanobench/; policies/ in it keeps trainings",
+    )
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES, help="sections; by default all")
     parser.add_argument("--out", type=Path, default=Path("validation.md"), metavar="FILE", help="page to write; its "
                         "pictures, of logs alone, go to the folder pictures next to it")  # fmt: skip
@@ -44,6 +51,8 @@ def run(options: argparse.Namespace) -> int:
     for section in selected:
         if section.problem:
             print(f"left out {section.name}: {section.problem}")
+        elif section.missing_peers:
+            print(f"left out rows of {section.name}: {section.missing_peers}")
     pictures = _draw(selected, rows, options.out.parent)
     write_file(options.out, format_page(selected, rows, _provenance(selected), pictures))
     for row in rows:
@@ -77,8 +86,12 @@ def _provenance(selected: Sequence[Section]) -> str:
         commit = f", commit {result.stdout.strip()}" if result.returncode == 0 else ""
     except OSError:
         commit = ""
-    packages = dict(item for section in selected if not section.problem for item in section.packages.items())
-    others = [name.partition("==")[0] for name in packages.values()]
+    packages: dict[str, str] = {}
+    for section in selected:
+        if not section.problem:
+            packages |= section.packages
+            packages |= {k: name for k, name in section.peers.items() if importlib.util.find_spec(k) is not None}
+    others = dict.fromkeys(re.split(r"[\[=@]", name)[0] for name in packages.values())
     programs = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco", "numpy", *others))
     return (
         f"Made on {datetime.now(UTC):%Y-%m-%d} with crazysim {crazysim.__version__}{commit}, {programs}, Python "

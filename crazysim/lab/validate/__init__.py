@@ -19,7 +19,8 @@ def validate(data: str | Path | None = None, only: Sequence[str] = NAMES) -> lis
     is a row with a ``problem``.
 
     Args:
-        data: Folder with logs of real flights in ``idsia`` and ``nanobench``; None for none.
+        data: Folder with logs of real flights in ``idsia`` and ``nanobench``, and for trainings in ``policies``; None
+            for none.
         only: Names of sections.
     """
     if unknown := [name for name in only if name not in NAMES]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 
 from crazysim.lab.validate.rows import Row, Section
@@ -19,9 +20,11 @@ crazysim validate --data FOLDER --out docs/validation.md
 ```
 
 and each section names the command that repeats it, which writes `validation.md`. Sections whose package is not
-installed are left out. In Python `crazysim.lab.validate.validate(only=["mujoco"])` returns the rows.
+installed are left out, and so are rows of simulators that are not installed. In Python
+`crazysim.lab.validate.validate(only=["mujoco"])` returns the rows.
 
-FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim:
+FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazysim, and keeps the policies of *Sim to
+sim*:
 
 - `idsia/melon_20251017_run1.csv` is a flight of IDSIA's benchmark (arXiv 2512.14450) as it was recorded. In a clone of
   [its repository](https://github.com/idsia-robotics/nanodrone-sysid-benchmark), with pandas and pyarrow,
@@ -36,6 +39,7 @@ FOLDER holds logs of real flights, `.csv` or `.npz`, which are not part of crazy
     writes it. Figures of this page are of the same samples rounded to float32, and differ by up to 2%.
 - `nanobench/` holds the logs of NanoBench (arXiv 2603.09908) that the rows name, from `datasets/dataset` of
   [its repository](https://github.com/syediu/nanobench-iros2026) at commit d45bc5a. More of its logs make more rows.
+- `policies/` holds or receives the trainings; without FOLDER, they are not kept.
 
 A figure passes if it is within the range in its row; rows without a range only report.
 """
@@ -64,12 +68,14 @@ def format_page(sections: Sequence[Section], rows: Sequence[Row], provenance: st
     summary = f" {len(bounded) - len(failed)} of {len(bounded)} figures with a range are within it." if bounded else ""
     if failed:
         summary += " Outside: " + "; ".join(row.quantity for row in failed) + "."
-    packages = dict.fromkeys(name for section in sections for name in section.packages.values())
-    parts = [INTRODUCTION.format(packages=" ".join(['".[demo]"', *packages])).strip(), provenance + summary]
+    packages = dict.fromkeys(
+        name for section in sections for name in (*section.packages.values(), *section.peers.values())
+    )
+    parts = [INTRODUCTION.format(packages=f'".[demo]" {shlex.join(packages)}'.rstrip()).strip(), provenance + summary]
     for section in sections:
         command = f"`crazysim validate --only {section.name}{' --data FOLDER' * section.needs_logs}`"
-        if section.packages:
-            command = f"`pip install {' '.join(section.packages.values())}` and {command}"
+        if needed := [*section.packages.values(), *section.peers.values()]:
+            command = f"`pip install {shlex.join(needed)}` and {command}"
         parts += [f"## {section.title}", section.text, f"Repeat: {command}."]
         if section.problem:
             parts.append(f"Not measured: {section.problem}.")
@@ -81,6 +87,8 @@ def format_page(sections: Sequence[Section], rows: Sequence[Row], provenance: st
         cells = {name: column for name, column in cells.items() if any(column)}
         lines = [list(cells), ["---"] * len(cells), *zip(*cells.values(), strict=True)]
         parts.append("\n".join(f"| {' | '.join(line)} |".replace("  ", " ") for line in lines))
+        if section.missing_peers:
+            parts.append(f"Left out: {section.missing_peers}.")
     return "\n\n".join(parts) + "\n"
 
 

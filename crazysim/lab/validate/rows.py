@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import importlib.util
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from crazysim.errors import ConfigError
@@ -62,6 +63,9 @@ class Section:
     """Functions that measure rows."""
     packages: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Modules that must be importable, with the requirement for pip of each."""
+    peers: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Modules of other simulators, with the requirement for pip of each. Rows of those that are not importable are left
+    out."""
     data_problem: str = ""
     """Reason why the section's data are missing; empty if it has them."""
     needs_logs: bool = False
@@ -72,8 +76,18 @@ class Section:
     @property
     def problem(self) -> str:
         """Reason why the section cannot be measured, or an empty string if it can."""
-        missing = [name for package, name in self.packages.items() if importlib.util.find_spec(package) is None]
-        return f"run `pip install {' '.join(missing)}`" if missing else self.data_problem
+        return _install(self.packages) or self.data_problem
+
+    @property
+    def missing_peers(self) -> str:
+        """Command that installs the simulators whose rows are left out, or an empty string if none are."""
+        return _install(self.peers)
+
+
+def _install(packages: Mapping[str, str]) -> str:
+    """Return advice to install the packages that are not importable, or an empty string if all are."""
+    missing = [name for package, name in packages.items() if importlib.util.find_spec(package) is None]
+    return f"run `pip install {shlex.join(missing)}`" if missing else ""
 
 
 def measure_sections(sections: Sequence[Section]) -> list[Row]:

@@ -16,12 +16,13 @@ from crazysim.lab.validate import (
     peers,
     raptor,
     rotorpy_flights,
+    sim_to_sim,
 )
 from crazysim.lab.validate.rows import Section
 
 NAMES = (
     "closed", "mujoco", "firmware", "crazyflow", "rotorpy", "commonroad", "idsia", "nanobench", "filter", "raptor",
-    "l2f",
+    "l2f", "sim2sim",
 )  # fmt: skip
 """Names of the sections."""
 RAPTOR = {"foundation_policy": "foundation-policy==1.0.2"}
@@ -136,5 +137,9 @@ def sections(data: Path | None = None) -> Sequence[Section]:
             "with methods of Runge-Kutta of order 4 and steps of 2 ms in both. The figure is the difference of "
             "the shares that it holds; latency costs as many quadrotors in the one as in the other.",
             (raptor.compare_training_airframes,), packages=RAPTOR | {"l2f": "l2f==2.0.18"},
+        ),
+        Section(
+            "sim2sim", "Sim to sim", sim_to_sim.TEXT, sim_to_sim.checks(data),
+            packages={"onnx": "onnx", "onnxruntime": "onnxruntime"}, peers=sim_to_sim.PEERS,
         ),
     )  # fmt: skip
