@@ -29,7 +29,9 @@ sim.step()
 print(sim.data.states.pos)
 """,
     "contacts": """
-print(crazysim.Sim().contacts().any())
+sim = crazysim.Sim(n_worlds=64, n_drones=2, control="state")
+sim.step()
+print(sim.contacts().any())
 """,
     "gradient": """
 import jax
@@ -40,7 +42,7 @@ step, target = sim.build_step_fn(), np.array(sim.data.states.pos)
 def height(climb):
     data = F.state_control(sim.data, pos=target + climb * np.eye(3)[2])
     return step(data, 100).states.pos[..., 2].mean()
-print(jax.grad(height)(0.1))
+print(jax.grad(height)(0.5))
 """,
     "gymnasium": """
 import gymnasium

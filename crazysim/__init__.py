@@ -16,18 +16,6 @@ from crazysim.core.stage import stage
 from crazysim.drones import Airframe, Drone, load_airframe
 from crazysim.dynamics import Dynamics
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects import (
-    Battery,
-    Downwash,
-    GroundEffect,
-    Latency,
-    MotorFailure,
-    Randomize,
-    Residual,
-    RotorAerodynamics,
-    Wind,
-    WindField,
-)
 from crazysim.pytree import Members, PyTree, leaf, static
 from crazysim.sim.sim import Sim
 from crazysim.startup import __version__, lazy
@@ -40,6 +28,18 @@ if TYPE_CHECKING:
     from crazysim.plugins.contacts.drone_collisions import DroneCollisions
     from crazysim.plugins.contacts.response import ContactResponse
     from crazysim.plugins.contacts.terrain import Terrain
+    from crazysim.plugins.effects import (
+        Battery,
+        Downwash,
+        GroundEffect,
+        Latency,
+        MotorFailure,
+        Randomize,
+        Residual,
+        RotorAerodynamics,
+        Wind,
+        WindField,
+    )
     from crazysim.plugins.estimators.eskf import ESKF
     from crazysim.plugins.estimators.kalman import Kalman
     from crazysim.plugins.follow import Follow
@@ -111,28 +111,38 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
+        "Battery": "crazysim.plugins.effects",
         "Bicycles": "crazysim.plugins.vehicles",
         "Cars": "crazysim.plugins.vehicles",
         "ContactLog": "crazysim.plugins.contacts.contact_log",
         "ContactResponse": "crazysim.plugins.contacts.response",
+        "Downwash": "crazysim.plugins.effects",
         "DroneCollisions": "crazysim.plugins.contacts.drone_collisions",
-        "Follow": "crazysim.plugins.follow",
         "ESKF": "crazysim.plugins.estimators.eskf",
+        "Follow": "crazysim.plugins.follow",
         "FreeBodies": "crazysim.plugins.bodies",
+        "functional": "crazysim.core",
+        "GroundEffect": "crazysim.plugins.effects",
         "Hook": "crazysim.plugins.payloads",
         "IMU": "crazysim.plugins.sensors.imu",
         "Kalman": "crazysim.plugins.estimators.kalman",
+        "Latency": "crazysim.plugins.effects",
+        "make": "crazysim.envs",
         "MotionCapture": "crazysim.plugins.sensors.motion_capture",
+        "MotorFailure": "crazysim.plugins.effects",
         "MPPI": "crazysim.sim.mppi",
+        "Radar": "crazysim.plugins.sensors.radar",
+        "Randomize": "crazysim.plugins.effects",
+        "RangeFinder": "crazysim.plugins.sensors.range_finder",
+        "Residual": "crazysim.plugins.effects",
+        "RotorAerodynamics": "crazysim.plugins.effects",
         "RotorJet": "crazysim.plugins.payloads",
         "Sensor": "crazysim.plugins.sensors.sensor",
         "SharedLoad": "crazysim.plugins.payloads",
         "SlungLoad": "crazysim.plugins.payloads",
-        "Radar": "crazysim.plugins.sensors.radar",
-        "RangeFinder": "crazysim.plugins.sensors.range_finder",
         "Terrain": "crazysim.plugins.contacts.terrain",
-        "functional": "crazysim.core",
-        "make": "crazysim.envs",
+        "Wind": "crazysim.plugins.effects",
+        "WindField": "crazysim.plugins.effects",
     },
 )
 

@@ -101,6 +101,10 @@ def folder() -> Path | None:
     configured = jaxcompat.cache_folder()
     if configured is not None:
         return Path(configured)
+    return _usable_default_folder()
+
+
+def _usable_default_folder() -> Path | None:
     return _prepared_default_folder(*map(os.environ.get, (CACHE_VARIABLE, "XDG_CACHE_HOME", "HOME")))
 
 
@@ -167,20 +171,23 @@ def enable_cache(
 
     Args:
         cache_path: Folder; None for the environment variable ``CRAZYSIM_CACHE``, or else ``crazysim/jax`` in
-            the user's folder of caches, with a folder for each kind of CPU. Where the variable is ``off``,
-            None keeps no programs and returns None.
+            the user's folder of caches, with a folder for each kind of CPU. Where the variable is ``off``, or where
+            this folder cannot be used, which a line on stderr explains, None keeps no programs and returns None.
         min_entry_size_bytes: Smallest program to keep; -1 for all.
         min_compile_time_secs: Shortest compilation whose program is kept, s.
         enable_xla_caches: True to let XLA keep files, too, in addition to JAX's.
 
     Raises:
-        ConfigError: If the folder cannot be made or written, belongs to another user, can be written by others, or its
-            disk is full.
+        ConfigError: If ``cache_path`` cannot be made or written, belongs to another user, can be written by others, or
+            its disk is full.
     """
-    path = default_cache() if cache_path is None else Path(cache_path).absolute()
+    if cache_path is None:
+        path = _usable_default_folder()
+    else:
+        path = Path(cache_path).absolute()
+        _prepare_folder(path, path)
     if path is None:
         return None
-    _prepare_folder(path if cache_path is not None else path.parent, path)
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", min_entry_size_bytes)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time_secs)
@@ -226,11 +233,8 @@ def enable_for_command() -> None:
         is_new = path is not None and not path.exists()
     except ConfigError:
         is_new = False
-    path = folder()  # prints a line where it cannot be used
-    if path is None:
-        return
-    enable_cache()
-    if is_new:
+    path = enable_cache()
+    if path is not None and is_new:
         print(
             f"compiled programs are kept in {path}, {MAX_CACHE_BYTES / 1e9:g} GB at most; "
             f"{CACHE_VARIABLE}=off keeps none",

@@ -23,7 +23,6 @@ from crazysim.cache import (
     trim,
 )
 from crazysim.engine.backends import kernel_cache
-from crazysim.errors import ConfigError
 
 PROGRAM = """
 import sys
@@ -158,7 +157,7 @@ from crazysim import Sim
 from crazysim import functional as F
 sim = Sim(n_worlds=2, n_drones=2, control="state")
 sim.step()
-print(sim.contacts().any(), sim.data.states.pos[0, 0])
+print(sim.mjx_data.mocap_pos.shape, sim.contacts().any(), sim.data.states.pos[0, 0])
 step = sim.build_step_fn()
 print(jax.grad(lambda z: step(F.state_control(sim.data, pos=z * np.eye(3)[2]), 10).states.pos[..., 2].mean())(1.0))
 print(jax.config.jax_compilation_cache_dir)
@@ -204,12 +203,11 @@ def test_without_a_usable_folder_there_is_one_line_and_everything_works(settings
         with keep_programs():
             jax.jit(_inner)(jnp.ones(3))
         assert kernel_cache.folder() == kernel_cache.temporary()
+        assert enable_cache() is None
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert told.startswith("compiled programs are not kept: expected ")
     assert cache.CACHE_VARIABLE in told
-    with pytest.raises(ConfigError, match="expected"):
-        enable_cache()
     cache._prepared_default_folder.cache_clear()
 
 

@@ -1,7 +1,8 @@
-"""MJX, imported on first use: the import takes more than half a second, and only contacts need it.
+"""MJX, imported on first use, since only contacts need it.
 
 It is imported without NVIDIA Warp: nothing here runs MJX on Warp, whose import would take two more seconds. A program
-that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts.
+that runs MJX on Warp imports ``mujoco.mjx`` or ``warp`` itself, before the first contacts. MJX calls trimesh and
+``scipy.spatial`` for scenes with meshes alone, so they are imported at the first call: they take almost a second.
 """
 
 from __future__ import annotations
@@ -23,21 +24,30 @@ __all__ = ["Data", "Model", "camlight", "collision", "com_pos", "kinematics", "p
 def load_module() -> ModuleType:
     """Return the module ``mujoco.mjx``."""
     # MJX prints two lines when Warp cannot be imported.
-    with _hide_warp(), contextlib.redirect_stdout(io.StringIO()):
+    with _light_imports(), contextlib.redirect_stdout(io.StringIO()):
         return importlib.import_module("mujoco.mjx")
 
 
+class _Deferred(ModuleType):
+    """Stand-in for a module, with functions that import it and call its functions and classes."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *args, **kwargs: getattr(importlib.import_module(self.__name__), name)(*args, **kwargs)
+
+
 @contextlib.contextmanager
-def _hide_warp() -> Iterator[None]:
-    """Make imports of Warp fail, unless it has been imported."""
-    if "warp" in sys.modules or "mujoco.mjx" in sys.modules:
-        yield
-        return
-    sys.modules["warp"] = None  # type: ignore[assignment]
+def _light_imports() -> Iterator[None]:
+    """Make imports of Warp fail, and defer those of trimesh and SciPy's geometry, unless they have been imported."""
+    light = {"warp": None, **{name: _Deferred(name) for name in ("trimesh", "scipy.spatial")}}
+    light = {} if "mujoco.mjx" in sys.modules else {k: x for k, x in light.items() if k not in sys.modules}
+    sys.modules.update(light)  # type: ignore[arg-type]
     try:
         yield
     finally:
-        del sys.modules["warp"]
+        for name in light:
+            del sys.modules[name]
 
 
 def __getattr__(name: str) -> Any:

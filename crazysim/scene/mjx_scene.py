@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import NDArray
 
+from crazysim.cache import announce_if_slow
 from crazysim.core.data import SimData
 from crazysim.core.sharding import put_on_device, shard_scene
 from crazysim.eager import fetch_rows
@@ -34,6 +36,7 @@ class MjxScene:
         self._model: mjx.Model | None = None
         self._data: mjx.Data | None = None
         self._rest: tuple[NDArray, ...] | None = None
+        self._is_synced = False
 
     @property
     def model(self) -> mjx.Model:
@@ -68,7 +71,9 @@ class MjxScene:
 
     def sync(self, data: SimData) -> SimData:
         """Bring all worlds up to date, and return the data with ``core.mjx_synced`` set."""
-        data, self._data = sync_sim2mjx(data, self.data, self.model)
+        first, self._is_synced = not self._is_synced, True
+        with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
+            data, self._data = sync_sim2mjx(data, self.data, self.model)
         return data
 
     def poses(self, worlds: int | NDArray | None = None) -> tuple[Any, Any, Any]:
@@ -105,7 +110,7 @@ class MjxScene:
 
     def shard(self, mesh: Mesh) -> None:
         """Spread the worlds over devices."""
-        self._mesh, self._model = mesh, None
+        self._mesh, self._model, self._is_synced = mesh, None, False
         if self._data is not None:
             self._data = self._to_device(self._data)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from jax import Array
 from jax.sharding import Mesh
 from numpy.typing import ArrayLike, NDArray
 
-from crazysim.cache import announce_if_slow
 from crazysim.core.data import Objects, SimData
 from crazysim.drones.airframe import Airframe
 from crazysim.errors import ConfigError
@@ -320,9 +318,7 @@ class Scene:
     def sync(self, data: SimData) -> SimData:
         """Bring ``mjx_data`` up to date in all worlds, and return the data with ``core.mjx_synced`` set."""
         self.compile_if_edited()
-        first = not self._mjx.is_allocated
-        with announce_if_slow("importing MJX and compiling contacts", "2 to 4 s") if first else nullcontext():
-            return self._mjx.sync(data)
+        return self._mjx.sync(data)
 
     def sync_one(self, data: SimData, world: int) -> None:
         """Bring ``mj_data`` up to date with one world; MJX, which takes seconds to import and compile, is not used."""

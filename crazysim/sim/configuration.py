@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 from jax import Array
@@ -33,8 +33,9 @@ from crazysim.drones import Airframe
 from crazysim.dynamics import Dynamics
 from crazysim.dynamics.models import require_freq, require_support
 from crazysim.errors import ConfigError
-from crazysim.plugins.effects import Residual
-from crazysim.plugins.estimators import Estimator, find_estimator
+
+if TYPE_CHECKING:
+    from crazysim.plugins.estimators import Estimator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +144,8 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
     """Return the plugins of a new simulation: the plugins that shorthands stand for, then the listed ones."""
     initial: list[Plugin] = []
     if estimator is not None:
+        from crazysim.plugins.estimators import find_estimator
+
         estimator = find_estimator(estimator)
         initial.extend([*estimator.sensors, estimator])
     if aero is not None:
@@ -151,6 +154,8 @@ def initial_plugins(plugins: Sequence[Plugin], estimator: str | Estimator | None
                 f"expected aero='identified' or None, got {aero!r}. Use plugins=[RotorAerodynamics()] for the other "
                 f"forces of the air on rotors."
             )
+        from crazysim.plugins.effects import Residual
+
         initial.append(Residual())
     return [*initial, *plugin_list("plugins", plugins)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import mujoco
@@ -33,7 +33,6 @@ from crazysim.dynamics.parameter_tables import rotor_vel_limits
 from crazysim.engine import Reset, Step, Stepper, explain
 from crazysim.engine.rollout import Keep, Policy, states_of
 from crazysim.engine.rollout import run as run_rollout
-from crazysim.plugins.estimators import Estimator
 from crazysim.plugins.plugin_registry import P, PluginRegistry
 from crazysim.pytree import device_array
 from crazysim.scene import mjx
@@ -50,6 +49,9 @@ from crazysim.scene.sync import sync_sim2mjx
 from crazysim.sim.adopt import VehicleKind, read_vehicles, vehicle_poses
 from crazysim.sim.configuration import Configuration, initial_plugins
 from crazysim.sim.members import Member, find_member, locked
+
+if TYPE_CHECKING:
+    from crazysim.plugins.estimators import Estimator
 
 __all__ = [
     "Sim",
