@@ -11,6 +11,7 @@ import pytest
 
 from crazysim import ConfigError
 from crazysim.__main__ import main
+from crazysim.core.random import drone_keys, world_keys
 from crazysim.envs import AutoReset, make
 from crazysim.train import apg, checkpoint, ppo
 from crazysim.train import config as configs
@@ -72,6 +73,19 @@ def test_a_seed_trains_beside_others_as_it_does_alone(algorithm, hyperparameters
         expected = evaluate(make("hover", 8, **SECONDS), seed_of(policies, i))
         for name, x in expected.items():
             np.testing.assert_allclose(found[i][name], x, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_the_random_numbers_of_a_block_are_those_of_its_key_alone():
+    """Several drones share the key of their world; keys of worlds and drones are the same in batched functions."""
+    keys = jax.random.split(jax.random.key(5), 2)
+    two, four = (jax.jit(make("swarm", n, engine="plain").reset) for n in (2, 4))
+    many, alone = four(keys), [two(key) for key in keys]
+    for i, one in enumerate(alone):
+        for name, x in one.obs.items():
+            np.testing.assert_array_equal(many.obs[name][2 * i : 2 * i + 2], x, err_msg=name)
+        for draw in (world_keys, drone_keys):
+            x, y = (jax.random.key_data(draw(state.full_data, "gusts")) for state in (many, one))
+            np.testing.assert_array_equal(x[2 * i : 2 * i + 2], y)
 
 
 def test_keys_must_divide_the_worlds():
