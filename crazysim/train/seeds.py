@@ -7,20 +7,23 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
 
 from crazysim.pytree import float_dtype
 from crazysim.train.hyperparameters import SWEEPABLE
 
 T = TypeVar("T")
-Rates = dict[str, Array]
+Rates = dict[str, Any]
 """Hyperparameters of ``SWEEPABLE`` by name, of one seed, (), or of all, (n_seeds,)."""
 
 
 def stack_rates(configs: Sequence[Any]) -> Rates:
-    """Return the hyperparameters that may differ between seeds. (n_seeds,) each"""
+    """Return the hyperparameters that may differ between seeds. (n_seeds,) each
+
+    They are arrays of the host, which are constants of the program where there is one seed.
+    """
     names = [name for name in SWEEPABLE if hasattr(configs[0], name)]
-    return {name: jnp.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
+    return {name: np.array([getattr(config, name) for config in configs], float_dtype()) for name in names}
 
 
 def split_blocks(tree: T, n_seeds: int) -> T:
