@@ -23,10 +23,9 @@ from crazysim.train.hyperparameters import check_hyperparameters
 from crazysim.train.networks import Layers, Policy, all_finite, init_mlp, mlp
 from crazysim.train.seeds import Rates, for_each_seed, join_blocks, split_blocks, stack_rates
 
-
 MAX_GROUPS = 64
-"""Groups of neighbouring worlds, at most, of which each minibatch gets as many worlds. A device holds whole groups, so that
-no device needs the samples of another one, and minibatches do not depend on the number of devices."""
+"""Groups of neighbouring worlds, at most, of which each minibatch gets as many worlds. A device holds whole groups, so
+that no device needs the samples of another one, and minibatches do not depend on the number of devices."""
 
 
 @dataclass(frozen=True)
