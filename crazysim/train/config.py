@@ -46,9 +46,9 @@ _LONG_ROLLOUTS = {"n_steps": 64, "minibatches": 32, "hidden": (128, 128), "disco
 """Hyperparameters of tasks in which a reward follows seconds after the actions that earn it."""
 
 RECIPES: dict[str, Recipe] = {
-    "hover": Recipe(config={"iterations": 80, "learning_rate": 2e-3}),
+    "hover": Recipe(config={"iterations": 80, "minibatches": 16, "learning_rate": 2e-3}),
     "reach_vel": Recipe(config={"iterations": 100}),
-    "recover": Recipe(config={"iterations": 150}),
+    "recover": Recipe(config={"iterations": 150, "minibatches": 16}),
     "race": Recipe(
         n_worlds=2048,
         config={"iterations": 150, "n_steps": 64, "minibatches": 16, "entropy": 0.01, "init_std": 0.7},
@@ -69,7 +69,10 @@ RECIPES: dict[str, Recipe] = {
     "avoid": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400, "minibatches": 64, "entropy": 0.003}),
     "transport": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 400}),
     "deliver": Recipe(n_worlds=4096, config={**_LONG_ROLLOUTS, "iterations": 800}),
-    "swarm": Recipe(config={**_LONG_ROLLOUTS, "iterations": 200, "entropy": 0.003}),
+    "swarm": Recipe(
+        n_worlds=2048,
+        config={**_LONG_ROLLOUTS, "iterations": 200, "minibatches": 64, "discount": 0.98, "entropy": 0.003},
+    ),
     "chase": Recipe(n_worlds=2048, config={"iterations": 300, "n_steps": 64, "minibatches": 16, "discount": 0.99}),
     "land": Recipe(
         n_worlds=2048,
