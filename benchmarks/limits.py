@@ -114,13 +114,14 @@ def work(sim: Sim) -> tuple[float, float, int]:
     program = one.build_step_fn().plan(one.data).program
     assert program is not None
     if program.unfused_stages:
-        raise SystemExit(f"{program.unfused_stages[0].unfused}; its operations cannot be counted. Remove the stage.")
+        stage = program.unfused_stages[0]
+        raise SystemExit(f"{stage.explanation}; its operations cannot be counted. Remove the stage.")
     often = sim.control_freq / sim.freq  # the one condition in the built-in pipelines is the state controller's rate
     each_step = sum(operations(segment.block, often) for segment in program.fused_segments)
     blocks = [s.hoisted for s in program.fused_segments] + ([program.check.block] if program.check else [])
     each_call = sum(operations(block, often) for block in blocks)
     batched = [i for i, leaf in enumerate(program.leaves) if leaf.scope in ("drone", "world")]
-    sizes = {i: program.leaves[i].size * program.leaves[i].number.itemsize for i in batched}
+    sizes = {i: program.leaves[i].size * program.leaves[i].number_type.itemsize for i in batched}
     read, written = (sum(sizes[i] for i in batched if i in leaves) for leaves in (program.read, program.written))
     return each_step, each_call, read + written
 

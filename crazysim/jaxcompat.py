@@ -113,8 +113,8 @@ def select_inputs(jaxpr: ClosedJaxpr, inputs: Sequence[int]) -> ClosedJaxpr:
         unused = [_zeros(v.aval) for v in inner.invars]
 
         def fn(*args: Any) -> list[Any]:
-            given = dict(zip(inputs, args, strict=True))
-            return jaxpr_as_fun(jaxpr)(*(given.get(i, zeros) for i, zeros in enumerate(unused)))
+            arg_at = dict(zip(inputs, args, strict=True))
+            return jaxpr_as_fun(jaxpr)(*(arg_at.get(i, zeros) for i, zeros in enumerate(unused)))
 
         return _traced(fn, [inner.invars[i] for i in inputs])
     invars = [inner.invars[i] for i in inputs]
@@ -273,22 +273,22 @@ def primitive_by_platform(
 def _derivative_of(fn: Callable[..., Any], primals: Sequence[Any], tangents: Sequence[Any], **params: Any) -> Any:
     changing = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
 
-    def of(*some: Any) -> Any:
+    def apply(*changed: Any) -> Any:
         args = list(primals)
-        for i, x in zip(changing, some, strict=True):
+        for i, x in zip(changing, changed, strict=True):
             args[i] = x
         return list(fn(*args, **params))
 
-    return jax.jvp(of, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
+    return jax.jvp(apply, tuple([primals[i] for i in changing]), tuple([tangents[i] for i in changing]))
 
 
 def _transposed_by(
     fn: Callable[..., Any], cotangents: Sequence[Any], *args: Any, n_fixed: int, **params: Any
 ) -> list[Any]:
     fixed, linear = args[:n_fixed], args[n_fixed:]
-    found = fn(fixed, [ad.instantiate_zeros(x) for x in cotangents], n_fixed=n_fixed, **params)
-    own = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(found, linear, strict=True)]
-    return [*(None for _ in fixed), *own]
+    results = fn(fixed, [ad.instantiate_zeros(x) for x in cotangents], n_fixed=n_fixed, **params)
+    of_linear = [x if ad.is_undefined_primal(arg) else None for x, arg in zip(results, linear, strict=True)]
+    return [*(None for _ in fixed), *of_linear]
 
 
 def _batched_by(fn: Callable[..., Any], primitive: Primitive, args: Any, dims: Any, **params: Any) -> Any:

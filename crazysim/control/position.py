@@ -24,7 +24,11 @@ MAX_HORIZONTAL_RATIO = 1.0
 MAX_FALL_RATIO = 0.5
 """Largest downward acceleration by feedback over gravity, 1: half of the hover thrust remains to turn the drone."""
 MIN_UPWARD_RATIO = 0.1
-"""Upward force of the rotors over the weight that keeps a falling drone upright, 1; idle rotors give twice that."""
+"""Upward force of the rotors over the weight that keeps a falling drone upright, 1.
+
+Of the built-in airframes, the ones named ``cf...`` and ``hb_x500`` have 1.6 to 2.1 times as much with all rotors at
+their least thrust, the others nothing.
+"""
 MIN_FEEDBACK_RATIO = 0.1
 """Lower bound on the upward and horizontal limits of the feedback over gravity, 1, for drones with little lift."""
 MAX_DISTURBANCE_RATIO = 0.5
@@ -138,8 +142,8 @@ def keep_upright(specific: Array, setpoint: Setpoint, params: PositionParams) ->
     """Return the specific force of the rotors, raised so that it does not turn the drone on its back.
 
     Where feedback, drag and estimates cancel the weight, as in a fall, the sum may point in any direction. A small
-    upward force is kept, which most rotors give in any case. A setpoint that accelerates downward by more than gravity
-    does turn the drone over: the limit is lowered by twice the excess over gravity.
+    upward force is kept, which most rotors exceed even at their least thrust. A setpoint that accelerates downward by
+    more than gravity does turn the drone over: the limit is lowered by twice the excess over gravity.
 
     Args:
         specific: Specific force of the rotors, world frame, m/s^2. (..., 3)

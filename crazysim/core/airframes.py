@@ -117,14 +117,14 @@ def create_per_drone(airframes: Airframes, create: Callable[[Airframe], T], n_wo
                 f"expected airframes with the same numbers for {type(records[0]).__name__}, got {kinds[0].name!r} and "
                 f"{kind.name!r}, of which one lacks some. Add them, with the key 'base', or use another controller."
             )
-    numbers = [kinds.index(airframe) for airframe in airframes]
+    kind_indices = [kinds.index(airframe) for airframe in airframes]
 
     def stack_leaf(path: tuple[object, ...], *values: ArrayLike) -> np.ndarray:
         name = jax.tree_util.keystr(path[-1:]).strip("[].'\"")
         arrays = _pad_to_longest([np.asarray(x) for x in values], name)
         if all(np.array_equal(x, arrays[0]) for x in arrays):
             return arrays[0]
-        per_drone = np.stack([arrays[k] for k in numbers])
+        per_drone = np.stack([arrays[k] for k in kind_indices])
         return np.array(np.broadcast_to(per_drone, (n_worlds, *per_drone.shape)))
 
     return jax.tree_util.tree_map_with_path(stack_leaf, *records)
@@ -135,14 +135,14 @@ def _pad_to_longest(arrays: list[np.ndarray], name: str) -> list[np.ndarray]:
     shape = tuple(np.max([x.shape for x in arrays], axis=0)) if arrays[0].ndim else ()
     out = []
     for x in arrays:
-        missing = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
+        padding = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
         is_repeated = [size == 1 and n > 1 for n, size in zip(shape, x.shape, strict=True)]
         if any(is_repeated):
             x = np.broadcast_to(
                 x, [n if repeat else size for n, size, repeat in zip(shape, x.shape, is_repeated, strict=True)]
             )
-            missing = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
-        out.append(np.pad(x, missing, mode="edge" if name in PER_ROTOR_FIELDS else "constant"))
+            padding = [(0, n - size) for n, size in zip(shape, x.shape, strict=True)]
+        out.append(np.pad(x, padding, mode="edge" if name in PER_ROTOR_FIELDS else "constant"))
     return out
 
 
@@ -156,10 +156,10 @@ def _add_rotor_masks(record: Any, n_rotors: int) -> Any:
         if f.name == ROTOR_MASK and value is None:
             changes[f.name] = np.ones(n_rotors, bool)
         elif isinstance(value, (PyTree, tuple, list)):
-            of_parts = isinstance(value, (tuple, list))
+            is_sequence = isinstance(value, (tuple, list))
             changes[f.name] = (
                 type(value)(_add_rotor_masks(x, n_rotors) for x in value)
-                if of_parts
+                if is_sequence
                 else _add_rotor_masks(value, n_rotors)
             )
     return record.replace(**changes) if changes else record

@@ -35,12 +35,12 @@ class ControllerData(PyTree):
             create_per_drone(airframes, controller.memory, n_worlds),
             controller.memory(as_airframes(airframes)[0]),
         )
-        for record, kinds in ((memory, ("drone",)), (params, ("shared", "drone"))):
-            others = set(jax.tree.leaves(scopes(record))) - set(kinds)
-            if others:
+        for record, allowed in ((memory, ("drone",)), (params, ("shared", "drone"))):
+            refused = set(jax.tree.leaves(scopes(record))) - set(allowed)
+            if refused:
                 raise ConfigError(
-                    f"expected leaves of scope {' or '.join(kinds)} in {type(record).__name__} of controller "
-                    f"{controller.name!r}, got {sorted(others)}. Declare memory with leaf('drone', ...), and "
+                    f"expected leaves of scope {' or '.join(allowed)} in {type(record).__name__} of controller "
+                    f"{controller.name!r}, got {sorted(refused)}. Declare memory with leaf('drone', ...), and "
                     f"parameters with leaf('parameter', ...)."
                 )
 
@@ -52,12 +52,12 @@ class ControllerData(PyTree):
                     f"leading axes (n_worlds, n_drones) = {counts}, got shape {np.shape(x)}. Use np.broadcast_to."
                 )
 
-        def of_all(x: np.ndarray, core_template: np.ndarray) -> np.ndarray:
+        def broadcast(x: np.ndarray, core_template: np.ndarray) -> np.ndarray:
             dtype = float_dtype() if np.issubdtype(np.asarray(x).dtype, np.floating) else np.asarray(x).dtype
             core = np.shape(x)[np.ndim(x) - np.ndim(core_template) :]  # it may have rows of drones, and more rotors
             return host_array(x, n_worlds, n_drones, *core, dtype=dtype)
 
-        return ControllerData(jax.tree.map(of_all, memory, template), params, controller.freq)
+        return ControllerData(jax.tree.map(broadcast, memory, template), params, controller.freq)
 
 
 class _LevelData(PyTree):

@@ -144,9 +144,9 @@ class Integration:
     def derivative(self, data: SimData) -> SimStateDeriv:
         """Return the derivative of the states of drones and plugins, under all influences and the constraint."""
         if self.couples_world:
-            influenced, deriv = data, vmap_drones(lambda drone_data: self._free(drone_data)[1])(data)
+            influenced, deriv = data, vmap_drones(lambda drone_data: self._without_constraint(drone_data)[1])(data)
         else:
-            influenced, deriv = self._free(data)
+            influenced, deriv = self._without_constraint(data)
         constraining = [plugin for plugin in self.plugins if plugin.constrains]
         if not constraining:
             return deriv
@@ -156,7 +156,7 @@ class Integration:
             deriv = deriv.replace(vel=vel, ang_vel=ang_vel)
         return apply_constraint(constraining[0], influenced, deriv, None if self.method is rk4 else dt)
 
-    def _free(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
+    def _without_constraint(self, data: SimData) -> tuple[SimData, SimStateDeriv]:
         """Return the data with all influences applied, and the derivative without constraints."""
         for plugin in self.plugins:
             data = apply_influence(plugin, data)

@@ -90,7 +90,7 @@ def _refuse_outside(*args: object, **params: object) -> NoReturn:
     )
 
 
-def _results(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list[Any]:
+def _result_types(*args: object, jaxpr: ClosedJaxpr, n_own: int, reduce: str) -> list[Any]:
     return [x.update(weak_type=False) for x in jaxpr.out_avals]
 
 
@@ -101,8 +101,8 @@ def _batched(axis: Any, args: Sequence[Any], dims: Sequence[Any], jaxpr: ClosedJ
     if axis.name == MEMBER_AXIS:
         out = _reduce_for_all(axis.size, rows[:n_own], in_axes[:n_own], rows[n_own:], in_axes[n_own:], jaxpr, reduce)
     else:
-        of_many = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
-        pair = jax.make_jaxpr(of_many)(*rows, jax.ShapeDtypeStruct((), bool))
+        pair_of_batch = jax.vmap(jaxpr_as_fun(jaxpr), in_axes=(*in_axes, None), axis_size=axis.size)
+        pair = jax.make_jaxpr(pair_of_batch)(*rows, jax.ShapeDtypeStruct((), bool))
         out = reduce_over_others_p.bind(*rows, jaxpr=pair, n_own=n_own, reduce=reduce)
     return out, [0] * len(out)
 
@@ -117,7 +117,7 @@ def _reduce_for_all(
     reduce: str,
 ) -> list[Array]:
     """Return the reduction for each drone of a world. (n, ...) each"""
-    pair, numbers = jaxpr_as_fun(jaxpr), jnp.arange(n)
+    pair, indices = jaxpr_as_fun(jaxpr), jnp.arange(n)
     batched = [x for x, axis in zip(captured, captured_axes, strict=True) if axis is not None]
 
     def reduce_for_one(i: Array, row: Sequence[Array]) -> list[Array]:
@@ -127,15 +127,15 @@ def _reduce_for_all(
         def apply_to_pair(j: Array, values: Sequence[Array]) -> list[Array]:
             return pair(*own_values, *values, i == j)
 
-        pairs = jax.vmap(apply_to_pair, (0, list(other_axes)))(numbers, list(other))
+        pairs = jax.vmap(apply_to_pair, (0, list(other_axes)))(indices, list(other))
         return [REDUCTIONS[reduce](x, axis=0).astype(x.dtype) for x in pairs]
 
     if n * n <= MAX_PAIRS:
-        return jax.vmap(reduce_for_one)(numbers, batched)
-    in_turn = jax.checkpoint(lambda xs: reduce_for_one(*xs))
-    return jax.lax.map(in_turn, (numbers, batched), batch_size=max(1, MAX_PAIRS // n))
+        return jax.vmap(reduce_for_one)(indices, batched)
+    reduce_in_batch = jax.checkpoint(lambda xs: reduce_for_one(*xs))
+    return jax.lax.map(reduce_in_batch, (indices, batched), batch_size=max(1, MAX_PAIRS // n))
 
 
-reduce_over_others_p = batched_primitive("reduce_over_others", _results, _batched, _refuse_outside)
+reduce_over_others_p = batched_primitive("reduce_over_others", _result_types, _batched, _refuse_outside)
 """The reduction as a primitive: its operands are the values that the function captures, then the published ones.
 ``jaxpr`` maps both and ``is_self`` to the results for one pair; ``n_own`` is the number of captured values."""

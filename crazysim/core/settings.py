@@ -407,14 +407,14 @@ def controller_at_rates(
         requested = {"outer_freq": requested_rates.get(control), "freq": requested_rates.get(Control.attitude)}
     class_defaults = {f.name: f.default for f in dataclasses.fields(controller)}  # type: ignore[arg-type]
     rates: dict[str, Any] = {}
-    defaults, of = {}, f" of controller {controller.name!r}"
+    defaults, owner = {}, f" of controller {controller.name!r}"
     for name, given_rate in requested.items():
         rate = getattr(controller, name) if given_rate is None else given_rate
         if given_rate is None and rate == class_defaults[name]:
-            defaults[name] = positive_integer(name + of, rate)
+            defaults[name] = positive_integer(name + owner, rate)
         else:
-            rates[name] = dividing_rate(name + of, rate, freq)
-    rates |= default_rates(freq, defaults, of)
+            rates[name] = dividing_rate(name + owner, rate, freq)
+    rates |= default_rates(freq, defaults, owner)
     if inner := controller.inner:
         rates["inner"] = controller_at_rates(inner, controller.output, freq, requested_rates)
     return dataclasses.replace(controller, **rates)  # type: ignore[type-var]

@@ -240,7 +240,7 @@ class Axes:
         return jax.ShapeDtypeStruct(jnp.shape(x)[n_leading:], x.dtype)
 
 
-def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
+def vmap_worlds(fn: Callable[..., Any], min_batch_axes: int = 1) -> Callable[..., Any]:
     """Transform a function of one world to a function of all worlds.
 
     Leaves of records have the batch axes that they declare. The function receives leaves of drones as (n_drones, ...),
@@ -250,33 +250,33 @@ def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
 
     Args:
         fn: The function of one world: takes any number of trees of arrays, and returns a tree of arrays.
-        least: Smallest number of batch axes with which a leaf is split into worlds: 2 excludes batched leaves.
+        min_batch_axes: Smallest number of batch axes with which a leaf is split into worlds: 2 excludes batched leaves.
     """
 
-    def of_all(*args: Any) -> Any:
+    def in_all_worlds(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
-        leaf_scopes = _kinds(args)
+        leaf_scopes = _leaf_scopes(args)
         # Leaves of worlds, (n_worlds, 1, ...), lose their second axis.
         inputs = [x[:, 0] if scope == "world" else x for scope, x in zip(leaf_scopes, leaves, strict=True)]
-        is_split = [n_batch_axes(scope) >= least for scope in leaf_scopes]
+        is_split = [n_batch_axes(scope) >= min_batch_axes for scope in leaf_scopes]
         returned: dict[str, Any] = {}
 
         def in_one_world(values: list[Any]) -> list[Any]:
             result = fn(*treedef.unflatten(values))
             paths, returned["treedef"] = jax.tree_util.tree_flatten_with_path(result)
-            returned["scopes"] = result_scopes = _kinds(result)
+            returned["scopes"] = result_scopes = _leaf_scopes(result)
             # Unchanged leaves are found by identity, since ``fn`` may return trees of another structure. Only shared
             # leaves can be the same array, and then it does not matter which of them is found.
             indices = {id(x): i for i, x in enumerate(values)}
             unchanged = [indices.get(id(x)) for _, x in paths]
             for k, i in enumerate(unchanged):
-                if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= least:
+                if i is not None and not is_split[i] and n_batch_axes(result_scopes[k]) >= min_batch_axes:
                     unchanged[k] = None  # a shared leaf, returned in a field that has a value for every world
-                elif i is not None and n_batch_axes(result_scopes[k]) < least:
+                elif i is not None and n_batch_axes(result_scopes[k]) < min_batch_axes:
                     result_scopes[k] = leaf_scopes[i]  # within one world, a leaf of a foreign record loses its scope
             returned["unchanged"] = unchanged
             for (path, _), scope, i in zip(paths, result_scopes, unchanged, strict=True):
-                if n_batch_axes(scope) < least and i is None:
+                if n_batch_axes(scope) < min_batch_axes and i is None:
                     name = jax.tree_util.keystr(path).lstrip(".")
                     raise ConfigError(
                         f"{getattr(fn, '__name__', fn)!r} is written for one world and changes {name}, which all "
@@ -294,7 +294,7 @@ def vmap_worlds(fn: Callable[..., Any], least: int = 1) -> Callable[..., Any]:
                 out.append(x[:, None] if scope == "world" else x)
         return returned["treedef"].unflatten(out)
 
-    return of_all
+    return in_all_worlds
 
 
 def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
@@ -304,15 +304,15 @@ def vmap_drones(fn: Callable[[SimData], Any]) -> Callable[[SimData], Any]:
         fn: Function that returns any tree of arrays. In the result each array has a first axis over drones.
     """
 
-    def of_world(data: SimData) -> Any:
+    def for_all_drones(data: SimData) -> Any:
         leaves, treedef = jax.tree.flatten(data)
         axes = [0 if scope == "drone" else None for scope in jax.tree.leaves(scopes(data))]
         return jax.vmap(lambda values: fn(treedef.unflatten(values)), (axes,), axis_name=MEMBER_AXIS)(leaves)
 
-    return of_world
+    return for_all_drones
 
 
-def _kinds(tree: object) -> list[str]:
+def _leaf_scopes(tree: object) -> list[str]:
     """Return the scope of every leaf: the one that its record declares, or ``batched`` outside of records."""
 
     def is_record(x: object) -> bool:
@@ -329,7 +329,7 @@ def _apply_in_all_worlds(stage: Stage, data: SimData) -> SimData:
 def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
     """Return a stage as a function of the data of one world; its condition selects between new and old leaves."""
 
-    def of_one_world(world: SimData) -> SimData:
+    def in_world(world: SimData) -> SimData:
         leaves = jax.tree.leaves(world)
         written: list[int] = []
 
@@ -343,4 +343,4 @@ def world_function(stage: Stage, axes: Axes) -> Callable[[SimData], SimData]:
         out = apply(leaves) if stage.scope == "world" else jax.vmap(apply, (in_axes,), axis_name=MEMBER_AXIS)(leaves)
         return axes.treedef.unflatten(replace_leaves(leaves, written, out))
 
-    return of_one_world
+    return in_world

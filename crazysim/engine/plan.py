@@ -125,9 +125,9 @@ class Planner(NamedTuple):
             ConfigError: If an engine chosen by name cannot run the stages; with ``strict``, if a stage is unsupported.
         """
         if self.engine == "plain":
-            return self._plain(data, "it was chosen")
+            return self._plan_plain(data, "it was chosen")
         try:
-            plan, problems = self._fast(data, zeros, separate)
+            plan, problems = self._plan_programs(data, zeros, separate)
             if plan.numpy_step is None:
                 trace(plan)
         except (ConfigError, MemoryError):
@@ -135,28 +135,29 @@ class Planner(NamedTuple):
         except Exception as error:
             if self.strict or self.engine != "auto":
                 raise
-            bug = error
+            failure = error
         else:
             self._report(problems)
             return plan
-        plan = self._plain(data, f"the engine failed with {type(bug).__name__}")  # raises an error of the stage itself
+        reason = f"the engine failed with {type(failure).__name__}"
+        plan = self._plan_plain(data, reason)  # raises an error of the stage itself
         self._report(
             [
-                f"the engine failed with {type(bug).__name__}: {bug}{self._culprit(data)}, so the step runs on "
-                f"'plain', which is slower. This is a bug of crazysim: please report it, with the files that "
-                f"CRAZYSIM_DUMP=folder writes; strict=True raises the error"
+                f"{reason}: {failure}{self._failing_stage(data)}, so the step runs on 'plain', which is slower. This "
+                "is a bug of crazysim: please report it, with the files that CRAZYSIM_DUMP=folder writes; strict=True "
+                "raises the error"
             ]
         )
         return plan
 
-    def _fast(self, data: SimData, zeros: Zeros, separate: SeparateLeaves) -> tuple[Plan, list[str]]:
+    def _plan_programs(self, data: SimData, zeros: Zeros, separate: SeparateLeaves) -> tuple[Plan, list[str]]:
         """Return a plan that runs programs, and messages on what its engine does not support.
 
         For data on several devices it may be a plan of ``plain``.
         """
-        limit = self._spread_limit(data)
+        limit = self._distribution_limit(data)
         if limit:
-            return self._plain(data, limit), []
+            return self._plan_plain(data, limit), []
         leaf_scopes = jax.tree.leaves(scopes(data))
         # ``zeros`` may be older than ``data``: a parameter that was shared then may have one value per drone now.
         known = tuple([(i, indices) for i, indices in zeros if leaf_scopes[i] == "shared"])
@@ -172,9 +173,10 @@ class Planner(NamedTuple):
             select = lambda written: [i for i in written if i not in not_rows]  # noqa: E731
         programs = tuple([optimise(program, select, pack=k == 0) for k, program in enumerate(lowered)])
         unfused = [stage for program in programs for stage in program.unfused_stages]
-        problems = [f"stage {s.unfused}" for s in unfused if not isinstance(s.error, LimitError)]
+        problems = [f"stage {s.explanation}" for s in unfused if not isinstance(s.error, LimitError)]
         if self.location.is_distributed and unfused:
-            return self._plain(data, f"with a mesh every stage must be fused, and {unfused[0].unfused}"), problems
+            limit = f"with a mesh every stage must be fused, and {unfused[0].explanation}"
+            return self._plan_plain(data, limit), problems
         engine, reason, runs = self.engine, "it was chosen", []
         if engine in ("auto", "fused"):
             engine, reason = "lanes", fused.unavailable_reason(self.location.platform) or ""
@@ -185,13 +187,13 @@ class Planner(NamedTuple):
                 except UnsupportedError as error:
                     error = self._error_of_stage(error, data)
                     reason = str(error)
-                    problems.append(self._without_kernel(error))
+                    problems.append(self._no_kernel_message(error))
             if reason and self.engine == "fused":
                 raise ConfigError(f"engine 'fused' cannot run this pipeline: {reason}. Use 'lanes' or 'auto'.")
         runs = runs or [BACKENDS[engine](program, self.location) for program in programs]
         inputs = {i for program in programs for i in _inputs(program)}
         run, written = _join_runs(groups, programs, runs)
-        plan = self._wrap(engine, reason, data, programs, inputs, written, run, len(programs[0].leaves))
+        plan = self._make_plan(engine, reason, data, programs, inputs, written, run, len(programs[0].leaves))
         kernels = [run.kernels for run in runs if isinstance(run, fused.FusedRun) and run.kernels is not None]
         on_host = self.location.platform == "cpu" and self.location.mesh is None and len(kernels) == len(programs)
         if on_host and is_possible(kernels):
@@ -200,7 +202,7 @@ class Planner(NamedTuple):
             plan = dataclasses.replace(plan, host_call=call)
         return plan, problems
 
-    def _spread_limit(self, data: SimData) -> str:
+    def _distribution_limit(self, data: SimData) -> str:
         """Return the reason why data on several devices must be stepped by ``plain``; empty if there is none."""
         if not self.location.is_distributed:
             return ""
@@ -211,17 +213,17 @@ class Planner(NamedTuple):
             return ""
         return f"a mesh needs stages of one drone or world; {stage.__name__!r}: {stage.unfused_reason}"
 
-    def _plain(self, data: SimData, reason: str) -> Plan:
+    def _plan_plain(self, data: SimData, reason: str) -> Plan:
         run, written = plain.build(self.stages, data)
         all_leaves = tuple(range(len(jax.tree.leaves(data))))
         # XLA itself distributes the computation of ``plain`` over the devices.
-        return self._wrap("plain", reason, data, (), all_leaves, tuple(written), run, len(all_leaves))
+        return self._make_plan("plain", reason, data, (), all_leaves, tuple(written), run, len(all_leaves))
 
     @property
     def _has_kernels(self) -> bool:
         return self.engine in ("auto", "fused") and fused.unavailable_reason(self.location.platform) is None
 
-    def _wrap(
+    def _make_plan(
         self,
         engine: str,
         reason: str,
@@ -279,7 +281,7 @@ class Planner(NamedTuple):
         """Warn of all problems of a plan in one warning, or raise them as one error if ``strict`` is True."""
         report_unsupported(problems, self.strict, self.reported, "Write the stage with supported operations")
 
-    def _without_kernel(self, error: UnsupportedError) -> str:
+    def _no_kernel_message(self, error: UnsupportedError) -> str:
         """Return a message on what a kernel does not support, with the stage, or with all stages if it is not known."""
         if error.stage:
             return f"stage {error.stage!r} has no kernel: {error.reason}"
@@ -301,7 +303,7 @@ class Planner(NamedTuple):
                 return stage_error
         return error
 
-    def _culprit(self, data: SimData) -> str:
+    def _failing_stage(self, data: SimData) -> str:
         """Return the end of a message that names the first stage that cannot be lowered; empty if there is none."""
         for stage in self.stages:
             try:

@@ -24,8 +24,8 @@ def from_barycentric(weights: Barycentric, a: Vector, b: Vector, c: Vector) -> V
 def closest_point(a: Vector, b: Vector, c: Vector) -> Barycentric:
     """Return the barycentric coordinates of the point of a triangle nearest to the origin."""
     t = _nearest_on_segment(b, c - b)
-    on_third, rest = (jnp.zeros_like(t), 1 - t, t), closest_point_off_bc(a, b, c)
-    return _nearer_point(on_third, rest, a, b, c)
+    on_bc, off_bc = (jnp.zeros_like(t), 1 - t, t), closest_point_off_bc(a, b, c)
+    return _nearer_point(on_bc, off_bc, a, b, c)
 
 
 def closest_point_off_bc(a: Vector, b: Vector, c: Vector) -> Barycentric:
@@ -36,8 +36,8 @@ def closest_point_off_bc(a: Vector, b: Vector, c: Vector) -> Barycentric:
     normal = ab.cross(ac)
     u, v, w = normal.dot(b.cross(c)), normal.dot(c.cross(a)), normal.dot(a.cross(b))
     inside = (u > 0) & (v > 0) & (w > 0) & (normal.dot(normal) > MIN_SQUARED_SINE * ab.dot(ab) * ac.dot(ac))
-    share = 1 / jnp.where(inside, u + v + w, 1.0)
-    return _choose(inside, (u * share, v * share, w * share), on_side)
+    scale = 1 / jnp.where(inside, u + v + w, 1.0)
+    return _choose(inside, (u * scale, v * scale, w * scale), on_side)
 
 
 def _nearest_on_segment(a: Vector, side: Vector) -> Array:

@@ -65,20 +65,20 @@ def _build_tree(low: np.ndarray, high: np.ndarray, geoms: np.ndarray) -> _Node:
     if n == 1:
         return node
     order = np.argsort(low[geoms] + high[geoms], axis=0, kind="stable")  # along each axis
-    a, b = low[geoms][order], high[geoms][order]  # (n, 3, 3): position, axis of the order, component
+    lows, highs = low[geoms][order], high[geoms][order]  # (n, 3, 3): position, axis of the order, component
 
     def surfaces(low: np.ndarray, high: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(high - low, -1, 0)
         return x * y + y * z + z * x
 
-    low_side = surfaces(np.minimum.accumulate(a), np.maximum.accumulate(b))[:-1]
-    right = surfaces(np.minimum.accumulate(a[::-1]), np.maximum.accumulate(b[::-1]))[::-1][1:]
+    first_surface = surfaces(np.minimum.accumulate(lows), np.maximum.accumulate(highs))[:-1]
+    second_surface = surfaces(np.minimum.accumulate(lows[::-1]), np.maximum.accumulate(highs[::-1]))[::-1][1:]
     count = np.arange(1, n)[:, None]
-    cost = low_side * count + right * (n - count)
-    least = n // 8
-    cost = cost[least : n - 1 - least]
+    cost = first_surface * count + second_surface * (n - count)
+    min_count = n // 8
+    cost = cost[min_count : n - 1 - min_count]
     split, axis = np.unravel_index(int(np.argmin(cost)), cost.shape)
-    halves = np.split(geoms[order[:, axis]], [int(split) + least + 1])
+    halves = np.split(geoms[order[:, axis]], [int(split) + min_count + 1])
     node.axis, node.geom = int(axis), -1
     node.children = _build_tree(low, high, halves[0]), _build_tree(low, high, halves[1])
     return node

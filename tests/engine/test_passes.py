@@ -83,7 +83,7 @@ def test_hoisting_takes_work_out_of_the_loop(pipeline):
     assert after.hoisted.outputs
     assert after.n_operations < before.n_operations
     assert {"cos", "sin", "div"} & {op.name for op in after.hoisted.operations}
-    assert hoisted.changing().isdisjoint(after.hoisted_reads)
+    assert hoisted.changing_slots().isdisjoint(after.hoisted_reads)
     expected, found = run(fused, numbers, 3), run(hoisted, numbers, 3)
     for slot, x in expected.items():
         np.testing.assert_allclose(found[slot], x, rtol=2e-4, atol=2e-5, err_msg=str(slot))

@@ -157,7 +157,7 @@ def test_a_lowered_stage_reads_what_it_reads_as_it_is_written(scope, chosen):
     for name, expected in jax.jit(each)(data()).items():
         program = optimise(lower_stages(as_stages(pipeline([name], scope)), data()))
         verify(program)
-        assert program.fused, program.unfused_stages[0].unfused
+        assert program.fused, program.unfused_stages[0].explanation
         leaves = jax.tree.leaves(data())
         (out,), _ = interpret.steps(program, [*leaves, _packed(program, leaves)], 1)
         np.testing.assert_array_equal(out, expected, err_msg=name)

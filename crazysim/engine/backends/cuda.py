@@ -166,10 +166,10 @@ def fit_registers(kernel: Kernel, device: jax.Device) -> Kernel:
     numbers = dict.fromkeys(n // kernel.threads for n in THREADS_TO_TRY if n > kernel.threads)
     candidates = [kernel, *(kernel.with_blocks(n) for n in numbers)]
     with ThreadPoolExecutor(len(candidates)) as pool:  # the compiler takes a second for each, on one core
-        least, *found = pool.map(lambda c: resources(c, device), candidates)
+        original, *others = pool.map(lambda c: resources(c, device), candidates)
     # Measured on an H200: docs/concepts/engine.md. Gradients are slower with 168 registers and 248 bytes than with 255.
-    bearable = 16 if least.registers <= 224 or kernel.state_bytes else 256
-    suitable = (c for c, r in zip(candidates[1:], found, strict=True) if r.spilled <= least.spilled + bearable)
+    spill_margin = 16 if original.registers <= 224 or kernel.state_bytes else 256
+    suitable = (c for c, r in zip(candidates[1:], others, strict=True) if r.spilled <= original.spilled + spill_margin)
     return next(suitable, kernel)
 
 
@@ -178,10 +178,10 @@ def widen_blocks(kernel: Kernel, device: jax.Device) -> Kernel:
 
     Kernels of gradients, of large worlds, and with few registers for each thread stay as they are.
     """
-    stays = kernel.state_bytes or kernel.group > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
+    keeps_size = kernel.state_bytes or kernel.group > WARP_THREADS or ANY_NUMBER_OF_BLOCKS not in kernel.text
     return (
         kernel
-        if stays or resources(kernel, device).code <= INSTRUCTION_CACHE_BYTES
+        if keeps_size or resources(kernel, device).code <= INSTRUCTION_CACHE_BYTES
         else kernel.with_threads(LARGE_KERNEL_THREADS)
     )
 
@@ -199,27 +199,27 @@ def resources(kernel: Kernel, device: jax.Device) -> Resources:
     """Return the registers and memory that a kernel takes on a GPU, as its driver reports them."""
     image = _compile(kernel.text, architecture(device).replace("compute", "sm"), "CUBIN")
     try:
-        driver, number = ctypes.CDLL("libcuda.so.1"), device.local_hardware_id
+        driver, ordinal = ctypes.CDLL("libcuda.so.1"), device.local_hardware_id
     except OSError as error:
         raise KernelError(f"the CUDA driver was not found: {error}") from error
     module, function, value = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
     jax.block_until_ready(jax.device_put(np.zeros(1), device))  # the driver's context exists from here on
     handle, context = ctypes.c_int(), ctypes.c_void_p()
-    check_driver(driver.cuDeviceGet(ctypes.byref(handle), number))
+    check_driver(driver.cuDeviceGet(ctypes.byref(handle), ordinal))
     check_driver(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), handle))
     check_driver(driver.cuCtxPushCurrent_v2(context))
     try:
         check_driver(driver.cuModuleLoadData(ctypes.byref(module), image))
         check_driver(driver.cuModuleGetFunction(ctypes.byref(function), module, b"advance"))
-        found = []
+        values = []
         for attribute in (4, 3):  # CU_FUNC_ATTRIBUTE_NUM_REGS, CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES
             check_driver(driver.cuFuncGetAttribute(ctypes.byref(value), attribute, function))
-            found.append(value.value)
+            values.append(value.value)
         check_driver(driver.cuModuleUnload(module))
     finally:
         driver.cuCtxPopCurrent_v2(ctypes.byref(context))
         driver.cuDevicePrimaryCtxRelease(handle)
-    registers, spilled = found
+    registers, spilled = values
     return Resources(registers, spilled, code=len(image))
 
 

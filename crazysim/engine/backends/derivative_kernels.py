@@ -42,7 +42,7 @@ class DerivativeKernels:
         self.program, self.location, self.on_lanes = program, location, on_lanes
         self.used: dict[str, None] = {}
         """Ways in which derivatives were computed so far, for ``explain``."""
-        self.floats = tuple(i for i in program.written if program.leaves[i].number.kind == "f")
+        self.floats = tuple(i for i in program.written if program.leaves[i].number_type.kind == "f")
         """Leaves that are written and have derivatives."""
         self._programs: dict[Any, Any] = {}
         self._launches: dict[Any, Launch | None] = {}
@@ -154,7 +154,7 @@ def _reverse(
 
     inputs = [*_inputs(values, reverse.needed_leaves(going_back)), *map(seed, kernels.floats)]
     leaves = [program.leaves[i] for i in going_back.perturbed]
-    outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number) for x in leaves]
+    outputs = [jax.ShapeDtypeStruct((n_worlds, n_drones, x.size), x.number_type) for x in leaves]
     sums_of_lanes = launch(n_worlds * n_drones, np.asarray([n_steps], np.int32), inputs, outputs)
 
     def sum_cotangent(i: int, x: Array) -> Array:

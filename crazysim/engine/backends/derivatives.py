@@ -62,10 +62,10 @@ def make_differentiable(run: CountedRun, other: Run, kernels: DerivativeKernels 
                 announce("compiling a derivative of the steps on lanes", "10 to 40 s")
             known = n_steps if isinstance(n_steps, int) else count  # a traced one may not be closed over
 
-            def of(floats: list[Any]) -> Any:
+            def advance_floats(floats: list[Any]) -> Any:
                 return other(replace_leaves(values, changing, floats), known)
 
-            return jax.jvp(of, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
+            return jax.jvp(advance_floats, ([values[i] for i in changing],), ([slopes[i] for i in changing],))
 
         forward.defjvp(derivative, symbolic_zeros=True)  # to skip the tangents of constant leaves
         return forward(leaves, jnp.asarray(n_steps, jnp.int32))
@@ -146,8 +146,8 @@ def _tangents_on_lanes(*args: Any, case: Case, **params: Any) -> list[Array]:
     del params
 
     def tangents(values: list[Any], slopes: list[Any]) -> list[Array]:
-        of = partial(_floats_after, case, values)
-        return jax.jvp(of, ([values[i] for i in case.changing],), (slopes,))[1]
+        fn = partial(_floats_after, case, values)
+        return jax.jvp(fn, ([values[i] for i in case.changing],), (slopes,))[1]
 
     return case.over_batches(tangents, args, case.changing, case.kernels.floats)
 

@@ -229,8 +229,8 @@ def lanes_of_block(group: int) -> tuple[int, int]:
     """
     if group <= WARP_THREADS:
         return BLOCK_SIZE, BLOCK_SIZE // WARP_THREADS * (WARP_THREADS // group * group)
-    least = math.ceil(group / WARP_THREADS) * WARP_THREADS
-    sizes = range(least, max(least, 256) + 1, WARP_THREADS)
+    min_threads = math.ceil(group / WARP_THREADS) * WARP_THREADS
+    sizes = range(min_threads, max(min_threads, 256) + 1, WARP_THREADS)
     return max(((n, n // group * group) for n in sizes), key=lambda x: (round(x[1] / x[0], 2), -x[0]))
 
 

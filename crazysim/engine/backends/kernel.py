@@ -39,7 +39,7 @@ def write(program: Program, target: str) -> Kernel:
     pointers += [f"{_type(program, i)}* __restrict__ q{rank[i]}" for i in outputs]
     pointers += ["b1* __restrict__ flagged"] if program.check is not None else []
     in_place = tuple(i for i in inputs if i in outputs and i in program.rows)
-    return body.kernel(pointers, inputs, outputs, in_place, [s.block for s in body.each])
+    return body.kernel(pointers, inputs, outputs, in_place, [s.block for s in body.step_segments])
 
 
 class Body:
@@ -49,7 +49,7 @@ class Body:
         self.program, self.target = program, target
         self.exchange = exchange_for(target, program.group)
         self.writer = Writer(self.exchange)
-        self.each = [s for s in program.fused_segments if s.phase == "each"]
+        self.step_segments = [s for s in program.fused_segments if s.phase == "each"]
         self.stored = _written_slots(program)
         self._depth = 1 + self.exchange.depth
         self.names: dict[Slot, str] = {}
@@ -98,7 +98,7 @@ class Body:
             else:
                 names[slot] = exchange.keep(writer, names[slot], kind, access, self._depth)
         self._write_phase("before")
-        hoisted = [self._write_hoisted(segment) for segment in self.each]
+        hoisted = [self._write_hoisted(segment) for segment in self.step_segments]
         exchange.close_loop(writer, 1)
         return hoisted
 
@@ -106,7 +106,7 @@ class Body:
         """Write the steps."""
         self.writer.line("for (int step = 0; step < n_steps; ++step) {", 1)
         self.exchange.open_loop(self.writer, 2)
-        for segment, constants in zip(self.each, hoisted, strict=True):
+        for segment, constants in zip(self.step_segments, hoisted, strict=True):
             write_segment(self.writer, self.program, segment, self.names, constants, 1 + self._depth)
         self.exchange.close_loop(self.writer, 2)
         self.writer.line("}", 1)
@@ -182,8 +182,8 @@ def require_source(program: Program) -> None:
         require_block_source(segment.block)
         for i in {*segment.read, *segment.written}:
             leaf = program.leaves[i]
-            if leaf.number not in TYPE_NAMES:
-                why = f"kernels have no numbers of type {leaf.number}, which {leaf.name} has"
+            if leaf.number_type not in TYPE_NAMES:
+                why = f"kernels have no numbers of type {leaf.number_type}, which {leaf.name} has"
                 raise UnsupportedError(why, stage=", ".join(segment.stages))
 
 
@@ -279,7 +279,7 @@ def _deferred_slots(program: Program) -> set[Slot]:
 
 
 def _type(program: Program, leaf: int) -> str:
-    return type_name(program.leaves[leaf].number)
+    return type_name(program.leaves[leaf].number_type)
 
 
 def _load(program: Program, slot: Slot) -> str:

@@ -128,7 +128,7 @@ def shape_of(program: Program, leaf: int, n_worlds: int) -> jax.ShapeDtypeStruct
     shape = (n_worlds, *example.shape[1:])
     if leaf in program.rows:
         shape = (program.rows[leaf], n_worlds * program.n_drones)
-    return jax.ShapeDtypeStruct((*shape, *([2] if is_key(example) else [])), example.number)
+    return jax.ShapeDtypeStruct((*shape, *([2] if is_key(example) else [])), example.number_type)
 
 
 MIN_CHECKPOINTED_STEPS = 256

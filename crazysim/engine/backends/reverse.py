@@ -47,7 +47,7 @@ class ReverseProgram:
     @property
     def seeds(self) -> tuple[int, ...]:
         """Leaves with given cotangents: the floats that the program writes."""
-        return tuple(i for i in self.program.written if self.program.leaves[i].number.kind == "f")
+        return tuple(i for i in self.program.written if self.program.leaves[i].number_type.kind == "f")
 
     def slots(self) -> list[Slot]:
         """Return the slots of all cotangents."""
@@ -71,7 +71,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
     """
     program, perturbed = without_check(program, perturbed)
     n = len(program.leaves)
-    cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number) for x in program.leaves]
+    cotangents = [Leaf(f"cotangent of {x.name}", "drone", (1, 1, x.size), x.number_type) for x in program.leaves]
     step_segments = [s for s in program.fused_segments if s.phase == "each"]
     hoisted = [
         Leaf("cotangents of hoisted numbers", "drone", (1, 1, len(s.hoisted.outputs)), _float_of(s.hoisted))
@@ -87,7 +87,7 @@ def reverse_program(program: Program, perturbed: Collection[int]) -> ReverseProg
         s: _back_hoisted(n, s, changed, constants[s], 2 * n + k) for k, s in enumerate(step_segments) if constants[s]
     }
     read = {slot for s in step_segments for slot in program.per_drone(s, [*s.reads, *s.writes])}
-    changing = program.changing()
+    changing = program.changing_slots()
     if len(step_segments) == 1 and step_segments[0].scope == "drone":
         read = set(step_segments[0].reads)
     carried = tuple(sorted(read & changing))
@@ -220,10 +220,10 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         if slot[0] >= 2 * n:
             s = [s for s in program.fused_segments if s.phase == "each"][slot[0] - 2 * n]
             return type_name(s.hoisted.outputs[slot[1]].dtype)
-        return type_name(program.leaves[slot[0]].number)
+        return type_name(program.leaves[slot[0]].number_type)
 
     for i in reverse.seeds:
-        writer.line(kernel.rows(f"s{rank[i]}", type_name(program.leaves[i].number), program.leaves[i].size), 1)
+        writer.line(kernel.rows(f"s{rank[i]}", type_name(program.leaves[i].number_type), program.leaves[i].size), 1)
     for i, k in reverse.slots():
         primal = i - n
         name = f"g{i - 2 * n}_{k}" if i >= 2 * n else f"c{rank[primal]}_{k}"
@@ -234,7 +234,7 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
         names[i, k] = name
 
     carried = reverse.carried
-    types = [type_name(program.leaves[i].number) for i, _ in carried]
+    types = [type_name(program.leaves[i].number_type) for i, _ in carried]
 
     def keep(state: str, slots: Collection[Slot], depth: int) -> None:
         for k, (slot, t) in enumerate(zip(carried, types, strict=True)):
@@ -280,12 +280,12 @@ def write(reverse: ReverseProgram, target: str) -> Kernel:
             kernel.write_segment(writer, program, reverse.back_hoisted[s], names, (), 1)
     if first:
         _write_back(body, reverse, first, [()] * len(first), names | body.starts, 1)
-    pointers = [f"const {type_name(program.leaves[i].number)}* __restrict__ "
+    pointers = [f"const {type_name(program.leaves[i].number_type)}* __restrict__ "
                 f"p{rank[i]}"
                 for i in kernel.needed_leaves(program)]  # fmt: skip
-    pointers += [f"const {type_name(program.leaves[i].number)}* __restrict__ s{rank[i]}" for i in reverse.seeds]
+    pointers += [f"const {type_name(program.leaves[i].number_type)}* __restrict__ s{rank[i]}" for i in reverse.seeds]
     for i in reverse.perturbed:
-        number, pointer = type_name(program.leaves[i].number), f"d{rank[i]}"
+        number, pointer = type_name(program.leaves[i].number_type), f"d{rank[i]}"
         pointers.append(f"{number}* __restrict__ {pointer}")
         values = [names[n + i, k] for k in range(program.leaves[i].size)]
         kernel.write_results(writer, pointer, number, 1, values, 1)
@@ -317,7 +317,7 @@ def _write_back(
         before.append(dict(names))
         if s is not segments[-1]:
             for slot in dict.fromkeys(program.per_drone(s, s.writes)):
-                fresh, kind = writer.new("a"), type_name(program.leaves[slot[0]].number)
+                fresh, kind = writer.new("a"), type_name(program.leaves[slot[0]].number_type)
                 writer.line(f"auto {fresh} = {kind}_lanes({names[slot]});", depth)
                 names[slot] = fresh
             kernel.write_segment(writer, program, s, names, fixed, depth)

@@ -40,6 +40,10 @@ def require_block_source(block: Block) -> None:
 
 
 INDENT = "  "
+"""Indentation of one depth."""
+
+EntryGroup = tuple[Element, Element, int]
+"""Table, index, and number of a group of four neighbouring entries, which a target reads at once."""
 
 
 class Writer(LineWriter):
@@ -56,10 +60,14 @@ class Writer(LineWriter):
         self.names: dict[Value, str] = {}
         self.shared: set[Value] = set()
         """Values that are scalar variables, because all lanes share them."""
-        self.pairs: dict[str, str] = {}
-        self.tests: dict[Value, Operation] = {}
+        self.sin_cos_names: dict[str, str] = {}
+        """Prefix of the variables that hold sine and cosine of an expression."""
+        self.comparisons: dict[Value, Operation] = {}
+        """Comparisons by their results."""
         self.tables: list[str] = []
-        self.fours: dict[tuple[Element, Element, int], str] = {}
+        """Lines with tables of constants, which stand before the kernel."""
+        self.entry_groups: dict[EntryGroup, str] = {}
+        """Variable of each group of four table entries that is read at once; empty before the first read."""
         self._count = 0
 
     def new(self, prefix: str = "v") -> str:
@@ -72,8 +80,8 @@ class Writer(LineWriter):
     def block(self, block: Block, inputs: Sequence[str], depth: int) -> list[str]:
         """Write a block's operations, and return the names of its outputs."""
         self.names.update(zip(block.inputs, inputs, strict=True))
-        outside = dict(self.pairs), self.fours  # variables of a block are not defined outside it
-        self.fours = dict.fromkeys(_fours(block), "")
+        outside = dict(self.sin_cos_names), self.entry_groups  # variables of a block are not defined outside it
+        self.entry_groups = dict.fromkeys(_entry_groups(block), "")
         for position, op in enumerate(block.operations):
             if op.name == "over_others":
                 self._over_others(op, depth, _live_values(block, position))
@@ -81,11 +89,11 @@ class Writer(LineWriter):
             else:
                 self._operation(op, depth)
                 self.shared.update(shared_results(op, self.shared))
-        self.pairs, self.fours = outside
+        self.sin_cos_names, self.entry_groups = outside
         return [self.element(x) for x in block.outputs]
 
     def forget(self) -> None:
-        self.pairs, self.fours = {}, dict.fromkeys(self.fours, "")
+        self.sin_cos_names, self.entry_groups = {}, dict.fromkeys(self.entry_groups, "")
 
     def element(self, x: Element) -> str:
         """Return an element as an expression."""
@@ -122,9 +130,9 @@ class Writer(LineWriter):
                     self.line(f"const auto {name}_{k} = {out};", depth)
             case _:
                 if op.name in ("lt", "gt"):
-                    self.tests[op.results[0]] = op
-                limit = _limit(op, self.tests)
-                text = expression(op, args) if limit is None else f"{limit}({args[1]}, {args[2]})"
+                    self.comparisons[op.results[0]] = op
+                function = _limiting_function(op, self.comparisons)
+                text = expression(op, args) if function is None else f"{function}({args[1]}, {args[2]})"
                 name = self.names[op.results[0]] = self.new()
                 self.line(f"const auto {name} = {text};", depth)
 
@@ -142,24 +150,24 @@ class Writer(LineWriter):
 
     def _lookup(self, op: Operation, args: list[str], depth: int) -> None:
         """Write a read of an entry, with its three neighbours if they are read too."""
-        offset, key = op.param("offset"), _four_of(op)
-        if key not in self.fours:
+        offset, key = op.param("offset"), _entry_group(op)
+        if key not in self.entry_groups:
             name = self.names[op.results[0]] = self.new()
             self.line(f"const auto {name} = lookup({args[0]}, {args[1]}, {offset});", depth)
             return
-        if not self.fours[key]:
-            name = self.fours[key] = self.new()
+        if not self.entry_groups[key]:
+            name = self.entry_groups[key] = self.new()
             self.line(f"const auto {name} = lookup_four({args[0]}, {args[1]}, {offset // 4 * 4});", depth)
-        self.names[op.results[0]] = f"{self.fours[key]}.x[{offset % 4}]"
+        self.names[op.results[0]] = f"{self.entry_groups[key]}.x[{offset % 4}]"
 
     def _sin_cos(self, op: Operation, x: str, depth: int) -> None:
         """Write sine and cosine together, as they share most of their work."""
-        if x not in self.pairs:
-            pair = self.pairs[x] = self.new()
+        if x not in self.sin_cos_names:
+            pair = self.sin_cos_names[x] = self.new()
             kind = "auto" if isinstance(op.args[0], Value) else type_name(op.dtype)
             self.line(f"{kind} {pair}_0 = {x}, {pair}_1 = {x};", depth)
             self.line(f"sin_cos({x}, {pair}_0, {pair}_1);", depth)
-        self.names[op.results[0]] = f"{self.pairs[x]}_{0 if op.name == 'sin' else 1}"
+        self.names[op.results[0]] = f"{self.sin_cos_names[x]}_{0 if op.name == 'sin' else 1}"
 
     def _when(self, op: Operation, args: list[str], depth: int) -> None:
         mask, *old = args
@@ -173,8 +181,8 @@ class Writer(LineWriter):
         (body,) = op.blocks
         shared = self._shared_carry(op)
         name = self._carry(op, args, shared, depth)
-        turn = self.new("n")
-        self.line(f"for (int {turn} = 0; {turn} < {op.param('length')}; ++{turn}) {{", depth)
+        counter = self.new("n")
+        self.line(f"for (int {counter} = 0; {counter} < {op.param('length')}; ++{counter}) {{", depth)
         outs = self.block(body, [f"{name}_{k}" for k in range(len(args))], depth + 1)
         self._assign(op, name, outs, shared, None, depth + 1)
         self.line("}", depth)
@@ -186,25 +194,25 @@ class Writer(LineWriter):
         reads = self.exchange.publish(self, published, live, depth)
         first = [ops.neutral_number(name, x.dtype) for name, x in zip(op.param("reduce"), op.results, strict=True)]
         name = self._carry(op, [literal(x) for x in first], [False] * len(first), depth)
-        best: dict[int, str] = {}
+        best_numbers: dict[int, str] = {}
         for k, (combine, x) in enumerate(zip(op.param("reduce"), body.outputs, strict=True)):
             if combine in ops.INDEX_REDUCTIONS:
-                best[k], start = self.new(), literal(ops.neutral_number(combine[3:], x.dtype))
-                self.line(f"auto {best[k]} = {type_name(x.dtype)}_lanes({start});", depth)
-        turn = self.new("j")
-        self.line(f"UNROLL for (int {turn} = 0; {turn} < GROUP; ++{turn}) {{", depth)
+                best_numbers[k], start = self.new(), literal(ops.neutral_number(combine[3:], x.dtype))
+                self.line(f"auto {best_numbers[k]} = {type_name(x.dtype)}_lanes({start});", depth)
+        counter = self.new("j")
+        self.line(f"UNROLL for (int {counter} = 0; {counter} < GROUP; ++{counter}) {{", depth)
         inputs = [self.new() for _ in body.inputs]
         for variable, read in zip(inputs, reads, strict=False):
-            self.line(f"const auto {variable} = {read(turn)};", depth + 1)
-        self.line(f"const auto {inputs[-1]} = eq_(own, i32({turn}));", depth + 1)
+            self.line(f"const auto {variable} = {read(counter)};", depth + 1)
+        self.line(f"const auto {inputs[-1]} = eq_(own, i32({counter}));", depth + 1)
         outs = self.block(body, inputs, depth + 1)
         for k, (combine, out) in enumerate(zip(op.param("reduce"), outs, strict=True)):
-            if k in best:
+            if k in best_numbers:
                 better = self.new()
-                test = f"{ops.INDEX_REDUCTIONS[combine]}_({out}, {best[k]})"
+                test = f"{ops.INDEX_REDUCTIONS[combine]}_({out}, {best_numbers[k]})"
                 self.line(f"const auto {better} = or_({test}, ne_({out}, {out}));", depth + 1)
-                self.line(f"{name}_{k} = select_n_({better}, {name}_{k}, i32_lanes(i32({turn})));", depth + 1)
-                self.line(f"{best[k]} = select_n_({better}, {best[k]}, {out});", depth + 1)
+                self.line(f"{name}_{k} = select_n_({better}, {name}_{k}, i32_lanes(i32({counter})));", depth + 1)
+                self.line(f"{best_numbers[k]} = select_n_({better}, {best_numbers[k]}, {out});", depth + 1)
             else:
                 self.line(f"{name}_{k} = {combine}_({name}_{k}, {out});", depth + 1)
         self.line("}", depth)
@@ -240,12 +248,13 @@ class Writer(LineWriter):
         self, op: Operation, name: str, outs: Sequence[str], shared: Sequence[bool], mask: str | None, depth: int
     ) -> None:
         """Assign all results of an iteration after computing all of them, as one may be the old value of another."""
-        fresh = [self.new() for _ in outs]
-        for k, (f, out) in enumerate(zip(fresh, outs, strict=True)):
+        new_names = [self.new() for _ in outs]
+        for k, (new_name, out) in enumerate(zip(new_names, outs, strict=True)):
             text = out if mask is None or shared[k] else f"select_n_({mask}, {name}_{k}, {out})"
-            self.line(f"const auto {f} = {text};", depth)
-        for k, (f, x, same) in enumerate(zip(fresh, op.results, shared, strict=True)):
-            self.line(f"{name}_{k} = {f};" if same else f"{name}_{k} = {type_name(x.dtype)}_lanes({f});", depth)
+            self.line(f"const auto {new_name} = {text};", depth)
+        for k, (new_name, x, same) in enumerate(zip(new_names, op.results, shared, strict=True)):
+            value = new_name if same else f"{type_name(x.dtype)}_lanes({new_name})"
+            self.line(f"{name}_{k} = {value};", depth)
 
 
 def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
@@ -256,16 +265,16 @@ def _live_values(block: Block, position: int) -> list[tuple[Value, str]]:
     return [(x, type_name(x.dtype)) for x in before if x in used]
 
 
-def _four_of(op: Operation) -> tuple[Element, Element, int]:
-    """Return the table, the index and the number of the group of four entries that a lookup belongs to."""
+def _entry_group(op: Operation) -> EntryGroup:
+    """Return the group of four entries that a lookup belongs to."""
     return op.args[0], op.args[1], op.param("offset") // 4
 
 
-def _fours(block: Block) -> list[tuple[Element, Element, int]]:
+def _entry_groups(block: Block) -> list[EntryGroup]:
     """Return the aligned groups of four float32 entries from which a block reads at least three."""
     lookups = [op for op in block.operations if op.name == "lookup" and op.param("aligned") and op.dtype == np.float32]
-    counts = collections.Counter(_four_of(op) for op in lookups if isinstance(op.args[1], Value))
-    sizes = {_four_of(op): op.args[0].size for op in lookups}
+    counts = collections.Counter(_entry_group(op) for op in lookups if isinstance(op.args[1], Value))
+    sizes = {_entry_group(op): op.args[0].size for op in lookups}
     return [key for key, n in counts.items() if n >= 3 and key[2] * 4 + 4 <= sizes[key]]
 
 
@@ -277,24 +286,24 @@ def expression(op: Operation, args: Sequence[str]) -> str:
     return source.format(*args, name=op.name, all=", ".join(args), type=type_name(op.dtype), **dict(op.params))
 
 
-def _limit(op: Operation, tests: Mapping[Value, Operation]) -> str | None:
+def _limiting_function(op: Operation, comparisons: Mapping[Value, Operation]) -> str | None:
     """Return the name of the function that can replace a selection which limits a number; None for other selections.
 
     An example is ``x < low ? low : x``, for which a target may have an instruction.
 
     Args:
         op: The selection.
-        tests: Comparisons by their results.
+        comparisons: Comparisons by their results.
     """
-    if op.name != "select_n" or op.dtype.kind != "f" or op.args[0] not in tests:
+    if op.name != "select_n" or op.dtype.kind != "f" or op.args[0] not in comparisons:
         return None
-    test, (x, limit) = tests[op.args[0]], op.args[1:]
-    if test.args[0] is not x or not _same(test.args[1], limit):
+    test, (x, limit) = comparisons[op.args[0]], op.args[1:]
+    if test.args[0] is not x or not _are_equal(test.args[1], limit):
         return None
     return "at_least" if test.name == "lt" else "at_most"
 
 
-def _same(a: Element, b: Element) -> bool:
+def _are_equal(a: Element, b: Element) -> bool:
     return a is b or (is_constant(a) and is_constant(b) and literal(a) == literal(b))
 
 

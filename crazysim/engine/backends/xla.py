@@ -65,8 +65,8 @@ def _separate(env: Env, block: Block, position: int, last_use: dict[Value, int])
 
 
 def _apply(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> Sequence[Any]:
-    if op.name in STRUCTURE:
-        return STRUCTURE[op.name](op, args, shape, env)
+    if op.name in STRUCTURED_RULES:
+        return STRUCTURED_RULES[op.name](op, args, shape, env)
     if op.name in ("convert_element_type", "bitcast_convert_type"):
         return [getattr(lax, op.name)(args[0], op.dtype)]
     fn = ops.TABLE[op.name].xla or op.name
@@ -213,7 +213,7 @@ def _threefry(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) 
     return jaxcompat.threefry2x32_p.bind(*_broadcast(args))
 
 
-STRUCTURE: dict[str, Callable[..., Any]] = {
+STRUCTURED_RULES: dict[str, Callable[..., Any]] = {
     "loop": _loop,
     "while": _while,
     "when": _when,

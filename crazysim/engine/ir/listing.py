@@ -67,15 +67,15 @@ def _list_segment(program: Program, segment: Segment, names: _Names) -> Iterator
             yield f"{INDENT * 2}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
         yield from _list_operations(segment.hoisted, names, 2)
         for x, y in zip(segment.block.inputs[len(segment.reads) :], segment.hoisted.outputs, strict=True):
-            yield f"{INDENT * 2}{names.new(x)} = {names.of(y)}"
+            yield f"{INDENT * 2}{names.new(x)} = {names.name(y)}"
     for x, slot in zip(segment.block.inputs, segment.reads, strict=False):
         yield f"{INDENT}{names.new(x)}: {_type(x)} = {slot_name(program, segment, slot)}"
     yield from _list_operations(segment.block, names, 1)
     if segment is program.check:
-        yield f"{INDENT}flagged = {names.of(segment.block.outputs[0])}"
+        yield f"{INDENT}flagged = {names.name(segment.block.outputs[0])}"
         return
     for x, slot in zip(segment.block.outputs, segment.writes, strict=True):
-        yield f"{INDENT}{slot_name(program, segment, slot)} = {names.of(x)}"
+        yield f"{INDENT}{slot_name(program, segment, slot)} = {names.name(x)}"
 
 
 def _type(x: Value) -> str:
@@ -91,7 +91,7 @@ class _Names:
     def new(self, x: Value) -> str:
         return self._names.setdefault(x, f"%{len(self._names)}")
 
-    def of(self, x: Element) -> str:
+    def name(self, x: Element) -> str:
         return self._names.get(x, "%?") if isinstance(x, Value) else _constant(x)
 
 
@@ -118,11 +118,11 @@ def _list_operations(block: Block, names: _Names, depth: int) -> Iterator[str]:
 def _line(op: Operation, names: _Names) -> str:
     params = [f"{k}={v}" for k, v in op.params if not callable(v)]
     results = ", ".join(f"{names.new(x)}: {_type(x)}" for x in op.results)
-    return f"{results} = {op.name}({', '.join([*map(names.of, op.args), *params])})"
+    return f"{results} = {op.name}({', '.join([*map(names.name, op.args), *params])})"
 
 
 def _list_inner(block: Block, names: _Names, depth: int) -> Iterator[str]:
     if block.inputs:
         yield f"{INDENT * depth}block({', '.join(names.new(x) for x in block.inputs)})"
     yield from _list_operations(block, names, depth)
-    yield f"{INDENT * depth}return {', '.join(names.of(x) for x in block.outputs)}"
+    yield f"{INDENT * depth}return {', '.join(names.name(x) for x in block.outputs)}"

@@ -29,7 +29,7 @@ PACKED_LEAF_NAME = "packed"
 """Name of the leaf that holds the packed shared leaves."""
 
 Zeros = tuple[tuple[int, frozenset[int]], ...]
-"""Leaves with the elements of them that are known to be zero."""
+"""Pairs of a leaf and the elements of it that are known to be zero."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Leaf:
         return int(np.prod(shape, dtype=int)) * (2 if is_key(self) else 1)
 
     @functools.cached_property
-    def number(self) -> np.dtype:
+    def number_type(self) -> np.dtype:
         """Type of its numbers."""
         return np.dtype(np.uint32 if is_key(self) else self.dtype)
 
@@ -70,7 +70,7 @@ class Segment:
     stages: tuple[str, ...]
     """Names of the stages."""
     phase: Phase
-    """When they run."""
+    """Time within a call at which they run."""
     block: Block
     """The block. Its inputs are ``reads``, then the outputs of ``hoisted``; its outputs are ``writes``."""
     reads: tuple[Slot, ...]
@@ -93,7 +93,7 @@ class Segment:
         return {leaf for leaf, _ in (*self.reads, *self.hoisted_reads)}
 
     @functools.cached_property
-    def couples(self) -> bool:
+    def couples_drones(self) -> bool:
         """True if drones of a world read each other's numbers."""
         return self.scope == "world" or any(op.name == "over_others" for op in self.block.operations)
 
@@ -110,7 +110,7 @@ class UnfusedStage:
     name: str
     """Name of the stage."""
     phase: Phase
-    """When it runs."""
+    """Time within a call at which it runs."""
     jaxpr: Any
     """The stage, from the leaves in ``used`` to the leaves in ``written``."""
     used: tuple[int, ...]
@@ -131,8 +131,8 @@ class UnfusedStage:
         return set(self.used)
 
     @property
-    def unfused(self) -> str:
-        """Reason as a sentence."""
+    def explanation(self) -> str:
+        """Clause that says that the stage is not fused, and why."""
         return f"{self.name!r} is not fused: {self.error.reason}"
 
 
@@ -184,7 +184,7 @@ class Program:
 
     @functools.cached_property
     def ranks(self) -> dict[int, int]:
-        """Rank of each leaf that is used, which kernels use in names; equal steps have equal ranks."""
+        """Rank of each used leaf among the used leaves, for names in kernels, so that equal steps have equal source."""
         checked = [leaf for leaf, _ in self.check.reads] if self.check is not None else []
         used = {*checked, *(i for s in self.segments for i in (*s.read, *s.written))}
         return {leaf: n for n, leaf in enumerate(sorted(used))}
@@ -203,7 +203,7 @@ class Program:
     @functools.cached_property
     def group(self) -> int:
         """Number of drones that read each other's numbers: all of a world if a segment needs that, otherwise 1."""
-        return self.n_drones if any(s.couples for s in self.fused_segments) else 1
+        return self.n_drones if any(s.couples_drones for s in self.fused_segments) else 1
 
     def phase_segments(self, phase: Phase) -> list[Any]:
         """Return the segments that run in a phase."""
@@ -215,17 +215,15 @@ class Program:
             return list(slots)
         return [(i, k if k == TABLE_INDEX else k % self.leaves[i].size) for i, k in slots]
 
-    def changing(self) -> set[Slot]:
-        """Return the numbers that a step may change."""
-        changing: set[Slot] = set()
+    def changing_slots(self) -> set[Slot]:
+        """Return the slots whose numbers a step may change."""
+        slots: set[Slot] = set()
         for segment in self.phase_segments("each"):
             if isinstance(segment, Segment):
-                changing.update(self.per_drone(segment, segment.writes))
+                slots.update(self.per_drone(segment, segment.writes))
             else:
-                changing.update(
-                    (leaf, k) for leaf in segment.written for k in range(TABLE_INDEX, self.leaves[leaf].size)
-                )
-        return changing
+                slots.update((leaf, k) for leaf in segment.written for k in range(TABLE_INDEX, self.leaves[leaf].size))
+        return slots
 
     def parts(self) -> Iterator[Program]:
         """Iterate over programs of one phase each: what one kernel can run, and each unfused stage, in order."""

@@ -26,7 +26,7 @@ def verify(program: Program) -> Program:
     """
     phases = [PHASES.index(s.phase) for s in program.segments]
     _require(phases == sorted(phases), "segments are not in the order of their phases")
-    changing = program.changing()
+    changing = program.changing_slots()
     for segment in [*program.fused_segments, *([program.check] if program.check else [])]:
         name = " + ".join(segment.stages)
         try:
@@ -70,12 +70,13 @@ def _slots(
     for (i, k), x in zip(slots, elements, strict=True):
         leaf = program.leaves[i]
         if k == TABLE_INDEX:
-            is_table = what != "output" and leaf.scope == "shared" and x.size == leaf.size and x.dtype == leaf.number
+            has_size_of_leaf = x.size == leaf.size and x.dtype == leaf.number_type
+            is_table = what != "output" and leaf.scope == "shared" and has_size_of_leaf
             _require(is_table, f"{what} is {leaf.name} as a table, which it is not")
             continue
         n_drones = program.n_drones if segment.scope == "world" and leaf.scope == "drone" else 1
         _require(0 <= k < leaf.size * n_drones, f"{what} {k} of {leaf.name}, which has {leaf.size * n_drones} numbers")
-        _require(x.dtype == leaf.number, f"{what} of type {x.dtype} for {leaf.name} of type {leaf.number}")
+        _require(x.dtype == leaf.number_type, f"{what} of type {x.dtype} for {leaf.name} of type {leaf.number_type}")
 
 
 def _verify_block(block: Block, defined: set[Value]) -> None:

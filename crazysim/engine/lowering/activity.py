@@ -22,7 +22,7 @@ def without_check(program: Program, perturbed: Collection[int]) -> tuple[Program
     if program.rows:
         raise LimitError("rows of packed leaves have no gradient in a kernel")
     program = dataclasses.replace(program, check=None)
-    floats = tuple(sorted(i for i in perturbed if program.leaves[i].number.kind == "f" and i in program.ranks))
+    floats = tuple(sorted(i for i in perturbed if program.leaves[i].number_type.kind == "f" and i in program.ranks))
     if tables := program.tables.intersection(floats):
         names = ", ".join(program.leaves[i].name for i in sorted(tables))
         raise UnsupportedError(f"{names} is read as a table, which has no derivative in a kernel")
@@ -37,29 +37,31 @@ def changed_slots(program: Program, perturbed: Sequence[int]) -> tuple[set[Slot]
     changed = {(i, k) for i in perturbed for k in range(program.leaves[i].size)}
     constants: dict[Segment, tuple[int, ...]] = {}
 
-    def of(block: Block, slots: Sequence[Slot], more: Sequence[int] = ()) -> list[int]:
-        wanted = [x for x, slot in zip(block.inputs, slots, strict=False) if slot in changed and x.dtype.kind == "f"]
-        wanted += [block.inputs[len(slots) + k] for k in more]
-        on_path = active_values(block, wanted)
+    def active_outputs(block: Block, slots: Sequence[Slot], active_constants: Sequence[int] = ()) -> list[int]:
+        active_inputs = [
+            x for x, slot in zip(block.inputs, slots, strict=False) if slot in changed and x.dtype.kind == "f"
+        ]
+        active_inputs += [block.inputs[len(slots) + k] for k in active_constants]
+        on_path = active_values(block, active_inputs)
         return [k for k, x in enumerate(block.outputs) if isinstance(x, Value) and x in on_path]
 
-    def run(s: Segment) -> None:
+    def propagate(s: Segment) -> None:
         written_slots = program.per_drone(s, s.writes)
         reads = program.per_drone(s, s.reads)
-        changed.update(written_slots[k] for k in of(s.block, reads, constants.get(s, ())))
+        changed.update(written_slots[k] for k in active_outputs(s.block, reads, constants.get(s, ())))
 
     for s in program.phase_segments("before"):
-        run(s)
+        propagate(s)
     for s in program.phase_segments("each"):
-        constants[s] = tuple(of(s.hoisted, s.hoisted_reads))
+        constants[s] = tuple(active_outputs(s.hoisted, s.hoisted_reads))
     while True:  # numbers that depend on the leaves after one step may affect others in the next
         before = len(changed)
         for s in program.phase_segments("each"):
-            run(s)
+            propagate(s)
         if len(changed) == before:
             break
     for s in program.phase_segments("after"):
-        run(s)
+        propagate(s)
     return changed, constants
 
 

@@ -91,8 +91,8 @@ def on_data_leaves(program: Program, run: Callable[..., Any]) -> Callable[..., A
 
     def steps(leaves: Sequence[Any], n_steps: Any) -> Any:
         out, flagged = run(view_leaves(views, leaves), n_steps)
-        numbered = dict(zip(written, out, strict=True))
-        partial_leaves = [numbered.get(i) for i in range(len(leaves))]
+        new_leaves = dict(zip(written, out, strict=True))
+        partial_leaves = [new_leaves.get(i) for i in range(len(leaves))]
         back = restore_leaves(views, partial_leaves)
         return [back[i] for i in written], flagged
 

@@ -44,7 +44,7 @@ def _select_own(builder: Builder, op: Operation, indices: list[int], values: dic
     args = [values.get(x, x) if isinstance(x, Value) else x for x in op.args]
     dtypes, n_members = [op.results[k].dtype for k in indices], ("n_members", op.param("n_members"))
 
-    def of_pair(n_more: int) -> tuple[Builder, list[Value], list[Element]]:
+    def copy_body(n_more: int) -> tuple[Builder, list[Value], list[Element]]:
         """Return a copy of the body with further published integers, which follow the other inputs."""
         inner = Builder(builder)
         fresh = [inner.input(x.dtype) for x in body.inputs[:-1]] + [inner.input("int32") for _ in range(n_more)]
@@ -53,7 +53,7 @@ def _select_own(builder: Builder, op: Operation, indices: list[int], values: dic
         outs = inline(inner, body, values | dict(zip(body.inputs, pair_inputs, strict=True)))
         return inner, [*fresh[len(args) :], is_self], [outs[k] for k in indices]
 
-    inner, (is_self,), candidates = of_pair(0)
+    inner, (is_self,), candidates = copy_body(0)
     one, zero = (constant(x, dtypes[0]) for x in (1, 0))
     is_largest = inner.add("select_n", (is_self, zero, one), dtypes[0])  # its argmax is the index of the drone itself
     names = (*(INDEX_REDUCTION_OF[op.param("reduce")[k]] for k in indices), "argmax")
@@ -61,7 +61,7 @@ def _select_own(builder: Builder, op: Operation, indices: list[int], values: dic
     *chosen, number = builder.add_many("over_others", args, ["int32"] * len(names), (("reduce", names), n_members),
                                        (block,))  # fmt: skip
 
-    inner, (other, _), candidates = of_pair(1)
+    inner, (other, _), candidates = copy_body(1)
     terms = [inner.add("select_n", (inner.add("eq", (other, which), bool), constant(0, x.dtype), x), x.dtype)
              for which, x in zip(chosen, candidates, strict=True)]  # fmt: skip
     params = (("reduce", ("add",) * len(indices)), n_members)

@@ -44,10 +44,10 @@ def add_tangents(program: Program, perturbed: Collection[int]) -> Program:
     program, perturbed = without_check(program, perturbed)
     n = len(program.leaves)
     changed, constants = changed_slots(program, perturbed)
-    segments = [_segment(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
+    segments = [_add_segment_tangents(program, n, s, changed, constants.get(s, ())) for s in program.fused_segments]
     zero = dict.fromkeys((i, k) for s in segments for i in s.written if i >= n and i - n not in perturbed
                          for k in range(program.leaves[i - n].size))  # fmt: skip
-    zeros = [constant(0, program.leaves[i - n].number) for i, _ in zero]
+    zeros = [constant(0, program.leaves[i - n].number_type) for i, _ in zero]
     start = Segment("drone", ("tangents",), "before", Block((), (), tuple(zeros)), (), tuple(zero))
     return dataclasses.replace(
         program,
@@ -63,33 +63,36 @@ def _tangent_of(leaf: Leaf) -> Leaf:
     return Leaf(f"tangent of {leaf.name}", scope, shape, leaf.dtype)
 
 
-def _segment(program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int]) -> Segment:
+def _add_segment_tangents(
+    program: Program, n: int, s: Segment, changed: set[Slot], constants: Sequence[int]
+) -> Segment:
     """Return a segment with the tangents of its outputs."""
     reads, n_reads = program.per_drone(s, s.reads), len(s.reads)
     wanted = [k for k, slot in enumerate(reads) if slot in changed and s.block.inputs[k].dtype.kind == "f"]
     wanted = [k for k in wanted if not s.block.inputs[k].size]
     block = add_block_tangents(s.block, [s.block.inputs[k] for k in (*wanted, *(n_reads + k for k in constants))])
-    primal, slopes = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
-    inputs = (*primal[:n_reads], *slopes[: len(wanted)], *primal[n_reads:], *slopes[len(wanted) :])
+    primal, input_tangents = block.inputs[: len(s.block.inputs)], block.inputs[len(s.block.inputs) :]
+    inputs = (*primal[:n_reads], *input_tangents[: len(wanted)], *primal[n_reads:], *input_tangents[len(wanted) :])
     floats = [k for k, x in enumerate(s.block.outputs) if x.dtype.kind == "f"]
-    moving = [(k, x) for k, x in zip(floats, block.outputs[len(s.writes) :], strict=True)
+    output_tangents = [(k, x) for k, x in zip(floats, block.outputs[len(s.writes) :], strict=True)
               if program.per_drone(s, [s.writes[k]])[0] in changed]  # fmt: skip
-    before = [slot for slot, x in zip(s.hoisted_reads, s.hoisted.inputs, strict=True)
+    hoisted_slots = [slot for slot, x in zip(s.hoisted_reads, s.hoisted.inputs, strict=True)
               if slot in changed and x.dtype.kind == "f" and not x.size]  # fmt: skip
     hoisted, n_hoisted = s.hoisted, len(s.hoisted.outputs)
     if constants:
-        moving_inputs = [x for x, slot in zip(s.hoisted.inputs, s.hoisted_reads, strict=True) if slot in before]
-        hoisted = add_block_tangents(s.hoisted, moving_inputs)
+        pairs = zip(s.hoisted.inputs, s.hoisted_reads, strict=True)
+        perturbed_inputs = [x for x, slot in pairs if slot in hoisted_slots]
+        hoisted = add_block_tangents(s.hoisted, perturbed_inputs)
         indices = [k for k, x in enumerate(s.hoisted.outputs) if x.dtype.kind == "f"]
         tangents_of_constants = [hoisted.outputs[n_hoisted + indices.index(k)] for k in constants]
         hoisted = dataclasses.replace(hoisted, outputs=(*hoisted.outputs[:n_hoisted], *tangents_of_constants))
     return dataclasses.replace(
         s,
-        block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in moving))),
+        block=Block(inputs, block.operations, (*block.outputs[: len(s.writes)], *(x for _, x in output_tangents))),
         reads=(*s.reads, *((n + s.reads[k][0], s.reads[k][1]) for k in wanted)),
-        writes=(*s.writes, *((n + s.writes[k][0], s.writes[k][1]) for k, _ in moving)),
+        writes=(*s.writes, *((n + s.writes[k][0], s.writes[k][1]) for k, _ in output_tangents)),
         hoisted=hoisted,
-        hoisted_reads=(*s.hoisted_reads, *((n + i, k) for i, k in before)) if constants else s.hoisted_reads,
+        hoisted_reads=(*s.hoisted_reads, *((n + i, k) for i, k in hoisted_slots)) if constants else s.hoisted_reads,
     )
 
 
@@ -110,7 +113,7 @@ def add_block_tangents(block: Block, wanted: Sequence[Value]) -> Block:
     builder = Builder()
     values: Values = {x: builder.input(x.dtype, x.size) for x in block.inputs}
     tangents: Values = {x: builder.input(x.dtype) for x in wanted}
-    outputs = _push(builder, block, values, tangents)
+    outputs = _add_with_tangents(builder, block, values, tangents)
     return prune(builder.finish([*outputs, *_tangents_of(block.outputs, tangents)]))
 
 
@@ -124,7 +127,7 @@ def _tangent(x: Element, tangents: Values) -> Element:
     return tangents.get(x, zero) if isinstance(x, Value) else zero
 
 
-def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> list[Element]:
+def _add_with_tangents(builder: Builder, block: Block, values: Values, tangents: Values) -> list[Element]:
     """Add a block's operations with their derivatives to a builder, and return its outputs.
 
     Args:
@@ -135,7 +138,7 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
     """
     for op in block.operations:
         builder.stage = op.stage
-        rule = STRUCTURE.get(op.name)
+        rule = STRUCTURED_RULES.get(op.name)
         if rule is not None:
             rule(builder, op, values, tangents)
             continue
@@ -144,9 +147,10 @@ def _push(builder: Builder, block: Block, values: Values, tangents: Values) -> l
             continue
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
-        slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
+        derivative = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
         operands = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
-        _record(op.results, inline(builder, slope, dict(zip(slope.inputs, operands, strict=True))), tangents)
+        results = inline(builder, derivative, dict(zip(derivative.inputs, operands, strict=True)))
+        _record_tangents(op.results, results, tangents)
     return [_map_element(x, values) for x in block.outputs]
 
 
@@ -154,40 +158,40 @@ def _map_element(x: Element, values: Values) -> Element:
     return values.get(x, x) if isinstance(x, Value) else x
 
 
-def _record(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
+def _record_tangents(results: Sequence[Value], elements: Sequence[Element], tangents: Values) -> None:
     """Record the tangents of some results, unless they are zero."""
     tangents.update((x, t) for x, t in zip(results, elements, strict=True) if isinstance(t, Value) or t != 0)
 
 
 @functools.lru_cache(maxsize=1024)
-def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
+def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
     """Return the block from the operands of an operation and the tangents of its float operands to its tangent."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
-    def push(*args: Any) -> Any:
+    def tangent(*args: Any) -> Any:
         operands, tangents = args[: len(dtypes)], args[len(dtypes) :]
 
-        def of(*changed: Any) -> Any:
-            return apply_operation(name, replace_leaves(operands, floats, changed), dtype, params)
+        def primal(*floats_now: Any) -> Any:
+            return apply_operation(name, replace_leaves(operands, floats, floats_now), dtype, params)
 
-        return jax.jvp(of, tuple([operands[k] for k in floats]), tangents)[1]
+        return jax.jvp(primal, tuple([operands[k] for k in floats]), tangents)[1]
 
-    return lower_function(push, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, *(dtypes[k] for k in floats))])
+    return lower_function(tangent, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, *(dtypes[k] for k in floats))])
 
 
 def _when(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
     mask, *old = op.args
     (block,) = op.blocks
-    inner, moving = Builder(builder), dict(tangents)
-    outputs = _push(inner, block, dict(values), moving)
-    after = [_tangent(x, moving) for x in block.outputs]
+    inner, inner_tangents = Builder(builder), dict(tangents)
+    outputs = _add_with_tangents(inner, block, dict(values), inner_tangents)
+    after = [_tangent(x, inner_tangents) for x in block.outputs]
     before = [_tangent(x, tangents) for x in old]
     indices = [k for k, pair in enumerate(zip(before, after, strict=True)) if any(isinstance(x, Value) for x in pair)]
     args = [_map_element(mask, values), *(_map_element(x, values) for x in old), *(before[k] for k in indices)]
     inside = inner.finish([*outputs, *(after[k] for k in indices)])
     results = builder.add_many("when", args, [x.dtype for x in args[1:]], op.params, (inside,))
     values.update(zip(op.results, results, strict=False))
-    _record([op.results[k] for k in indices], results[len(old) :], tangents)
+    _record_tangents([op.results[k] for k in indices], results[len(old) :], tangents)
 
 
 def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
@@ -198,11 +202,11 @@ def _custom_jvp(builder: Builder, op: Operation, values: Values, tangents: Value
     values.update(zip(op.results, results, strict=True))
     if not any(isinstance(x, Value) and x in tangents for x in op.args):
         return
-    slope = op.param("slope")()
-    moving = [_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
-    parts = inline(builder, slope, dict(zip(slope.inputs, [*args, *moving], strict=True)))
-    parts = [x for x, out in zip(parts, slope.outputs, strict=True) if out.dtype.kind == "f"]
-    _record([x for x in op.results if x.dtype.kind == "f"], parts, tangents)
+    derivative = op.param("slope")()
+    arg_tangents = [_tangent(x, tangents) if x.dtype.kind == "f" else constant(0, x.dtype) for x in op.args]
+    parts = inline(builder, derivative, dict(zip(derivative.inputs, [*args, *arg_tangents], strict=True)))
+    parts = [x for x, out in zip(parts, derivative.outputs, strict=True) if out.dtype.kind == "f"]
+    _record_tangents([x for x in op.results if x.dtype.kind == "f"], parts, tangents)
 
 
 def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
@@ -213,9 +217,9 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
         return
     inner = Builder(builder)
     inside = values | {x: inner.input(x.dtype) for x in body.inputs}
-    moving = tangents | {x: inner.input(x.dtype) for x in body.inputs if x.dtype.kind == "f"}
-    outputs = _push(inner, body, inside, moving)
-    blocks = [inner.finish([*outputs, *_tangents_of(body.outputs, moving)])]
+    inner_tangents = tangents | {x: inner.input(x.dtype) for x in body.inputs if x.dtype.kind == "f"}
+    outputs = _add_with_tangents(inner, body, inside, inner_tangents)
+    blocks = [inner.finish([*outputs, *_tangents_of(body.outputs, inner_tangents)])]
     args = [*(_map_element(x, values) for x in op.args), *_tangents_of(op.args, tangents)]
     for block in test:
         inner = Builder(builder)
@@ -225,7 +229,7 @@ def _loop(builder: Builder, op: Operation, values: Values, tangents: Values) -> 
         blocks.insert(0, inner.finish(inline(inner, block, inside)))
     results = builder.add_many(op.name, args, [x.dtype for x in args], op.params, tuple(blocks))
     values.update(zip(op.results, results, strict=False))
-    _record([x for x in op.results if x.dtype.kind == "f"], results[len(op.args) :], tangents)
+    _record_tangents([x for x in op.results if x.dtype.kind == "f"], results[len(op.args) :], tangents)
 
 
 def _over_others(builder: Builder, op: Operation, values: Values, tangents: Values) -> None:
@@ -235,21 +239,22 @@ def _over_others(builder: Builder, op: Operation, values: Values, tangents: Valu
     inner = Builder(builder)
     inside = values | {x: inner.input(x.dtype) for x in others}
     published = [(x, y) for x, y in zip(op.args, others, strict=True) if isinstance(x, Value) and x in tangents]
-    moving = tangents | {y: inner.input(y.dtype) for _, y in published}
+    inner_tangents = tangents | {y: inner.input(y.dtype) for _, y in published}
     inside[is_self] = inner.input(is_self.dtype)
-    outputs = _push(inner, body, inside, moving)
+    outputs = _add_with_tangents(inner, body, inside, inner_tangents)
     names = op.param("reduce")
-    summed = [k for k, x in enumerate(body.outputs) if names[k] == "add" and isinstance(_tangent(x, moving), Value)]
-    block = inner.finish([*outputs, *(moving[body.outputs[k]] for k in summed)])
+    body_tangents = [_tangent(x, inner_tangents) for x in body.outputs]
+    summed = [k for k, x in enumerate(body_tangents) if names[k] == "add" and isinstance(x, Value)]
+    block = inner.finish([*outputs, *(body_tangents[k] for k in summed)])
     args = [*(_map_element(x, values) for x in op.args), *(tangents[x] for x, _ in published)]
     dtypes = [x.dtype for x in op.results] + [op.results[k].dtype for k in summed]
     params = (("reduce", (*names, *("add" for _ in summed))), ("n_members", op.param("n_members")))
     results = builder.add_many("over_others", args, dtypes, params, (block,))
     values.update(zip(op.results, results, strict=False))
-    _record([op.results[k] for k in summed], results[len(op.results) :], tangents)
+    _record_tangents([op.results[k] for k in summed], results[len(op.results) :], tangents)
 
 
-STRUCTURE: dict[str, Callable[[Builder, Operation, Values, Values], None]] = {
+STRUCTURED_RULES: dict[str, Callable[[Builder, Operation, Values, Values], None]] = {
     "when": _when,
     "custom_jvp": _custom_jvp,
     "loop": _loop,

@@ -57,7 +57,7 @@ def transpose_block(block: Block, wanted: Sequence[Value]) -> Block:
                 _accumulate(builder, cotangents, x, ct)
     for k, part in reversed(list(enumerate(parts))):
         elements = values if k == len(parts) - 1 else _recompute(builder, part, k, values, on_path)
-        _pull(builder, part, elements, on_path, cotangents)
+        _add_cotangents(builder, part, elements, on_path, cotangents)
     return prune(builder.finish([cotangents.get(x, constant(0, x.dtype)) for x in wanted]))
 
 
@@ -91,7 +91,9 @@ def _recompute(
     return elements
 
 
-def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents) -> None:
+def _add_cotangents(
+    builder: Builder, block: Block, values: dict[Value, Element], on_path: set[Value], cts: Cotangents
+) -> None:
     """Go through a block backwards, from the cotangents of its results to the cotangents of the values that it uses.
 
     Args:
@@ -102,7 +104,7 @@ def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path:
         cts: Cotangents so far; changed in place.
     """
 
-    def replaced(x: Element) -> Element:
+    def map_element(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
     for op in reversed(block.operations):
@@ -110,14 +112,14 @@ def _pull(builder: Builder, block: Block, values: dict[Value, Element], on_path:
         if all(ct is None for ct in result_cts) or not any(x in on_path for x in op.results):
             continue
         builder.stage = op.stage
-        rule = STRUCTURE.get(op.name)
+        rule = STRUCTURED_RULES.get(op.name)
         if rule is not None:
             rule(builder, op, values, on_path, result_cts, cts)
             continue
         if ops.TABLE[op.name].structured:
             raise UnsupportedError("it has no derivative in a kernel", op.name, op.stage)
-        slope = _slope(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
-        operands = [*map(replaced, op.args), result_cts[0]]
+        slope = _derivative_block(op.name, tuple([x.dtype for x in op.args]), op.dtype, op.params)
+        operands = [*map(map_element, op.args), result_cts[0]]
         parts = inline(builder, slope, dict(zip(slope.inputs, operands, strict=True)))
         floats = [x for x in op.args if x.dtype.kind == "f"]
         for x, part in zip(floats, parts, strict=True):
@@ -130,19 +132,19 @@ def _accumulate(builder: Builder, cts: Cotangents, x: Value, part: Element) -> N
 
 
 @functools.lru_cache(maxsize=1024)
-def _slope(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
+def _derivative_block(name: str, dtypes: tuple[np.dtype, ...], dtype: np.dtype, params: tuple) -> Block:
     """Return the block from the operands of an operation and its cotangent to the cotangents of its float operands."""
     floats = [k for k, x in enumerate(dtypes) if x.kind == "f"]
 
-    def pull(*args: Any) -> list[Any]:
+    def cotangents(*args: Any) -> list[Any]:
         *operands, ct = args
 
-        def of(floats_now: list[Any]) -> Any:
+        def primal(floats_now: list[Any]) -> Any:
             return apply_operation(name, replace_leaves(operands, floats, floats_now), dtype, params)
 
-        return jax.vjp(of, [operands[k] for k in floats])[1](ct)[0]
+        return jax.vjp(primal, [operands[k] for k in floats])[1](ct)[0]
 
-    return lower_function(pull, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, dtype)])
+    return lower_function(cotangents, *[jax.ShapeDtypeStruct((), x) for x in (*dtypes, dtype)])
 
 
 ResultCotangents = Sequence[Element | None]
@@ -166,7 +168,7 @@ def _when(
             _accumulate(builder, cts, before, rest)
         if isinstance(x, Value) and x in on_path:
             _accumulate(inner, inner_cts, x, ct)
-    _pull(inner, block, inside, on_path, inner_cts)
+    _add_cotangents(inner, block, inside, on_path, inner_cts)
     before = [cts.get(x, constant(0, x.dtype)) for x in inner_cts]
     sums = [inner.add("add", (a, inner_cts[x]), x.dtype) for a, x in zip(before, inner_cts, strict=True)]
     if inner_cts:
@@ -221,7 +223,7 @@ def _over_others(
         for x, ct in zip(body.outputs, result_cts, strict=True):
             if ct is not None and isinstance(x, Value) and x in on_path:
                 _accumulate(inner, local, x, inside.get(ct, ct) if isinstance(ct, Value) else ct)
-        _pull(inner, body, inside, on_path, local)
+        _add_cotangents(inner, body, inside, on_path, local)
         wanted = [x for x in wanted if x in local]
         if not wanted:
             return
@@ -248,7 +250,7 @@ def _over_others(
 
 
 Rule = Callable[[Builder, Operation, dict, set[Value], ResultCotangents, Cotangents], None]
-STRUCTURE: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
+STRUCTURED_RULES: dict[str, Rule] = {"when": _when, "custom_jvp": _custom_jvp, "over_others": _over_others}
 
 
 def _unroll_loops(block: Block) -> Block:
@@ -269,14 +271,14 @@ def _is_reversed(op: Operation) -> bool:
 
 
 def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> list[Element]:
-    def replaced(x: Element) -> Element:
+    def map_element(x: Element) -> Element:
         return values.get(x, x) if isinstance(x, Value) else x
 
     for op in block.operations:
         builder.stage = op.stage
         if _is_reversed(op):
             (body,) = op.blocks
-            length, carry = op.param("length"), [replaced(x) for x in op.args]
+            length, carry = op.param("length"), [map_element(x) for x in op.args]
             if length * sum(1 for _ in body.walk()) > MAX_UNROLLED:
                 raise UnsupportedError(f"a loop of {length} iterations is too long to be reversed", op.name, op.stage)
             for _ in range(length):
@@ -289,9 +291,9 @@ def _unroll(builder: Builder, block: Block, values: dict[Value, Element]) -> lis
                 fresh = Builder(builder)
                 inside = values | {x: fresh.input(x.dtype) for x in inner.inputs}
                 blocks.append(fresh.finish(_unroll(fresh, inner, inside)))
-            args = [replaced(x) for x in op.args]
+            args = [map_element(x) for x in op.args]
             results = builder.add_many(op.name, args, [x.dtype for x in op.results], op.params, tuple(blocks))
             values.update(zip(op.results, results, strict=True))
         else:
             inline(builder, Block((), (op,), ()), values)
-    return [replaced(x) for x in block.outputs]
+    return [map_element(x) for x in block.outputs]

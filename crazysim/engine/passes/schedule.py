@@ -130,7 +130,7 @@ def hoist(program: Program) -> Program:
 
     A division by such a value becomes a product with its inverse, which adds one rounding error.
     """
-    changing = program.changing()
+    changing = program.changing_slots()
     return dataclasses.replace(
         program,
         segments=tuple([

@@ -76,7 +76,7 @@ def first_difference(
     for name, stage in pipeline.items():
         after = [Step({name: stage}, engine)(data, jnp.int32(1)) for engine in engines]
         for i, (x, y) in enumerate(zip(*map(jax.tree.leaves, after), strict=True)):
-            index = _differs(x, y, tolerance)
+            index = _largest_difference(x, y, tolerance)
             if index is not None:
                 values = (np.asarray(x)[index], np.asarray(y)[index])
                 operation = _operation(pipeline[name], name, data, engines, tolerance)
@@ -85,24 +85,24 @@ def first_difference(
     return None
 
 
-def _differs(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
+def _largest_difference(x: Any, y: Any, tolerance: float) -> tuple[int, ...] | None:
     """Return the index at which arrays differ most, or None if nowhere beyond the tolerance."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         x, y = jax.random.key_data(x), jax.random.key_data(y)
     x, y = np.asarray(x), np.asarray(y)
     if x.dtype.kind != "f":
-        wrong = np.asarray(x != y, float)
+        difference = np.asarray(x != y, float)
     else:
         finite = np.where(np.isfinite(x), np.abs(x), 0)
         size = finite.max(axis=-1, keepdims=True) if x.ndim > 2 else finite
         with np.errstate(all="ignore"):
             relative_error = np.abs(x.astype(np.float64) - y) / np.maximum(size, np.finfo(x.dtype).tiny)
         same = (x == y) | (np.isnan(x) & np.isnan(y))
-        wrong = np.where(same, 0.0, np.where(np.isnan(relative_error), np.inf, relative_error)) > tolerance
-        wrong = np.where(wrong, np.where(np.isfinite(relative_error), relative_error, np.inf), 0.0)
-    if not wrong.any():
+        difference = np.where(same, 0.0, np.where(np.isnan(relative_error), np.inf, relative_error)) > tolerance
+        difference = np.where(difference, np.where(np.isfinite(relative_error), relative_error, np.inf), 0.0)
+    if not difference.any():
         return None
-    return tuple(int(k) for k in np.unravel_index(int(wrong.argmax()), wrong.shape))
+    return tuple(int(k) for k in np.unravel_index(int(difference.argmax()), difference.shape))
 
 
 def _operation(stage: Any, name: str, data: Any, engines: Sequence[str], tolerance: float) -> str:
@@ -135,7 +135,7 @@ def first_operation(program: Program, leaves: list[Any], build: Build, tolerance
     (segment,) = exposed.fused_segments
     for op, (leaf, _) in zip(operations, segment.writes, strict=True):
         expected, actual = (np.asarray(result[leaf]) for result in results)
-        index = _differs(expected, actual, tolerance)
+        index = _largest_difference(expected, actual, tolerance)
         if index is not None:
             numbers = f"{expected[index]} by 'interpret' and {actual[index]} by the engine"
             return f"{listing.list_operation(program, op)} ({numbers}, index {list(index)})"

@@ -30,7 +30,7 @@ def explain(step: Step, data: SimData, measure: bool = False, zeros: Zeros | Non
     for program in plan.programs:
         for segment in program.segments:
             if isinstance(segment, UnfusedStage):
-                lines.append(f"splits the step: {segment.unfused}")
+                lines.append(f"splits the step: {segment.explanation}")
             else:
                 names, is_per_member = ", ".join(segment.stages), segment.scope == "drone"
                 owner = (

@@ -18,7 +18,7 @@ PRIMITIVES_WITH_RULES = frozenset(
 
 
 @rule(*(name for name, row in ops.TABLE.items() if not row.structured and name not in PRIMITIVES_WITH_RULES))
-def _each(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _elementwise(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     return [ctx.elementwise(eqn.primitive.name, args, eqn.outvars[0].aval.dtype)]
 
 
@@ -56,11 +56,11 @@ def _select_n(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elemen
     dtype, kind = eqn.outvars[0].aval.dtype, eqn.invars[0].aval.dtype
     if np.dtype(kind).kind == "b":
         return [ctx.elementwise("select_n", args, dtype)]
-    taken = cases[-1]
+    selected = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
         is_case = ctx.elementwise("le", [which, constants(k, kind)], bool)
-        taken = ctx.elementwise("select_n", [is_case, taken, cases[k]], dtype)
-    return [taken]
+        selected = ctx.elementwise("select_n", [is_case, selected, cases[k]], dtype)
+    return [selected]
 
 
 @rule("bitcast_convert_type")
@@ -105,12 +105,12 @@ def _total_order(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
     if eqn.invars[0].aval.dtype.kind != "f":
         return [ctx.elementwise(name, args, bool)]
     a_nan, b_nan = (ctx.elementwise("ne", [x, x], bool) for x in args)
-    of_nan = {
+    with_nan = {
         "lt": lambda: ctx.elementwise("and", [b_nan, ctx.elementwise("not", [a_nan], bool)], bool),
         "le": lambda: b_nan,
         "eq": lambda: ctx.elementwise("and", [a_nan, b_nan], bool),
     }[name]()
-    return [ctx.elementwise("or", [ctx.elementwise(name, args, bool), of_nan], bool)]
+    return [ctx.elementwise("or", [ctx.elementwise(name, args, bool), with_nan], bool)]
 
 
 @rule("optimization_barrier")

@@ -12,7 +12,7 @@ from crazysim.jaxcompat import JaxprEqn
 
 
 @rule("reduce_over_others")
-def _over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
+def _reduce_over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Elements]:
     """Add a loop over the drones of the world; numbers that all drones share are not published."""
     n_own, n = eqn.params["n_own"], ctx.n_members
     if not n:
@@ -44,16 +44,16 @@ def _over_others(ctx: Lowering, eqn: JaxprEqn, args: list[Elements]) -> list[Ele
 
 
 def _replace_elements(x: Elements, new: dict[Value, Value]) -> Elements:
-    def of(item: Any) -> Any:
+    def replace(item: Any) -> Any:
         return (
-            tuple(map(of, item))
+            tuple(map(replace, item))
             if isinstance(item, tuple)
             else new.get(item, item)
             if isinstance(item, Value)
             else item
         )
 
-    return as_elements([of(item) for item in x.reshape(-1)], x.shape)
+    return as_elements([replace(item) for item in x.reshape(-1)], x.shape)
 
 
 def _shared_numbers(ctx: Lowering) -> set[Value]:
