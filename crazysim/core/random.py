@@ -85,10 +85,10 @@ def drone_keys(data: SimData, name: str) -> Array:
         Typed keys; draw with ``jax.vmap(jax.vmap(draw))(keys)``. (n_worlds, n_drones)
     """
 
-    def of_world(world: SimData) -> Array:
+    def keys_of_world(world: SimData) -> Array:
         return jax.vmap(lambda drone: _key(world, name, drone))(world.core.drone_id)
 
-    return _over_worlds(data, of_world)
+    return _over_worlds(data, keys_of_world)
 
 
 def normal(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
@@ -148,10 +148,10 @@ def _key(data: SimData, name: str, *members: Array) -> Array:
 def _over_worlds(data: SimData, fn: Callable[[SimData], Array]) -> Array:
     core = data.core
 
-    def of_world(key: Array, world_id: Array, drone_id: Array, episode: Array, steps: Array) -> Array:
+    def apply_to_world(key: Array, world_id: Array, drone_id: Array, episode: Array, steps: Array) -> Array:
         world_core = core.replace(rng_key=key, world_id=world_id, drone_id=drone_id, episode=episode, steps=steps)
         return fn(data.replace(core=world_core))
 
     axes = (0 if core.rng_key.ndim else None, 0, 0, 0, 0)
-    numbers = core.world_id[:, 0], core.drone_id, core.episode[:, 0], core.steps[:, 0]
-    return jax.vmap(of_world, in_axes=axes)(core.rng_key, *numbers)
+    counters = core.world_id[:, 0], core.drone_id, core.episode[:, 0], core.steps[:, 0]
+    return jax.vmap(apply_to_world, in_axes=axes)(core.rng_key, *counters)

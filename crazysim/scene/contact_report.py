@@ -65,8 +65,8 @@ class ContactReport(PyTree):
     def merge(self, other: ContactReport) -> ContactReport:
         """Return the fields of both reports. Fields of this report take precedence."""
         names = (f.name for f in dataclasses.fields(self))  # type: ignore[arg-type]
-        mine = {name: x for name in names if (x := getattr(self, name)) is not None}
-        return other.replace(**mine | {"object_names": self.object_names or other.object_names})
+        own_fields = {name: x for name in names if (x := getattr(self, name)) is not None}
+        return other.replace(**own_fields | {"object_names": self.object_names or other.object_names})
 
     @property
     def any(self) -> Array:
@@ -125,8 +125,8 @@ def build_contact_fn(
         )  # fmt: skip
         if floor:
             gaps = [
-                _mask_absent(has, _geom_distance(mine, part_pos, drone_rot, geom))
-                for mine, part_pos, has in parts
+                _mask_absent(present, _geom_distance(part, part_pos, drone_rot, geom))
+                for part, part_pos, present in parts
                 for geom in model.floor
             ]
             gap = _minimum(gaps, pos)
@@ -204,7 +204,7 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
         if len(group) > MAX_UNROLLED_GEOMS:
             stacked = StackedGeoms.of([body.geoms[0] for body in group])
             return _minimum(
-                [_stacked_distances(mine, part_pos, drone_rot, stacked, has) for mine, part_pos, has in parts],
+                [_stacked_distances(part, part_pos, drone_rot, stacked, present) for part, part_pos, present in parts],
                 parts[0][1],
             )
         return jnp.stack([_fixed_distance(parts, drone_rot, body.geoms) for body in group], axis=-1)
@@ -216,10 +216,10 @@ def _group_distances(parts: DroneParts, drone_rot: Array | None, group: list[Col
     if drone_rot is not None:
         rot = _product(jnp.swapaxes(rotation.matrix(quat), -1, -2), drone_rot[..., None, :, :])
     gaps = []
-    for mine, part_pos, has in parts:
+    for part, part_pos, present in parts:
         inside = rotation.rotate_inverse(quat, part_pos[..., None, :] - pos)
-        of_each = None if has is None else has[..., None]
-        gaps += [_mask_absent(of_each, _geom_distance(mine, inside, rot, geom)) for geom in geoms]
+        presence = None if present is None else present[..., None]
+        gaps += [_mask_absent(presence, _geom_distance(part, inside, rot, geom)) for geom in geoms]
     return _minimum(gaps, parts[0][1])
 
 
@@ -233,13 +233,15 @@ def _fixed_distance(parts: DroneParts, drone_rot: Array | None, geoms: Sequence[
         kinds.setdefault((geom.shape, geom.rot is None), []).append(geom)
     gaps = []
     for equal_geoms in kinds.values():
-        for mine, part_pos, has in parts:
+        for part, part_pos, present in parts:
             if len(equal_geoms) > MAX_UNROLLED_GEOMS:
                 gaps.append(
-                    jnp.min(_stacked_distances(mine, part_pos, drone_rot, StackedGeoms.of(equal_geoms), has), axis=-1)
+                    jnp.min(
+                        _stacked_distances(part, part_pos, drone_rot, StackedGeoms.of(equal_geoms), present), axis=-1
+                    )
                 )
             else:
-                gaps += [_mask_absent(has, _geom_distance(mine, part_pos, drone_rot, geom)) for geom in equal_geoms]
+                gaps += [_mask_absent(present, _geom_distance(part, part_pos, drone_rot, geom)) for geom in equal_geoms]
     return _minimum(gaps, parts[0][1])
 
 
@@ -261,21 +263,21 @@ class StackedGeoms(NamedTuple):
 
 
 def _stacked_distances(
-    mine: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, present: Array | None
+    part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geoms: StackedGeoms, present: Array | None
 ) -> Array:
     """Return the distances of a drone's geom to stacked geoms, infinite if the drone has no such geom, m. (..., n)"""
     rot = None if drone_rot is None else drone_rot[..., None, :, :]
-    gap = _geom_distance(mine, part_pos[..., None, :], rot, geoms)
+    gap = _geom_distance(part, part_pos[..., None, :], rot, geoms)
     return _mask_absent(None if present is None else present[..., None], gap)
 
 
 def _geom_distance(
-    mine: CollisionGeom, part_pos: Array, drone_rot: Array | None, geom: CollisionGeom | StackedGeoms
+    part: CollisionGeom, part_pos: Array, drone_rot: Array | None, geom: CollisionGeom | StackedGeoms
 ) -> Array:
     """Return the distance of a drone's geom to another geom, m. (...)
 
     Args:
-        mine: Geom of the drone.
+        part: Geom of the drone.
         part_pos: Its position in the frame in which the other geom is given, m. (..., 3)
         drone_rot: Attitude of the drone in that frame; None if all its geoms are spheres. (..., 3, 3)
         geom: The other geom, or several along the last batch axis.
@@ -287,9 +289,9 @@ def _geom_distance(
         x, y, z = (inside[..., k, None] * columns[..., k, :] for k in range(3))
         inside = x + y + z
         rot = None if drone_rot is None else _product(jnp.swapaxes(columns, -1, -2), drone_rot)
-    if rot is not None and mine.rot is not None:
-        rot = _product(rot, jnp.asarray(mine.rot, part_pos.dtype))
-    return distance(mine.shape, geom.shape, inside, jnp.eye(3) if rot is None else rot)
+    if rot is not None and part.rot is not None:
+        rot = _product(rot, jnp.asarray(part.rot, part_pos.dtype))
+    return distance(part.shape, geom.shape, inside, jnp.eye(3) if rot is None else rot)
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -308,19 +310,19 @@ def _nearest_other(parts: DroneParts, drone_rot: Array | None) -> Array:
     """Return the distance of one drone to the nearest other of its world, m. ()"""
 
     def between(other: tuple[list[Array], list[Array | None], Array | None], is_self: Array) -> Array:
-        positions, theirs, rot = other
+        positions, presences, rot = other
         inverse = None if rot is None else rot.T
         relative_rot = jnp.eye(3) if inverse is None or drone_rot is None else _product(inverse, drone_rot)
         gaps = []
-        for mine, part_pos, has in parts:
-            for (geom, *_), other_pos, other_has in zip(parts, positions, theirs, strict=True):
+        for part, part_pos, present in parts:
+            for (geom, *_), other_pos, other_present in zip(parts, positions, presences, strict=True):
                 inside = part_pos - other_pos if inverse is None else rotation.matvec(inverse, part_pos - other_pos)
-                are_present = None if has is None or other_has is None else has & other_has
-                gaps.append(_mask_absent(are_present, distance(mine.shape, geom.shape, inside, relative_rot)))
+                are_present = None if present is None or other_present is None else present & other_present
+                gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, inside, relative_rot)))
         return jnp.where(is_self, jnp.inf, _minimum(gaps, parts[0][1]))
 
     return reduce_over_others(
-        between, ([part_pos for _, part_pos, _ in parts], [has for *_, has in parts], drone_rot), "min"
+        between, ([part_pos for _, part_pos, _ in parts], [present for *_, present in parts], drone_rot), "min"
     )
 
 
@@ -333,32 +335,32 @@ def _nearest_drones(parts: DroneParts, drone_rot: Array | None) -> tuple[Array, 
     n = parts[0][1].shape[-2]
     indices = jnp.arange(n, dtype=np.int32)
 
-    def of_chunk(chunk: Array) -> tuple[Array, Array]:
+    def nearest_of_chunk(chunk: Array) -> tuple[Array, Array]:
         gaps = []
-        for mine, part_pos, has in parts:
+        for part, part_pos, present in parts:
             chunk_pos = jnp.take(part_pos, chunk, axis=-2)[..., :, None, :]
-            for geom, other, other_has in parts:
+            for geom, other, other_present in parts:
                 are_present = None
-                if has is not None and other_has is not None:
-                    are_present = jnp.take(has, chunk, axis=-1)[..., :, None] & other_has[..., None, :]
+                if present is not None and other_present is not None:
+                    are_present = jnp.take(present, chunk, axis=-1)[..., :, None] & other_present[..., None, :]
                 offset = chunk_pos - other[..., None, :, :]
                 if drone_rot is None:
-                    gaps.append(_mask_absent(are_present, distance(mine.shape, geom.shape, offset, jnp.eye(3))))
+                    gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, offset, jnp.eye(3))))
                     continue
                 inverse = jnp.swapaxes(drone_rot, -1, -2)[..., None, :, :, :]
                 inside = rotation.matvec(inverse, offset)
                 rot = _product(inverse, jnp.take(drone_rot, chunk, axis=-3)[..., :, None, :, :])
-                gaps.append(_mask_absent(are_present, distance(mine.shape, geom.shape, inside, rot)))
+                gaps.append(_mask_absent(are_present, distance(part.shape, geom.shape, inside, rot)))
         gap = jnp.where(chunk[:, None] == indices, jnp.inf, _minimum(gaps, parts[0][1]))
         return jnp.min(gap, axis=-1), _argmin(gap)
 
     if n <= DRONES_PER_CHUNK:
-        return of_chunk(indices)
+        return nearest_of_chunk(indices)
     n_chunks = -(-n // DRONES_PER_CHUNK)
     padded = jnp.minimum(jnp.arange(n_chunks * DRONES_PER_CHUNK, dtype=np.int32), n - 1).reshape(
         n_chunks, DRONES_PER_CHUNK
     )
-    gap, nearest = jax.lax.map(of_chunk, padded)
+    gap, nearest = jax.lax.map(nearest_of_chunk, padded)
     return tuple(jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)[..., :n] for x in (gap, nearest))  # type: ignore[return-value]
 
 

@@ -58,17 +58,17 @@ class SceneQueries:
         self, name: str, build: Callable[[], Callable[..., Any]], model: CollisionModel, data: SimData, *settings: Any
     ) -> Any:
         """Return the result of a query about poses, which is compiled once for its settings."""
-        of_scene, compiled = self._compiled
-        if of_scene is not self._scene.mj_model:
+        compiled_model, compiled = self._compiled
+        if compiled_model is not self._scene.mj_model:
             _, compiled = self._compiled = self._scene.mj_model, {}
-        first = (name, *settings) not in compiled
-        if first:
+        is_new = (name, *settings) not in compiled
+        if is_new:
             compiled[name, *settings] = jax.jit(_as_function_of_poses(build(), data))
         states, objects = data.states, data.objects
         # Only the arrays that the query needs, since a compiled call costs by their number.
         poses = (states.pos, states.quat, *((None, None) if objects is None else (objects.pos, objects.quat)))
         mocap = self._scene.mocap_poses() if model.mocap_bodies else None
-        with keep_programs(when=first):
+        with keep_programs(when=is_new):
             return compiled[name, *settings](*poses, mocap)
 
     def _contacts(self, objects: ObjectSelection, floor: bool, drones: bool) -> Callable[..., ContactReport]:
@@ -105,7 +105,7 @@ def _as_function_of_poses(fn: Callable[..., Any], data: SimData) -> Callable[...
     """Return a function of data and mocap poses as one of poses alone; the rest of the data is left out."""
     poses_only = jax.tree.map(lambda _: None, data)
 
-    def of_poses(
+    def query_poses(
         pos: Array, quat: Array, objects_pos: Array | None, objects_quat: Array | None, mocap: MocapPoses
     ) -> Any:
         states, objects = poses_only.states.replace(pos=pos, quat=quat), poses_only.objects
@@ -114,4 +114,4 @@ def _as_function_of_poses(fn: Callable[..., Any], data: SimData) -> Callable[...
             objects = objects.replace(pos=objects_pos, quat=objects_quat)
         return fn(poses_only.replace(states=states, objects=objects, core=core, plugins={}), mocap)
 
-    return of_poses
+    return query_poses

@@ -40,7 +40,7 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
     if not has_joints:
         mjx_data = update_kinematics(mjx_model, mjx_data)
 
-    def of_world(world: mjx.Data) -> mjx.Data:
+    def collide_in_world(world: mjx.Data) -> mjx.Data:
         if has_joints:
             world = mjx.kinematics(_model_with_mocap_poses(mjx_model, world), world)
         if np.isin(mjx_model.cam_mode, COM_CAMERAS).any():
@@ -48,7 +48,7 @@ def sync_sim2mjx(data: SimData, mjx_data: mjx.Data, mjx_model: mjx.Model) -> tup
         world = mjx.camlight(mjx_model, world)
         return mjx.collision(mjx_model, world)
 
-    mjx_data = jax.vmap(of_world)(mjx_data)
+    mjx_data = jax.vmap(collide_in_world)(mjx_data)
     return data.replace(core=data.core.replace(mjx_synced=jnp.asarray(True))), mjx_data
 
 

@@ -252,11 +252,11 @@ class MPPI:
                 f"{list(template.plugins)}, got {list(data.plugins)}. Build MPPI after adding them."
             )
 
-        def of_rollouts(scope: str, default: Array, x: Array) -> Array:
+        def repeat_for_rollouts(scope: str, default: Array, x: Array) -> Array:
             return self._repeat(x) if n_batch_axes(scope) == 2 else default if scope != "shared" else x
 
         leaves = [
-            of_rollouts(*pair)
+            repeat_for_rollouts(*pair)
             for pair in zip(
                 jax.tree.leaves(scopes(data)), jax.tree.leaves(template), jax.tree.leaves(data), strict=True
             )

@@ -82,12 +82,12 @@ def compile_kernel(kernel: Kernel, devices: Sequence[jax.Device] | None = None) 
         KernelError: If NVRTC is missing, or refuses the source, with its message.
     """
     device = weakest_device(devices)
-    few = kernel if device is None else fit_registers(kernel, device)
-    many = few if device is None else widen_blocks(few, device)
-    ptx(few, architecture(device))  # raises here what it would raise at the first launch
+    small_kernel = kernel if device is None else fit_registers(kernel, device)
+    large_kernel = small_kernel if device is None else widen_blocks(small_kernel, device)
+    ptx(small_kernel, architecture(device))  # raises here what it would raise at the first launch
 
     def launch(n_lanes: int, count: Any, inputs: Sequence[Array], outputs: Sequence[Any]) -> list[Array]:
-        kernel = few if n_lanes < RESIDENT_LANES else many
+        kernel = small_kernel if n_lanes < RESIDENT_LANES else large_kernel
         n_blocks, memory = -(-n_lanes // kernel.lanes), []
         if kernel.state_bytes:
             n_blocks, count, memory = _plan_memory(kernel, n_lanes, int(count[0]))
@@ -128,13 +128,13 @@ def _plan_memory(kernel: Kernel, n_lanes: int, n_steps: int) -> tuple[int, np.nd
     If the memory would exceed ``MAX_GRADIENT_MEMORY_BYTES``, there are fewer blocks, which each process several groups
     of lanes in turn.
     """
-    here = steps_per_interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.state_bytes, MAX_GRADIENT_MEMORY_BYTES)
-    n_states = here + max(-(-n_steps // here), 1)
+    interval = steps_per_interval(n_steps, min(n_lanes, RESIDENT_LANES) * kernel.state_bytes, MAX_GRADIENT_MEMORY_BYTES)
+    n_states = interval + max(-(-n_steps // interval), 1)
     size = n_states * kernel.state_bytes * kernel.threads
     n_blocks = -(-n_lanes // kernel.lanes)
-    turns = -(-n_blocks // max(MAX_GRADIENT_MEMORY_BYTES // size, 1))
-    n_blocks = -(-n_blocks // turns)
-    return n_blocks, np.asarray([n_steps, here], np.int32), [jax.ShapeDtypeStruct((n_blocks, size // 4), np.uint32)]
+    n_rounds = -(-n_blocks // max(MAX_GRADIENT_MEMORY_BYTES // size, 1))
+    n_blocks = -(-n_blocks // n_rounds)
+    return n_blocks, np.asarray([n_steps, interval], np.int32), [jax.ShapeDtypeStruct((n_blocks, size // 4), np.uint32)]
 
 
 def weakest_device(devices: Sequence[jax.Device] | None = None) -> jax.Device | None:

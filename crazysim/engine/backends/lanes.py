@@ -256,17 +256,17 @@ def steps(
     return [end.array(i) for i in program.written], flagged
 
 
-def repeat(turn: Callable[[Any], Any], carry: Any, n: int) -> Any:
+def repeat(iterate: Callable[[Any], Any], carry: Any, n: int) -> Any:
     """Return a carry after ``n`` iterations, computed so that its gradient needs little memory.
 
     Only the carry before each iteration is stored. The backward pass recomputes the rest, which costs less than
     fetching it from memory. From ``MIN_CHECKPOINTED_STEPS`` iterations on, only every k-th carry is stored, where k is
     the square root of n. The memory of a gradient then grows with that root, at the price of one more forward pass.
     """
-    turn = jax.checkpoint(turn, prevent_cse=False)  # within a scan it is not needed
+    iterate = jax.checkpoint(iterate, prevent_cse=False)  # within a scan it is not needed
 
     def scan(carry: Any, n: int) -> Any:
-        return jax.lax.scan(lambda c, _: (turn(c), None), carry, length=n)[0]
+        return jax.lax.scan(lambda c, _: (iterate(c), None), carry, length=n)[0]
 
     if n < MIN_CHECKPOINTED_STEPS:
         return scan(carry, n)

@@ -52,15 +52,15 @@ def build(stages: Sequence[Stage], data: SimData) -> tuple[Run, list[int]]:
         leaves = run["before"](*leaves)
         in_loop = written["each"]
 
-        def turn(values: list[Any]) -> list[Any]:
+        def advance(values: list[Any]) -> list[Any]:
             after = run["each"](*replace_leaves(leaves, in_loop, values))
             return [after[i] for i in in_loop]
 
         out = [leaves[i] for i in in_loop]
         if in_loop and isinstance(n_steps, int):
-            out, _ = jax.lax.scan(lambda x, _: (turn(x), None), out, length=n_steps)
+            out, _ = jax.lax.scan(lambda x, _: (advance(x), None), out, length=n_steps)
         elif in_loop:
-            out = jax.lax.fori_loop(0, n_steps, lambda _, x: turn(x), out)
+            out = jax.lax.fori_loop(0, n_steps, lambda _, x: advance(x), out)
         leaves = replace_leaves(leaves, in_loop, out)
         flagged = nonfinite_worlds(axes.treedef.unflatten(leaves))
         leaves = run["after"](*leaves)

@@ -86,25 +86,25 @@ def _loop(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> l
     (body,) = op.blocks
     carry = [_lanes(x, shape) for x in args]
 
-    def turn(carry: list[Any], _: Any) -> tuple[list[Any], None]:
+    def iterate(carry: list[Any], _: Any) -> tuple[list[Any], None]:
         return [_lanes(x, shape) for x in run(body, carry, shape, env)], None
 
-    return lax.scan(turn, carry, length=op.param("length"))[0]
+    return lax.scan(iterate, carry, length=op.param("length"))[0]
 
 
 def _while(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
     """Repeat until no lane continues; lanes that are finished keep their values."""
     test, body = op.blocks
 
-    def goes_on(carry: list[Any]) -> Array:
+    def continues(carry: list[Any]) -> Array:
         return _lanes(run(test, carry, shape, env)[0], shape)
 
-    def turn(carry: list[Any]) -> list[Any]:
-        mask = goes_on(carry)
+    def iterate(carry: list[Any]) -> list[Any]:
+        mask = continues(carry)
         new = run(body, carry, shape, env)
         return [jnp.where(mask, _lanes(x, shape), old) for x, old in zip(new, carry, strict=True)]
 
-    return lax.while_loop(lambda carry: jnp.any(goes_on(carry)), turn, [_lanes(x, shape) for x in args])
+    return lax.while_loop(lambda carry: jnp.any(continues(carry)), iterate, [_lanes(x, shape) for x in args])
 
 
 def _when(op: Operation, args: list[Any], shape: tuple[int, ...], env: Env) -> list[Any]:
@@ -150,14 +150,14 @@ def _over_others(op: Operation, args: list[Any], shape: tuple[int, ...], env: En
     rows = [jnp.reshape(x, (n_worlds, n)) if np.ndim(x) else x for x in args]
     if n <= MAX_UNROLLED:
         number = lax.broadcasted_iota(np.int32, (n_worlds, n), 1)
-        mine = {v: jnp.reshape(x, (n_worlds, n)) for v, x in per_lane.items()}
-        turns = []
+        own_values = {v: jnp.reshape(x, (n_worlds, n)) for v, x in per_lane.items()}
+        results_by_drone = []
         for j in range(n):
             other = [x[:, j : j + 1] if np.ndim(x) else x for x in rows]
-            turns.append(run(block, [*other, number == j], (n_worlds, n), fixed | mine))
+            results_by_drone.append(run(block, [*other, number == j], (n_worlds, n), fixed | own_values))
         combine = [COMBINE[name] for name in op.param("reduce")]
-        reduced = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in turn_results])
-                 for fn, turn_results in zip(combine, zip(*turns, strict=True), strict=True)]  # fmt: skip
+        reduced = [functools.reduce(fn, [_lanes(x, (n_worlds, n)) for x in results])
+                 for fn, results in zip(combine, zip(*results_by_drone, strict=True), strict=True)]  # fmt: skip
         return [jnp.reshape(x, shape) for x in reduced]
     columns = [jnp.reshape(x, (n_worlds, n)).T[..., None] for x in per_lane.values()]  # (n, n_worlds, 1)
 

@@ -86,11 +86,11 @@ class PackedRows(NamedTuple):
         """Return the rows. (n_rows, n_lanes)"""
         n_drones = self.program.n_drones
 
-        def of_leaf(x: Any) -> Array:
+        def rows_of_leaf(x: Any) -> Array:
             x = jnp.broadcast_to(x, (x.shape[0], n_drones, *x.shape[2:]))
             return x.reshape(x.shape[0] * n_drones, -1).T
 
-        return jnp.concatenate([of_leaf(leaves[i]) for i in self.members])
+        return jnp.concatenate([rows_of_leaf(leaves[i]) for i in self.members])
 
     def unpack(self, rows: Array, leaf: int) -> Array:
         """Return the array of one of ``members``."""
