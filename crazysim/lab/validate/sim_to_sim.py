@@ -55,8 +55,8 @@ All airframes have the mass, the inertia and the largest thrust of `cf21B_500`. 
 
 - crazysim: our default controller, 500 Hz. Drag of 0.022 N s/m across the rotors and 0.025 along them. The time
   constant of small changes of the rotor speeds is about 59 ms.
-- C MuJoCo: our default controller in the loop, 500 Hz. No drag. Thrusts follow their commands with a time constant
-  of 59 ms; rotors have no inertia.
+- C MuJoCo: our default controller in the loop, 500 Hz. No drag, with which `track` was trained. Thrusts follow their
+  commands with a time constant of 59 ms; rotors have no inertia.
 - Crazyflow: the same airframe, with Crazyflow's controller, 500 Hz.
 - RotorPy: its brushless Crazyflie, whose thrust is proportional to the square of the speed, with a lag of 50 ms, a
   drag in hover of 0.046 N s/m across and 0.11 along the rotors, and translational lift. Its controller of attitudes
@@ -224,7 +224,7 @@ def compare(name: str, simulator: str, folder: Path | None = None) -> Iterable[R
     what = f"`{task}`{', trained with `randomize=crazyflie`' * bool(options)}"
     remark = f"crashed {100 * result.crashed:.3g} %"
     remark = remark if np.isnan(result.error) else f"mean error {result.error:.2g} m, {remark}"
-    yield Row(what, simulator, 100 * result.success, "%", None, remark)
+    yield Row(f"{what}: success", simulator, 100 * result.success, "%", None, remark)
     if simulator == "crazysim":
         obs = result.observed.reshape(-1, result.observed.shape[-1])
         difference = float(np.abs(policy.c(obs) - policy.onnx(obs)).max())

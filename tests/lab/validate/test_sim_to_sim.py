@@ -83,7 +83,7 @@ def test_a_row_has_success_error_and_the_difference_of_both_exports(monkeypatch)
     result = sim_to_sim.Result(0.5, 0.25, 0.0123, np.linspace(-1, 1, 60).reshape(5, 3, 4))
     monkeypatch.setattr(sim_to_sim, "fly", lambda *_: result)
     flown, same = sim_to_sim.compare("hover_crazyflie", "crazysim")
-    assert (flown.quantity, flown.figure) == ("`hover`, trained with `randomize=crazyflie`", 50)
+    assert (flown.quantity, flown.figure) == ("`hover`, trained with `randomize=crazyflie`: success", 50)
     assert flown.remark == "mean error 0.012 m, crashed 25 %"
     assert same.figure == pytest.approx(2e-6, rel=0.2)
     assert not same.failed
